@@ -1,0 +1,452 @@
+"""Balancing: a legged robot keeps its base over its feet along a plan, and steps when it must."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlparse
+
+import numpy as np
+from pydrake.geometry import HalfSpace, Meshcat, MeshcatVisualizer
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    DiscreteContactApproximation,
+)
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain, RandomSource
+from pydrake.common import RandomDistribution, RandomGenerator
+
+from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
+from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.control.robot import (
+    ObservationNoise,
+    add_robot,
+    add_to_package_map,
+    apply_mass_scale,
+    by_pattern,
+)
+from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.models import load_robot
+from drake_safety.simulation.balls import Ball, Throw, add_ball
+from drake_safety.simulation.closed_loop import ClosedLoop, check_assessment
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
+from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.recovery_switch import RecoverySwitch
+from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.safety_monitor import SafetyMonitor
+from drake_safety.systems.state_observer import StateObserver
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
+
+
+@dataclass(kw_only=True)
+class StartSampling:
+    """Random initial states and plans. Ranges are half-widths about the standing posture."""
+
+    foot_offset_m: float = 0.02
+    base_offset_m: list[float] = field(default_factory=lambda: [0.08, 0.05])
+    base_height_m: list[float] = field(default_factory=lambda: [0.36, 0.45])
+    """Lowest and highest height of the base [m]."""
+    tilt_rad: float = 0.1
+    """Roll, pitch and yaw, each [rad]."""
+    velocity_std_m_s: list[float] = field(default_factory=lambda: [0.5, 0.35, 0.1])
+    angular_velocity_std_rad_s: float = 0.4
+    joint_std_rad: float = 0.02
+    target_offset_m: list[float] = field(default_factory=lambda: [0.20, 0.11])
+    target_height_m: list[float] = field(default_factory=lambda: [0.34, 0.46])
+    plan_duration_s: list[float] = field(default_factory=lambda: [0.8, 1.6])
+    """Shortest and longest duration of the planned motion [s]."""
+
+
+@dataclass(kw_only=True)
+class PushSampling:
+    """Random balls, and the calm motion during which they are thrown."""
+
+    share: float = 0.25
+    """Share of nominal episodes that begin as a ball hits."""
+    mass_kg: list[float] = field(default_factory=lambda: [2.0, 4.0])
+    speed_m_s: list[float] = field(default_factory=lambda: [2.0, 11.0])
+    offset_m: float = 0.0
+    height_m: float = 0.03
+    target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
+    """Half-widths of where the calm motion starts and ends, about the stance [m]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"push: share must be in [0, 1]; got {self.share}")
+
+    def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
+        """A random ball from any horizontal direction."""
+        return Throw(
+            time_s=time_s,
+            mass_kg=rng.uniform(*self.mass_kg),
+            speed_m_s=rng.uniform(*self.speed_m_s),
+            direction_rad=rng.uniform(-math.pi, math.pi),
+            offset_m=rng.uniform(-self.offset_m, self.offset_m),
+            height_m=rng.uniform(-self.height_m, self.height_m),
+        )
+
+
+@dataclass(kw_only=True)
+class RecoveryParameters:
+    """When the robot steps, and how."""
+
+    threshold: float = 0.6
+    """Γ_thre."""
+    is_normalized: bool = True
+    """Whether the threshold is on b_safe / (1 - μ) or, literally, on b_safe."""
+    assessment_period_s: float = 0.02
+    """Time between two evaluations of Γ [s]."""
+    step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
+
+
+@dataclass(kw_only=True)
+class BalancingParameters:
+    """The task's part of the scenario file."""
+
+    safe_set: BalanceLimits = field(default_factory=BalanceLimits)
+    start: StartSampling = field(default_factory=StartSampling)
+    push: PushSampling = field(default_factory=PushSampling)
+    recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
+
+
+class Balancing(ClosedLoop):
+    """The diagram of the balancing task, for any robot.yaml with feet and joint gains.
+
+    Args:
+        scenario: The scenario.
+        variation: Name of the plant variation.
+        assessment: Γ; adds the assessor.
+        meshcat: Adds a visualiser.
+        recovery: Whether there are recovery steps; by default there are when there is Γ to
+            trigger them. Without Γ the diagram has an input port ``safety_probability``.
+        ball: Whether the plant has a ball; by default it has when pushes are sampled.
+
+    Raises:
+        ValueError: A robot without feet or gains, or an assessment of another diagram.
+    """
+
+    Parameters = BalancingParameters
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        variation: str = "nominal",
+        *,
+        assessment: SafetyAssessment | None = None,
+        meshcat: Meshcat | None = None,
+        recovery: bool | None = None,
+        ball: bool | None = None,
+    ):
+        super().__init__(scenario, variation, assessment)
+        recovery = assessment is not None if recovery is None else recovery
+        parameters = scenario.parameters
+        horizon = scenario.assessment.horizon
+        # Γ, trigger, step planner and controller tick one after the other within a plant step.
+        tick_offset_s = 0.25 * scenario.time_step_s
+        robot = load_robot(scenario.robot)
+        builder = DiagramBuilder()
+
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
+        plant.set_name("plant")
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph)
+        parser = Parser(plant)
+        add_to_package_map(parser.package_map())
+        parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
+        mu = self.variation.foot_friction or robot.foot_friction
+        plant.RegisterCollisionGeometry(
+            plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
+        )
+        has_ball = parameters.push.share > 0 if ball is None else ball
+        ball_instance = add_ball(plant) if has_ball else None
+        plant.Finalize()
+        self.plant, self.robot, self.robot_instance = plant, robot, instance
+        self.ball = (
+            Ball(plant, scene_graph, ball_instance, robot.base)
+            if ball_instance is not None
+            else None
+        )
+
+        nominal = scenario.variation("nominal")
+        kinematics = RobotKinematics(robot, nominal)
+        self.kinematics = kinematics
+        n_q, n_v = kinematics.num_positions, kinematics.num_velocities
+        plant_state = plant.get_state_output_port(instance)
+
+        noise, extra = self.variation.observation_noise, self.variation.input_noise
+        input_noise = ObservationNoise(
+            position=math.hypot(noise.position, extra.position),
+            velocity=math.hypot(noise.velocity, extra.velocity),
+        )
+        self._noise_sources = []
+        observers: dict[tuple[float, float], StateObserver] = {}
+
+        def observe(name: str, std: ObservationNoise) -> StateObserver:
+            key = (std.position, std.velocity)
+            if key not in observers:
+                observer = builder.AddNamedSystem(name, StateObserver(kinematics, std))
+                builder.Connect(plant_state, observer.GetInputPort("plant_state"))
+                if key != (0.0, 0.0):
+                    source = builder.AddNamedSystem(
+                        f"{name}_noise",
+                        RandomSource(
+                            RandomDistribution.kGaussian, 2 * n_v, scenario.control_period_s
+                        ),
+                    )
+                    builder.Connect(source.get_output_port(), observer.GetInputPort("noise"))
+                    self._noise_sources.append(source)
+                observers[key] = observer
+            return observers[key]
+
+        observer = observe("observer", noise)
+        assessor_observer = observe("assessor_observer", input_noise)
+        true_observer = observe("true_observer", ObservationNoise())
+        measured = observer.GetOutputPort("measured_plant_state")
+
+        planner = builder.AddNamedSystem(
+            "trajectory_planner", TrajectoryPlanner(horizon=horizon, step_s=scenario.step_s)
+        )
+        self._planner = planner
+        desired_output = planner.GetOutputPort("desired_output")
+        desired_preview = planner.GetOutputPort("desired_preview")
+
+        self._recovery_switch = None
+        if recovery:
+            switch = builder.AddNamedSystem(
+                "recovery_switch",
+                RecoverySwitch(
+                    kinematics,
+                    parameters.recovery.step,
+                    threshold=parameters.recovery.threshold,
+                    period_s=scenario.control_period_s,
+                    offset_s=tick_offset_s,
+                    horizon=horizon,
+                ),
+            )
+            self._recovery_switch = switch
+            builder.Connect(measured, switch.GetInputPort("plant_state"))
+            builder.Connect(desired_output, switch.GetInputPort("nominal_desired_output"))
+            builder.Connect(desired_preview, switch.GetInputPort("nominal_desired_preview"))
+            builder.Connect(
+                switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
+            )
+            desired_output = switch.GetOutputPort("desired_output")
+            desired_preview = switch.GetOutputPort("desired_preview")
+            builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
+
+        stiffness = [
+            getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)
+            for name in kinematics.joint_names
+        ]
+        controller = builder.AddNamedSystem(
+            "inverse_kinematics_controller",
+            InverseKinematicsController(
+                kinematics,
+                np.array(stiffness),
+                period_s=scenario.control_period_s,
+                offset_s=3 * tick_offset_s,
+            ),
+        )
+        self._controller = controller
+        builder.Connect(measured, controller.GetInputPort("plant_state"))
+        builder.Connect(desired_output, controller.GetInputPort("desired_output"))
+        if recovery:
+            builder.Connect(
+                switch.GetOutputPort("desired_foot_positions"),
+                controller.GetInputPort("desired_foot_positions"),
+            )
+        servos = builder.AddNamedSystem("servo_map", MatrixGain(D=self._servo_matrix()))
+        builder.Connect(
+            controller.GetOutputPort("desired_joint_state"), servos.get_input_port()
+        )
+        builder.Connect(
+            servos.get_output_port(), plant.get_desired_state_input_port(instance)
+        )
+
+        safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
+        monitor = builder.AddNamedSystem(
+            "safety_monitor",
+            SafetyMonitor(safe_set, n_q, n_v, period_s=scenario.control_period_s),
+        )
+        builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
+        features = builder.AddNamedSystem(
+            "plan_features", PlanFeatures(safe_set, n_q, n_v, horizon=horizon)
+        )
+        builder.Connect(
+            assessor_observer.GetOutputPort("measured_plant_state"),
+            features.GetInputPort("plant_state"),
+        )
+        builder.Connect(desired_preview, features.GetInputPort("desired_preview"))
+
+        self.state_names = assessor_observer.state_names
+        self.output_names = assessor_observer.output_names
+        self.feature_names = features.feature_names
+        self.constraint_names = monitor.constraint_names
+        self.fall_name = safe_set.fall_name
+        if assessment is not None:
+            check_assessment(
+                assessment,
+                scenario=scenario,
+                state_names=self.state_names,
+                output_names=self.output_names,
+                feature_names=self.feature_names,
+                constraint_names=self.constraint_names,
+            )
+            assessor = builder.AddNamedSystem(
+                "safety_assessor",
+                SafetyAssessor(assessment, period_s=parameters.recovery.assessment_period_s),
+            )
+            builder.Connect(
+                assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
+            )
+            builder.Connect(desired_preview, assessor.GetInputPort("desired_preview"))
+            builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
+            if recovery:
+                name = "normalized_" if parameters.recovery.is_normalized else ""
+                builder.Connect(
+                    assessor.GetOutputPort(f"{name}safety_probability"),
+                    switch.GetInputPort("safety_probability"),
+                )
+            for i in range(assessor.num_output_ports()):
+                port = assessor.get_output_port(i)
+                builder.ExportOutput(port, port.get_name())
+
+        elif recovery:
+            builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
+        builder.ExportOutput(assessor_observer.GetOutputPort("state"), "state")
+        builder.ExportOutput(true_observer.GetOutputPort("state"), "true_state")
+        builder.ExportOutput(observer.GetOutputPort("output"), "output")
+        builder.ExportOutput(desired_output, "desired_output")
+        builder.ExportOutput(desired_preview, "desired_preview")
+        builder.ExportOutput(features.GetOutputPort("features"), "features")
+        builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
+        builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
+        builder.ExportOutput(plant_state, "plant_state")
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        self.finish(builder)
+
+    @classmethod
+    def model_files(cls, scenario: Scenario) -> list[str]:
+        """The robot's YAML and model file."""
+        robot = load_robot(scenario.robot)
+        url = urlparse(robot.urdf)
+        if url.scheme == "package":
+            package_map = PackageMap()
+            add_to_package_map(package_map)
+            model = str(Path(package_map.GetPath(url.netloc)) / url.path.lstrip("/"))
+        else:
+            model = str(Path(robot.source_dir) / robot.urdf)
+        return [str(Path(robot.source_dir) / "robot.yaml"), model]
+
+    def _servo_matrix(self) -> np.ndarray:
+        """Maps [q; v] of the joints onto the plant's actuators; friction holds velocity zero."""
+        indices = self.plant.GetJointActuatorIndices(self.robot_instance)
+        actuators = [self.plant.get_joint_actuator(index) for index in indices]
+        column = {name: i for i, name in enumerate(self.kinematics.joint_names)}
+        n_a, n_j = len(actuators), len(column)
+        D = np.zeros((2 * n_a, 2 * n_j))
+        for row, actuator in enumerate(actuators):
+            if not actuator.name().endswith("_friction"):
+                j = column[actuator.joint().name()]
+                D[row, j] = 1.0
+                D[n_a + row, n_j + j] = 1.0
+        return D
+
+    def reset(self, context: Context, rng: np.random.Generator) -> int:
+        """Samples an initial state and a plan; some episodes begin as a ball hits."""
+        parameters = self.scenario.parameters
+        is_push = self.ball is not None and rng.random() < parameters.push.share
+        if not is_push:
+            self._reset_offset(context, rng)
+            return 0
+        self.reset_calm(context, rng)
+        # The first row after the hit sees it between 0 and one assessment step ago.
+        lead_s = rng.uniform(0.0, 1.0) * self.scenario.step_s
+        self.throw_ball(context, parameters.push.sample(rng, lead_s), lead_s)
+        return 1
+
+    def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
+        """Starts a calm motion near the stance, as it is when a ball is thrown."""
+        push = self.scenario.parameters.push
+        start_sampling = self.scenario.parameters.start
+        kinematics = self.kinematics
+        half = np.array([*push.target_offset_m, 0.0])
+        nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
+        start = nominal + rng.uniform(-half, half)
+        goal = nominal + rng.uniform(-half, half)
+        contacts = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+        X_WB = RigidTransform(start)
+        joints = solve_inverse_kinematics(kinematics, X_WB, contacts, kinematics.posture)
+        plan = interpolate(start, goal, rng.uniform(*start_sampling.plan_duration_s))
+        self._set(context, rng, X_WB, joints, np.zeros(kinematics.num_velocities), contacts, plan)
+
+    def _reset_offset(self, context: Context, rng: np.random.Generator) -> None:
+        sampling = self.scenario.parameters.start
+        kinematics = self.kinematics
+        xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * sampling.foot_offset_m
+        contacts = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
+        X_WS = planar_pose(fit_stance(contacts, kinematics.nominal_contacts))
+        start = np.append(
+            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * sampling.base_offset_m,
+            rng.uniform(*sampling.base_height_m),
+        )
+        rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
+        X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start)
+        joints = solve_inverse_kinematics(kinematics, X_WB, contacts, kinematics.posture)
+        v = np.zeros(kinematics.num_velocities)
+        v[:3] = rng.normal(size=3) * sampling.angular_velocity_std_rad_s
+        v[3:6] = rng.normal(size=3) * sampling.velocity_std_m_s
+        # Feet are at rest on the ground: 0 = J_b v_b + J_leg dq.
+        J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
+        v[6:], *_ = np.linalg.lstsq(J[:, 6:], -J[:, :6] @ v[:6], rcond=1e-6)
+        joints = joints + rng.normal(size=kinematics.num_joints) * sampling.joint_std_rad
+        goal = np.append(
+            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * sampling.target_offset_m,
+            rng.uniform(*sampling.target_height_m),
+        )
+        plan = interpolate(start, goal, rng.uniform(*sampling.plan_duration_s))
+        self._set(context, rng, X_WB, joints, v, contacts, plan)
+
+    def _set(self, context, rng, X_WB, joints, v, contacts, plan) -> None:
+        kinematics = self.kinematics
+        joints = np.clip(
+            joints, kinematics.position_limits[:, 0], kinematics.position_limits[:, 1]
+        )
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
+        q = kinematics.positions_at(X_WB, joints)
+        self.plant.SetPositionsAndVelocities(
+            plant_context, self.robot_instance, np.concatenate([q, v])
+        )
+        if self.ball is not None:
+            self.ball.park(plant_context)
+        stance_pose = fit_stance(contacts, kinematics.nominal_contacts)
+        self._planner.set_plan(
+            self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose
+        )
+        self._controller.set_foot_positions(
+            self._controller.GetMyMutableContextFromRoot(context), contacts
+        )
+        if self._recovery_switch is not None:
+            step_planner = self._recovery_switch.step_planner
+            step_planner.set_stance(
+                step_planner.GetMyMutableContextFromRoot(context), contacts, stance_pose
+            )
+        for source in self._noise_sources:
+            source.SetRandomContext(
+                source.GetMyMutableContextFromRoot(context),
+                RandomGenerator(int(rng.integers(2**31))),
+            )
+
+    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
+        """Sets the ball in flight; see :meth:`ClosedLoop.throw_ball`."""
+        if self.ball is None:
+            raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
+        self.ball.throw(self.plant.GetMyMutableContextFromRoot(context), throw, lead_s)
+        return context.get_time() + lead_s

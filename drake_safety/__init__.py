@@ -1,0 +1,59 @@
+"""Safety assessment for robots in Drake: beforehand, will this motion stay safe?"""
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.rollouts import run_episode, run_episodes
+    from drake_safety.simulation.scenario import Scenario, load_scenario
+
+__all__ = [
+    "SafetyAssessment",
+    "Scenario",
+    "__version__",
+    "load_scenario",
+    "run_episode",
+    "run_episodes",
+]
+
+# In a checkout `models` and `diagrams` stand beside this package, in a wheel inside it.
+if not (Path(__file__).parent / "models").is_dir():
+    __path__.append(str(Path(__file__).resolve().parents[1]))
+
+# Resolved on first use: an online run needs neither the training code nor the rollouts.
+_HOMES = {
+    "SafetyAssessment": "drake_safety.learning.assessment",
+    "Scenario": "drake_safety.simulation.scenario",
+    "load_scenario": "drake_safety.simulation.scenario",
+    "run_episode": "drake_safety.simulation.rollouts",
+    "run_episodes": "drake_safety.simulation.rollouts",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Resolves a public name on first use."""
+    if name == "__version__":
+        value: Any = _version()
+    elif name in _HOMES:
+        value = getattr(import_module(_HOMES[name]), name)
+    else:
+        raise AttributeError(f"module 'drake_safety' has no attribute {name!r}; it has {__all__}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Lists the names not resolved yet beside the resolved ones."""
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    """Returns the installed version, or one that says the code runs uninstalled."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("drake_safety")
+    except PackageNotFoundError:
+        return "0+uninstalled"

@@ -1,0 +1,1 @@
+"""Robot mathematics on arrays: kinematics, footholds and safe sets; no ports, no learning."""

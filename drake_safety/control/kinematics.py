@@ -1,0 +1,209 @@
+"""Kinematics of a legged robot from its own model: contact points, the stance frame, statics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from drake_safety.control.robot import (
+    PlantVariation,
+    RobotModel,
+    add_robot,
+    apply_mass_scale,
+    posture_positions,
+)
+
+NUM_BASE_POSITIONS = 7
+NUM_BASE_VELOCITIES = 6
+
+
+class RobotKinematics:
+    """A robot without ground or scene, for the mathematics of controllers and observers.
+
+    Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
+    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context; every method sets
+    what it needs first, so no call depends on an earlier one.
+
+    Args:
+        robot: The robot.
+        variation: Mass and damping that the controller believes in.
+
+    Raises:
+        ValueError: The robot's base is not the only floating body, or a foot names an unknown
+            body or joint.
+    """
+
+    def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
+        self.robot = robot
+        self.plant = MultibodyPlant(time_step=0.0)
+        add_robot(self.plant, robot)
+        self.plant.Finalize()
+        base = self.plant.GetBodyByName(robot.base)
+        if not base.is_floating_base_body() or self.plant.num_positions() != (
+            NUM_BASE_POSITIONS + self.plant.num_velocities() - NUM_BASE_VELOCITIES
+        ):
+            raise ValueError(
+                f"robot '{robot.name}': base '{robot.base}' must be the floating body and every "
+                f"joint must have one degree of freedom; the plant has "
+                f"{self.plant.num_positions()} positions and "
+                f"{self.plant.num_velocities()} velocities"
+            )
+        self.context = self.plant.CreateDefaultContext()
+        if variation is not None and variation.mass_scale != 1.0:
+            apply_mass_scale(self.plant, self.context, robot, variation.mass_scale)
+        self.num_positions = self.plant.num_positions()
+        self.num_velocities = self.plant.num_velocities()
+        self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
+        instance = self.plant.GetModelInstanceByName(robot.name)
+        joints = [self.plant.get_joint(i) for i in self.plant.GetJointIndices(instance)]
+        joints = [j for j in joints if j.num_velocities() == 1]
+        joints.sort(key=lambda joint: joint.velocity_start())
+        self.joint_names = [joint.name() for joint in joints]
+        self.position_limits = np.array(
+            [[j.position_lower_limit(), j.position_upper_limit()] for j in joints]
+        ).reshape(-1, 2)
+        self.velocity_limits = np.array([j.velocity_upper_limit() for j in joints])
+        self.base = base
+        self.world_frame = self.plant.world_frame()
+        column = {name: i for i, name in enumerate(self.joint_names)}
+        self.foot_names = list(robot.feet)
+        self.foot_frames = []
+        self.foot_points = []
+        self.foot_columns = []
+        self.foot_radii = []
+        for foot in robot.feet.values():
+            self.foot_frames.append(self.plant.GetFrameByName(foot.body))
+            self.foot_points.append(np.asfortranarray(np.array(foot.contact_points).T))
+            self.foot_columns.append(np.array([column[name] for name in foot.joints], dtype=int))
+            self.foot_radii += [foot.radius_m] * len(foot.contact_points)
+        self.foot_radii = np.array(self.foot_radii)
+        self.num_contacts = len(self.foot_radii)
+        posture = posture_positions(self.plant, robot)
+        self.posture = np.array([posture[name] for name in self.joint_names])
+        self.total_mass = self.plant.CalcTotalMass(self.context)
+        self.foot_slices = []
+        start = 0
+        for points in self.foot_points:
+            self.foot_slices.append(slice(start, start + points.shape[1]))
+            start += points.shape[1]
+        self._set_standing()
+
+    def _set_standing(self) -> None:
+        q = self.positions_at(RigidTransform(), self.posture)
+        p_WC = self.contact_positions(q)
+        lowest = np.min(p_WC[:, 2] - self.foot_radii)
+        self.standing_height = -float(lowest)
+        """Height of the base over the ground in the standing posture [m]."""
+        centroid = p_WC.mean(axis=0)
+        self.nominal_contacts = p_WC[:, :2] - centroid[:2]
+        """Contact points of the standing posture about their centroid, (n_c, 2) [m]."""
+        self.nominal_base_offset = -centroid[:2]
+        """Base over the contact points' centroid in the standing posture, (2,) [m]."""
+
+    def positions_at(self, X_WB: RigidTransform, joints: np.ndarray) -> np.ndarray:
+        """Position vector (n_q,) of a base pose and joint positions (n_j,) [rad]."""
+        quaternion = X_WB.rotation().ToQuaternion().wxyz()
+        return np.concatenate([quaternion, X_WB.translation(), joints])
+
+    def contact_positions(self, q: np.ndarray) -> np.ndarray:
+        """World positions of the contact spheres' centres, (n_c, 3) [m]."""
+        self.plant.SetPositions(self.context, q)
+        return np.concatenate(
+            [
+                self.plant.CalcPointsPositions(self.context, frame, points, self.world_frame).T
+                for frame, points in zip(self.foot_frames, self.foot_points, strict=True)
+            ]
+        )
+
+    def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
+        self.plant.SetPositions(self.context, q)
+        return np.concatenate(
+            [
+                self.plant.CalcJacobianTranslationalVelocity(
+                    self.context,
+                    JacobianWrtVariable.kV,
+                    frame,
+                    points,
+                    self.world_frame,
+                    self.world_frame,
+                )
+                for frame, points in zip(self.foot_frames, self.foot_points, strict=True)
+            ]
+        )
+
+    def gravity_torques(
+        self, q: np.ndarray, is_stance: np.ndarray, J: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Joint torques that hold the robot still on its stance points.
+
+        The ground forces are the least-squares split of the weight: minimise the sum of squared
+        point forces subject to the six floating-base rows ``0 = g_b + J_bᵀ f``.
+
+        Args:
+            q: Positions (n_q,).
+            is_stance: Per contact point, whether it carries weight, (n_c,).
+            J: The contact Jacobian at ``q``, if it is at hand.
+
+        Returns:
+            Torques (n_j,) [N·m].
+        """
+        J = self.contact_jacobian(q) if J is None else J
+        self.plant.SetPositions(self.context, q)
+        g = self.plant.CalcGravityGeneralizedForces(self.context)
+        if not is_stance.all():
+            if not is_stance.any():
+                return -g[NUM_BASE_VELOCITIES:]
+            J = J[np.repeat(is_stance, 3)]
+        A = J[:, :NUM_BASE_VELOCITIES].T
+        # Two stance points leave one base direction without force: the small diagonal lets the
+        # others be balanced in the least-squares sense.
+        gram = A @ A.T
+        gram.flat[:: NUM_BASE_VELOCITIES + 1] += 1e-4
+        forces = A.T @ np.linalg.solve(gram, -g[:NUM_BASE_VELOCITIES])
+        return -g[NUM_BASE_VELOCITIES:] - J[:, NUM_BASE_VELOCITIES:].T @ forces
+
+    def center_of_mass(self, q: np.ndarray) -> np.ndarray:
+        """Centre of mass in the world, (3,) [m]."""
+        self.plant.SetPositions(self.context, q)
+        return self.plant.CalcCenterOfMassPositionInWorld(self.context)
+
+
+def planar_pose(stance_pose: np.ndarray) -> RigidTransform:
+    """The transform X_WS of a stance pose ``[x, y, yaw]`` on the ground."""
+    x, y, yaw = stance_pose
+    return RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0])
+
+
+def yaw_of(R_WB: RotationMatrix) -> float:
+    """Yaw of a rotation, roll-pitch-yaw convention [rad]."""
+    return float(RollPitchYaw(R_WB).yaw_angle())
+
+
+def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
+    """The planar pose that best carries the nominal contact points onto the given ones.
+
+    Least squares in closed form (planar Procrustes).
+
+    Args:
+        p_WC: Contact points in the world, (n_c, 3) [m].
+        nominal_contacts: The standing posture's points about their centroid, (n_c, 2) [m].
+
+    Returns:
+        ``[x, y, yaw]`` of the stance frame S in the world (3,).
+    """
+    # Plain floats: for a handful of points they are several times faster than arrays.
+    points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()
+    n = len(points)
+    x = sum(px for px, _ in points) / n
+    y = sum(py for _, py in points) / n
+    sine = cosine = 0.0
+    for (px, py), (nx, ny) in zip(points, nominal, strict=True):
+        dx, dy = px - x, py - y
+        sine += nx * dy - ny * dx
+        cosine += nx * dx + ny * dy
+    return np.array([x, y, math.atan2(sine, cosine)])

@@ -1,0 +1,144 @@
+"""Footholds and swing curves of a recovery step (Raibert 1986)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+_GRAVITY = 9.81
+
+
+@dataclass(kw_only=True)
+class RecoveryStepParameters:
+    """The numbers of a recovery step."""
+
+    step_duration_s: float = 0.12
+    """Duration of a swing; the other feet carry the robot meanwhile [s]."""
+    lift_m: float = 0.06
+    """Height of the swing curve's top [m]."""
+    velocity_gain_s: float = 0.03
+    """Raibert's gain: how much further than the neutral point per speed [s]."""
+    max_reach_m: float = 0.22
+    """A foothold is at most this far from its hip's ground projection [m]."""
+    min_lateral_m: float = 0.09
+    """A foothold is at least this far from the base's midline, on its own side [m]."""
+    min_steps: int = 2
+    """Swings before the robot may stop."""
+    max_steps: int = 20
+    """Swings after which it stops in any case."""
+    settle_speed_m_s: float = 0.2
+    """Base speed under which it may stop [m/s]."""
+    settle_margin_m: float = 0.04
+    """Distance of the capture point inside the support polygon at which it may stop [m]."""
+    return_duration_s: float = 0.5
+    """Time in which the base returns over its feet before balancing goes on [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("step_duration_s", "lift_m", "max_reach_m", "return_duration_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(
+                    f"recovery step: {name} must be positive; got {getattr(self, name)}"
+                )
+        if not 1 <= self.min_steps <= self.max_steps:
+            raise ValueError(
+                f"recovery step: 1 <= min_steps <= max_steps is required; got "
+                f"{self.min_steps}, {self.max_steps}"
+            )
+
+
+def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
+    """Which feet swing together: every second foot around the body.
+
+    Two feet step one after the other, four in diagonal pairs, six in tripods.
+
+    Args:
+        foot_positions: Feet about their centroid in the standing posture, (n_feet, 2) [m].
+
+    Returns:
+        Two groups of foot indices.
+    """
+    around = np.argsort(np.arctan2(foot_positions[:, 1], foot_positions[:, 0]), kind="stable")
+    return [sorted(around[0::2].tolist()), sorted(around[1::2].tolist())]
+
+
+def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
+    """Where a linear inverted pendulum comes to rest: p + v √(z/g), (2,) [m]."""
+    return p_WB[:2] + v_WB[:2] * math.sqrt(max(float(p_WB[2]), 0.05) / _GRAVITY)
+
+
+def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
+    """Distance of a point to the segment between the first and last of some feet [m]."""
+    a, b = feet[0], feet[-1]
+    edge = b - a
+    length_squared = edge @ edge
+    s = 0.0 if length_squared == 0 else np.clip((point - a) @ edge / length_squared, 0.0, 1.0)
+    return float(np.linalg.norm(point - a - s * edge))
+
+
+def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) -> int:
+    """The group to swing first: the others' stance line is then nearest the capture point.
+
+    Args:
+        groups: As :func:`gait_groups`.
+        feet: Foot positions on the ground, (n_feet, 2) [m].
+        point: The capture point, (2,) [m].
+    """
+    distances = [distance_to_feet(point, feet[groups[1 - swing]]) for swing in (0, 1)]
+    return int(np.argmin(distances))
+
+
+def foothold(
+    p_WB: np.ndarray,
+    v_WB: np.ndarray,
+    yaw: float,
+    hip_offset: np.ndarray,
+    remaining_s: float,
+    parameters: RecoveryStepParameters,
+) -> np.ndarray:
+    """Where a swinging foot should land, on the ground (2,) [m].
+
+    Raibert's neutral point: the hip at touchdown plus half the distance travelled in the next
+    stance, ``p + v (t_rem + T/2)``, plus ``k v``. It stays within reach of where the hip is
+    at touchdown, and on its own side of the base, so that legs cannot cross.
+
+    Args:
+        p_WB: Base position (3,) [m].
+        v_WB: Base velocity (3,) [m/s].
+        yaw: Base yaw [rad].
+        hip_offset: The foot's place in the standing posture, in the base's heading frame, (2,).
+        remaining_s: Time to touchdown [s].
+        parameters: Numbers of the step.
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    R_WS = np.array([[c, -s], [s, c]])
+    v_S = R_WS.T @ v_WB[:2]
+    step = v_S * (0.5 * parameters.step_duration_s + parameters.velocity_gain_s)
+    reach = float(np.hypot(*step))
+    if reach > parameters.max_reach_m:
+        step = step * (parameters.max_reach_m / reach)
+    place = hip_offset + step
+    side = 1.0 if hip_offset[1] >= 0 else -1.0
+    if side * place[1] < parameters.min_lateral_m:
+        place[1] = side * min(parameters.min_lateral_m, abs(hip_offset[1]))
+    return p_WB[:2] + v_WB[:2] * remaining_s + R_WS @ place
+
+
+def swing_position(
+    start: np.ndarray, target: np.ndarray, phase: float, lift_m: float
+) -> np.ndarray:
+    """A point of the swing curve (3,) [m].
+
+    Horizontally it moves from start to target by the minimum-jerk law; vertically it rises by
+    ``lift_m`` at mid-swing and comes down to the target with zero speed.
+
+    Args:
+        start: Where the foot left the ground (3,) [m].
+        target: Where it lands (3,) [m].
+        phase: Share of the swing's time, clipped to [0, 1].
+        lift_m: Height of the curve's top over the line from start to target [m].
+    """
+    s = min(max(phase, 0.0), 1.0)
+    blend = s**3 * (10 - 15 * s + 6 * s**2)
+    point = start + blend * (target - start)
+    point[2] += lift_m * math.sin(math.pi * s) ** 2
+    return point

@@ -1,0 +1,334 @@
+"""A robot as data: the schema of ``robot.yaml``, and how it enters a MultibodyPlant."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.geometry import (
+    AddContactMaterial,
+    ProximityProperties,
+    RoleAssign,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import (
+    JointActuator,
+    ModelInstanceIndex,
+    PdControllerGains,
+    SpatialInertia,
+)
+from pydrake.systems.framework import Context
+
+
+@dataclass(kw_only=True)
+class Foot:
+    """One foot: the points that touch the ground, and the joints of its leg."""
+
+    body: str = ""
+    """Body that carries the contact points."""
+    contact_points: list[list[float]] = field(default_factory=list)
+    """Centres of the contact spheres in the body's frame, each (3,) [m]."""
+    radius_m: float = 0.0
+    """Radius of the contact spheres [m]."""
+    joints: list[str] = field(default_factory=list)
+    """Joints of the leg, from the base to the foot."""
+
+
+@dataclass(kw_only=True)
+class JointGains:
+    """Gains of a joint's position servo, which Drake integrates implicitly."""
+
+    stiffness: float = 0.0
+    """Proportional gain [N·m/rad]."""
+    damping: float = 0.0
+    """Derivative gain [N·m·s/rad]."""
+
+
+@dataclass(kw_only=True)
+class RobotModel:
+    """The schema of ``robot.yaml``: all that controllers and safe sets need to know of a robot."""
+
+    name: str = ""
+    urdf: str = ""
+    """``package://…`` or a path beside the YAML file; any format that Drake's Parser reads."""
+    base: str = ""
+    """Floating base body."""
+    posture: dict[str, float] = field(default_factory=dict)
+    """Standing joint positions [rad], by regular expression over joint names."""
+    feet: dict[str, Foot] = field(default_factory=dict)
+    joint_gains: dict[str, JointGains] = field(default_factory=dict)
+    """Position servo gains, by regular expression over joint names."""
+    effort_limits: dict[str, float] = field(default_factory=dict)
+    """Effort limits [N·m] of actuators that the model file lacks, by regular expression."""
+    foot_friction: float = 0.8
+    """Coulomb friction coefficient of the contact points."""
+    source_dir: str = ""
+    """Folder of the YAML file; filled in by the loader."""
+
+    def __post_init__(self) -> None:
+        for name, foot in self.feet.items():
+            points = np.asarray(foot.contact_points, dtype=float)
+            if points.ndim != 2 or points.shape[1] != 3:
+                raise ValueError(
+                    f"robot '{self.name}', foot '{name}': contact_points must be a list of "
+                    f"[x, y, z]; got {foot.contact_points}"
+                )
+        if not self.foot_friction > 0:
+            raise ValueError(
+                f"robot '{self.name}': foot_friction must be positive; got {self.foot_friction}"
+            )
+
+
+@dataclass(kw_only=True)
+class ObservationNoise:
+    """Standard deviations of the noise on a measured state."""
+
+    position: float = 0.0
+    """Base position [m], base orientation and joint positions [rad]."""
+    velocity: float = 0.0
+    """Base and joint velocities [m/s, rad/s]."""
+
+
+@dataclass(kw_only=True)
+class PlantVariation:
+    """How one plant differs from the published robot: a reality gap, as data."""
+
+    mass_scale: float = 1.0
+    """Factor on every body's spatial inertia."""
+    joint_friction_nm: float = 0.0
+    """Dry (Coulomb) friction torque of every actuated joint [N·m]."""
+    joint_damping: float = 0.0
+    """Viscous damping added to every actuated joint [N·m·s/rad]."""
+    foot_friction: float | None = None
+    """Friction coefficient of the feet in place of the robot's own."""
+    observation_noise: ObservationNoise = field(default_factory=ObservationNoise)
+    """Noise on what the controllers and the assessor measure."""
+    input_noise: ObservationNoise = field(default_factory=ObservationNoise)
+    """Noise on the assessor's inputs alone; the closed loop's motion never sees it."""
+
+    def __post_init__(self) -> None:
+        for name in ("mass_scale", "foot_friction"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"plant variation: {name} must be positive; got {value}")
+        for name in ("joint_friction_nm", "joint_damping"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(
+                    f"plant variation: {name} must not be negative; got {getattr(self, name)}"
+                )
+
+
+_FRICTION_DAMPING = 200.0  # [N·m·s/rad]: stiction creeps at tau_c / 200, below 0.003 rad/s.
+
+
+def load_robot_file(path: str | Path) -> RobotModel:
+    """Reads a ``robot.yaml``.
+
+    Args:
+        path: The YAML file.
+
+    Returns:
+        The robot, its ``source_dir`` set to the file's folder.
+
+    Raises:
+        ValueError: The file does not exist or does not fit the schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"robot file '{path}' does not exist")
+    try:
+        robot = yaml_load_typed(schema=RobotModel, filename=str(path))
+    except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
+        raise ValueError(f"robot file '{path}' does not fit the schema: {error}") from error
+    robot.source_dir = str(path.resolve().parent)
+    return robot
+
+
+def models_package_xml() -> Path:
+    """The ``package.xml`` behind ``package://drake_safety_models/``."""
+    import drake_safety
+
+    for folder in drake_safety.__path__:
+        candidate = Path(folder) / "models" / "package.xml"
+        if candidate.is_file():
+            return candidate
+    raise ValueError(f"no models/package.xml beside or inside {list(drake_safety.__path__)}")
+
+
+def add_to_package_map(package_map: PackageMap) -> None:
+    """Makes ``package://drake_safety_models/…`` known to a parser's package map."""
+    if not package_map.Contains("drake_safety_models"):
+        package_map.AddPackageXml(str(models_package_xml()))
+
+
+def by_pattern(patterns: dict, name: str, what: str, robot_name: str):
+    """The value of the only pattern that matches ``name`` in full; None when none does.
+
+    Raises:
+        ValueError: Two patterns match.
+    """
+    found = [key for key in patterns if re.fullmatch(key, name)]
+    if len(found) > 1:
+        raise ValueError(f"robot '{robot_name}': {what} of joint '{name}' matches {found}")
+    return patterns[found[0]] if found else None
+
+
+def _require(exists: bool, robot: RobotModel, what: str, name: str, known: list[str]) -> None:
+    if not exists:
+        raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
+
+
+def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
+    """Names of the one-degree-of-freedom joints of ``robot`` in the plant's order."""
+    instance = plant.GetModelInstanceByName(robot.name)
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    return [j.name() for j in joints if j.num_velocities() == 1]
+
+
+def _set_friction(
+    scene_graph: SceneGraph, plant: MultibodyPlant, robot: RobotModel, mu: float
+) -> None:
+    inspector = scene_graph.model_inspector()
+    instance = plant.GetModelInstanceByName(robot.name)
+    for foot in robot.feet.values():
+        body = plant.GetBodyByName(foot.body, instance)
+        points = np.array(foot.contact_points)
+        for geometry_id in plant.GetCollisionGeometriesForBody(body):
+            centre = inspector.GetPoseInFrame(geometry_id).translation()
+            is_contact = np.linalg.norm(points - centre, axis=1).min() < 1e-3
+            if not is_contact or not isinstance(inspector.GetShape(geometry_id), Sphere):
+                continue
+            old = inspector.GetProximityProperties(geometry_id)
+            new = ProximityProperties()
+            AddContactMaterial(friction=CoulombFriction(mu, mu), properties=new)
+            for group in old.GetGroupNames():
+                for key, value in old.GetPropertiesInGroup(group).items():
+                    if not new.HasProperty(group, key):
+                        new.AddProperty(group, key, value.get_value())
+            scene_graph.AssignRole(
+                plant.get_source_id(), geometry_id, new, RoleAssign.kReplace
+            )
+
+
+def add_robot(
+    plant: MultibodyPlant,
+    robot: RobotModel,
+    variation: PlantVariation | None = None,
+    *,
+    scene_graph: SceneGraph | None = None,
+) -> ModelInstanceIndex:
+    """Adds a robot to a plant that is not finalised: model, servos, friction.
+
+    The mass of the variation is a parameter of the Context: see :func:`apply_mass_scale`.
+    Dry joint friction is a second actuator on the joint that holds velocity zero with at most
+    the friction torque, solved implicitly with the contact.
+
+    Args:
+        plant: A plant before ``Finalize``.
+        robot: The robot.
+        variation: What differs from the published robot; nothing by default.
+        scene_graph: Where the feet's friction is assigned; without it friction is left alone.
+
+    Returns:
+        The model instance.
+
+    Raises:
+        ValueError: A body or joint that robot.yaml names does not exist, or a pattern is
+            ambiguous.
+    """
+    variation = variation or PlantVariation()
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    add_to_package_map(parser.package_map())
+    if robot.urdf.startswith("package://"):
+        (instance,) = parser.AddModels(url=robot.urdf)
+    else:
+        (instance,) = parser.AddModels(str(Path(robot.source_dir) / robot.urdf))
+    plant.RenameModelInstance(instance, robot.name)
+
+    bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
+    joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
+    _require(robot.base in bodies, robot, "body", robot.base, bodies)
+    for foot in robot.feet.values():
+        _require(foot.body in bodies, robot, "body", foot.body, bodies)
+        for joint_name in foot.joints:
+            _require(joint_name in joints, robot, "joint", joint_name, joints)
+
+    actuated = {
+        plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i)
+        # Per model instance the plant lists actuators only once it is finalised.
+        for i in plant.GetJointActuatorIndices()
+        if plant.get_joint_actuator(i).model_instance() == instance
+    }
+    for index in plant.GetJointIndices(instance):
+        joint = plant.get_joint(index)
+        if joint.num_velocities() != 1:
+            continue
+        actuator: JointActuator | None = actuated.get(joint.name())
+        if actuator is None:
+            limit = by_pattern(robot.effort_limits, joint.name(), "effort limit", robot.name)
+            if limit is None:
+                continue
+            actuator = plant.AddJointActuator(f"{joint.name()}_actuator", joint, limit)
+            actuated[joint.name()] = actuator
+        gains = by_pattern(robot.joint_gains, joint.name(), "gains", robot.name)
+        if gains is not None:
+            actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
+        if variation.joint_damping:
+            joint.set_default_damping(joint.default_damping() + variation.joint_damping)
+    if variation.joint_friction_nm:
+        for name in actuated:
+            friction = plant.AddJointActuator(
+                f"{name}_friction",
+                plant.GetJointByName(name, instance),
+                variation.joint_friction_nm,
+            )
+            friction.set_controller_gains(PdControllerGains(p=0.0, d=_FRICTION_DAMPING))
+    if scene_graph is not None:
+        mu = variation.foot_friction or robot.foot_friction
+        _set_friction(scene_graph, plant, robot, mu)
+    for joint_name, position in posture_positions(plant, robot).items():
+        plant.GetJointByName(joint_name, instance).set_default_positions([position])
+    return instance
+
+
+def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
+    """The standing position [rad] of every servo joint; zero where robot.yaml names none.
+
+    Raises:
+        ValueError: A posture pattern matches no joint, or two match one.
+    """
+    names = servo_joints(plant, robot)
+    for pattern in robot.posture:
+        if not any(re.fullmatch(pattern, name) for name in names):
+            _require(False, robot, "joint for posture pattern", pattern, names)
+    positions = {}
+    for name in names:
+        value = by_pattern(robot.posture, name, "posture", robot.name)
+        positions[name] = 0.0 if value is None else float(value)
+    return positions
+
+
+def apply_mass_scale(
+    plant: MultibodyPlant, context: Context, robot: RobotModel, scale: float
+) -> None:
+    """Scales every body's spatial inertia of ``robot`` in a plant's Context.
+
+    Args:
+        plant: The finalised plant.
+        context: The plant's Context, whose parameters change.
+        robot: The robot.
+        scale: Factor on the published inertias (mass and rotational inertia alike).
+    """
+    for index in plant.GetBodyIndices(plant.GetModelInstanceByName(robot.name)):
+        body = plant.get_body(index)
+        M_BBo_B = body.default_spatial_inertia()
+        if M_BBo_B.get_mass() > 0:
+            scaled = SpatialInertia(
+                scale * M_BBo_B.get_mass(), M_BBo_B.get_com(), M_BBo_B.get_unit_inertia()
+            )
+            body.SetSpatialInertiaInBodyFrame(context, scaled)

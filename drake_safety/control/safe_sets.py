@@ -1,0 +1,207 @@
+"""Safe sets as signed margins: positive inside, zero on the boundary, negative outside."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
+
+_GRAVITY = 9.81
+_NUM_DIRECTIONS = 8
+_ANGLES = 2 * np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # (2, 8)
+
+
+def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
+    """Corners of the convex hull, counter-clockwise (Andrew's monotone chain).
+
+    Args:
+        points: (n, 2) [m]. A dozen contact points is the usual size.
+
+    Returns:
+        The corners; one or two of them when the points coincide or are collinear.
+    """
+    ordered = sorted(map(tuple, points.tolist()))
+
+    def chain(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        hull: list[tuple[float, float]] = []
+        for px, py in sequence:
+            while len(hull) >= 2:
+                (ax, ay), (bx, by) = hull[-2], hull[-1]
+                if (bx - ax) * (py - ay) - (by - ay) * (px - ax) > 0:
+                    break
+                hull.pop()
+            hull.append((px, py))
+        return hull[:-1]
+
+    if len(ordered) <= 1:
+        return ordered
+    return chain(ordered) + chain(ordered[::-1])
+
+
+def signed_distance_to_polygon(point: np.ndarray, corners: list[tuple[float, float]]) -> float:
+    """Signed distance of a point to a convex polygon's boundary, positive inside.
+
+    Args:
+        point: (2,) [m].
+        corners: Counter-clockwise corners. With two the polygon is a segment and with one a
+            point: the distance is then never positive. With none it is minus infinity.
+
+    Returns:
+        The distance [m].
+    """
+    if not corners:
+        return -math.inf
+    px, py = float(point[0]), float(point[1])
+    inside = len(corners) >= 3
+    nearest = math.inf
+    previous = corners[-1]
+    for corner in corners:
+        ax, ay = previous
+        ex, ey = corner[0] - ax, corner[1] - ay
+        dx, dy = px - ax, py - ay
+        if ex * dy - ey * dx < 0:
+            inside = False
+        length_squared = ex * ex + ey * ey
+        s = 0.0 if length_squared == 0 else (dx * ex + dy * ey) / length_squared
+        s = min(max(s, 0.0), 1.0)
+        nearest = min(nearest, math.hypot(dx - s * ex, dy - s * ey))
+        previous = corner
+    return nearest if inside else -nearest
+
+
+@dataclass(kw_only=True)
+class BalanceLimits:
+    """The numbers of :class:`BalanceSafeSet`."""
+
+    support_clearance_m: float = 0.03
+    """A foot carries the support polygon while it is lower than this over the ground [m]."""
+    height_m: list[float] = field(default_factory=lambda: [0.3, 0.5])
+    """Lowest and highest safe height of the base [m]."""
+    fall_height_m: float = 0.2
+    """Below this height of the base the robot has fallen [m]."""
+    fall_tilt_rad: float = 0.8
+    """Beyond this angle between the base's z axis and the vertical it has fallen [rad]."""
+
+    def __post_init__(self) -> None:
+        if len(self.height_m) != 2 or not self.height_m[0] < self.height_m[1]:
+            raise ValueError(
+                f"safe set: height_m must be [lowest, highest] with lowest < highest; got "
+                f"{self.height_m}"
+            )
+        if not self.fall_height_m <= self.height_m[0]:
+            raise ValueError(
+                f"safe set: fall_height_m must not exceed the lowest safe height "
+                f"{self.height_m[0]}; got {self.fall_height_m}"
+            )
+
+
+class BalanceSafeSet:
+    """A legged robot balances: base over its feet, at a safe height, not fallen.
+
+    The constraints, in the order of :attr:`names`:
+
+    - ``support_polygon``: signed distance of the base's ground projection to the boundary of
+      the polygon of the feet on the ground [m];
+    - ``height``: distance to the nearer end of the height band [m];
+    - ``fall``: the smaller of the height over ``fall_height_m`` and of the height that a rigid
+      pendulum of the standing height has left before ``fall_tilt_rad`` [m].
+
+    Args:
+        kinematics: The robot.
+        limits: The numbers.
+    """
+
+    names = ("support_polygon", "height", "fall")
+    fall_name = "fall"
+
+    def __init__(self, kinematics: RobotKinematics, limits: BalanceLimits):
+        self.kinematics = kinematics
+        self.limits = limits
+        self._cos_fall_tilt = math.cos(limits.fall_tilt_rad)
+        directions = [f"{round(math.degrees(a))}deg" for a in _ANGLES]
+        points = ("base", "capture_point", "goal")
+        self.feature_names = [f"{p}_margin_{d}" for p in points for d in directions]
+        self.feature_names += [f"{p}_support_distance" for p in points]
+        self.feature_names += [f"clearance_{i}" for i in range(kinematics.num_contacts)]
+        self.feature_names += ["height_over_lowest", "height_under_highest", "yaw_error"]
+        self.feature_names += [f"tracking_error_{axis}" for axis in "xyz"]
+
+    def _support(self, p_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        clearance = p_WC[:, 2] - self.kinematics.foot_radii
+        return clearance, clearance < self.limits.support_clearance_m
+
+    def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Signed margins (3,) [m] of a state; minus infinity never occurs.
+
+        Args:
+            q: Positions (n_q,).
+            v: Velocities (n_v,); unused by these constraints.
+        """
+        del v
+        p_WC = self.kinematics.contact_positions(q)
+        _, is_support = self._support(p_WC)
+        height = float(q[6])
+        if is_support.any():
+            corners = convex_hull(p_WC[is_support, :2])
+            support = signed_distance_to_polygon(q[4:6], corners)
+        else:
+            support = -float(np.hypot(*(q[4:6] - p_WC[:, :2].mean(axis=0)))) - 1e-3
+        lowest, highest = self.limits.height_m
+        w, x, y, z = q[:4]
+        cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
+        fall = min(
+            height - self.limits.fall_height_m,
+            self.kinematics.standing_height * (cos_tilt - self._cos_fall_tilt),
+        )
+        return np.array([support, min(height - lowest, highest - height), fall])
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """The margins seen in eight directions, now, at the capture point and at the goal.
+
+        Directional margins are the polygon's support function seen from a point: positive while
+        the polygon reaches past the point in that direction. Their number does not depend on
+        the number of feet.
+
+        Args:
+            q: Positions (n_q,), measured.
+            v: Velocities (n_v,), measured.
+            preview: Desired base positions in the stance frame, (H, 3) [m].
+
+        Returns:
+            Features (n_f,), in the order of :attr:`feature_names` [m, rad].
+        """
+        kinematics, limits = self.kinematics, self.limits
+        p_WC = kinematics.contact_positions(q)
+        x, y, yaw = fit_stance(p_WC, kinematics.nominal_contacts)
+        c, s = math.cos(yaw), math.sin(yaw)
+        R_SW = np.array([[c, s], [-s, c]])
+        origin = np.array([x, y])
+        contacts = (p_WC[:, :2] - origin) @ R_SW.T
+        clearance, is_support = self._support(p_WC)
+        if not is_support.any():
+            is_support = np.ones_like(is_support)
+        base = R_SW @ (q[4:6] - origin)
+        height = q[6]
+        velocity = R_SW @ v[3:5]
+        capture_point = base + velocity * math.sqrt(max(height, 0.05) / _GRAVITY)
+        goal = preview[-1, :2]
+        reach = (contacts[is_support] @ _DIRECTIONS).max(axis=0)
+        corners = convex_hull(contacts[is_support])
+        points = (base, capture_point, goal)
+        qw, qx, qy, qz = q[:4]
+        base_yaw = math.atan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
+        yaw_error = math.remainder(base_yaw - yaw, 2 * math.pi)
+        lowest, highest = limits.height_m
+        return np.concatenate(
+            [
+                *(reach - p @ _DIRECTIONS for p in points),
+                [signed_distance_to_polygon(p, corners) for p in points],
+                clearance,
+                [height - lowest, highest - height, yaw_error],
+                preview[0, :2] - base,
+                [preview[0, 2] - height],
+            ]
+        )
+

@@ -1,0 +1,137 @@
+"""Basic belief assignments over {safe, unsafe} and the fusion operator F.
+
+A belief is an array (..., 3 + n_c): the masses of safe, unsafe and uncertainty, which sum to one, then
+optionally n_c columns that split the unsafe mass by cause and sum to it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2
+"""Columns of a belief; the columns from 3 on split `UNSAFE` by cause."""
+
+EMPTY = np.array([0.0, 0.0, 1.0])
+"""The empty belief B_0 = (0, 0, 1): no safety estimate can be made."""
+EMPTY.setflags(write=False)
+
+
+def empty(shape: int | tuple[int, ...], num_causes: int = 0) -> np.ndarray:
+    """Empty beliefs, (*shape, 3 + num_causes)."""
+    leading = (shape,) if isinstance(shape, int) else shape
+    beliefs = np.zeros((*leading, 3 + num_causes))
+    beliefs[..., UNCERTAINTY] = 1.0
+    return beliefs
+
+
+def from_scores(
+    score: np.ndarray,
+    uncertainty: float | np.ndarray,
+    cause: np.ndarray | None = None,
+    num_causes: int = 0,
+) -> np.ndarray:
+    """The belief that each unsafety score stands for.
+
+    Args:
+        score: Unsafety scores lambda in [0, 1], (N,).
+        uncertainty: mu in [0, 1], one for all or (N,).
+        cause: Column of the constraint each unsafe mass belongs to, -1 for none, (N,).
+        num_causes: n_c.
+
+    Returns:
+        Beliefs (N, 3 + n_c).
+
+    Raises:
+        ValueError: A score or an uncertainty lies outside [0, 1], or causes are asked for and not given,
+            or an unsafe score has no cause.
+    """
+    score = np.asarray(score, dtype=float)
+    uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
+    for name, values in (("score", score), ("uncertainty", uncertainty)):
+        if not np.all((values >= 0.0) & (values <= 1.0)):
+            raise ValueError(f"from_scores: every {name} must lie in [0, 1], got {values}")
+    if num_causes and cause is None:
+        raise ValueError(f"from_scores: {num_causes} causes are asked for, but `cause` is not given")
+    beliefs = np.zeros((*score.shape, 3 + num_causes))
+    # Eq. (bba_training_data)
+    beliefs[..., SAFE] = (1.0 - uncertainty) * (1.0 - score)
+    beliefs[..., UNSAFE] = (1.0 - uncertainty) * score
+    beliefs[..., UNCERTAINTY] = uncertainty
+    if num_causes and cause is not None:
+        has_cause = np.asarray(cause) >= 0
+        if np.any(~has_cause & (score > 0.0)) or np.any(np.asarray(cause) >= num_causes):
+            raise ValueError(f"from_scores: every unsafe score needs a cause in 0..{num_causes - 1}")
+        rows = np.flatnonzero(has_cause)
+        beliefs[rows, 3 + np.asarray(cause)[rows]] = beliefs[rows, UNSAFE]
+    return beliefs
+
+
+def fuse(beliefs: np.ndarray) -> np.ndarray:
+    """F: the joint fusion of a set of beliefs.
+
+    Certain beliefs (mu = 0) outweigh all others and are averaged, vacuous ones (mu = 1) have no weight.
+    F gathers no evidence (equal mu stays mu) and is not associative: fuse a set at once.
+
+    Departure: the printed products of uncertainties underflow from some 600 beliefs on. Divided by
+    their common product they become weights w = (1 - mu) / mu, which is the same value without loss.
+
+    Args:
+        beliefs: A set of beliefs, (k, 3 + n_c).
+
+    Returns:
+        The fused belief, (3 + n_c,); empty if the set is empty or all of it is vacuous.
+    """
+    beliefs = np.asarray(beliefs, dtype=float)
+    return fuse_cells(beliefs, np.zeros(len(beliefs), dtype=int), num_cells=1, min_count=0)[0]
+
+
+def fuse_cells(
+    beliefs: np.ndarray, cells: np.ndarray, *, num_cells: int, min_count: int
+) -> np.ndarray:
+    """The belief of every grid cell, fused jointly from the beliefs that lie in it.
+
+    Args:
+        beliefs: Beliefs, (N, 3 + n_c).
+        cells: Cell of each belief, -1 for outside, (N,).
+        num_cells: Number of cells V.
+        min_count: k_min, the number of beliefs below which a cell stays empty.
+
+    Returns:
+        Beliefs (V, 3 + n_c).
+
+    Raises:
+        ValueError: `cells` has another length than `beliefs`.
+    """
+    beliefs = np.asarray(beliefs, dtype=float)
+    cells = np.asarray(cells)
+    if cells.shape != beliefs.shape[:1]:
+        raise ValueError(f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}")
+    is_inside = cells >= 0
+    beliefs, cells = beliefs[is_inside], cells[is_inside]
+    num_columns = beliefs.shape[1]
+    uncertainty = beliefs[:, UNCERTAINTY]
+    count = np.bincount(cells, minlength=num_cells)
+
+    # Within a cell the smallest mu scales all weights, so that a tiny mu cannot overflow; where it is
+    # zero only the certain beliefs keep a weight, the limit of w = (1 - mu) / mu.
+    smallest = np.full(num_cells, np.inf)
+    np.minimum.at(smallest, cells, uncertainty)
+    is_certain = uncertainty == 0.0
+    ratio = np.where(is_certain, 1.0, smallest[cells] / np.where(is_certain, 1.0, uncertainty))
+    weight = (1.0 - uncertainty) * ratio
+    total = np.bincount(cells, weights=weight, minlength=num_cells)
+
+    fused = empty(num_cells, num_columns - 3)
+    # Eq. (compute_prior_estmate_bba): k_v >= k_min, as displayed; the prose says the opposite at equality.
+    is_filled = (count >= min_count) & (total > 0.0)
+    divisor = np.where(is_filled, total, 1.0)
+    for column in range(num_columns):
+        if column == UNCERTAINTY:
+            # Eq. (fuse_op): mu = sum(1 - mu) / sum(w)
+            summed = np.bincount(cells, weights=1.0 - uncertainty, minlength=num_cells)
+            summed = summed * np.where(np.isfinite(smallest), smallest, 0.0)
+        else:
+            # Eq. (fuse_op): b = sum(w b) / sum(w)
+            summed = np.bincount(cells, weights=weight * beliefs[:, column], minlength=num_cells)
+        fused[is_filled, column] = (summed / divisor)[is_filled]
+    return fused

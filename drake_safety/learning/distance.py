@@ -1,0 +1,251 @@
+"""The safety distance Omega between segments, as a graph of nearest neighbours.
+
+Only the nearest neighbours under Omega are ever kept. Two exact bounds make this cheap. The Euclidean
+distance of two error sequences, the shorter one held at its last value, is the cost of one admissible
+warping path and so bounds DTW from above; it gives each segment a radius within which its neighbours
+must lie. Sorted by that radius, a block of segments needs DTW only up to its own largest radius, and the
+C implementation abandons a pair as soon as it exceeds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+BACKENDS = ("dtaidistance", "tslearn")
+_BLOCK = 512
+_MAX_DENSE = 4000
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NeighbourGraph:
+    """The nearest neighbours of each segment under Omega, nearest first, itself excluded.
+
+    Attributes:
+        indices: Neighbours, (N, k).
+        distances: Omega to each neighbour, (N, k), dimensionless.
+        max_dtw: w_max, the largest DTW distance over all pairs [unit of the errors].
+    """
+
+    indices: np.ndarray
+    distances: np.ndarray
+    max_dtw: float
+
+
+def dtw_matrix(
+    error: np.ndarray, length: np.ndarray, *, backend: str = "dtaidistance"
+) -> np.ndarray:
+    """DTW distance, sqrt(sum ||.||^2) along the best path, of every pair of error sequences.
+
+    Args:
+        error: Error sequences, (N, H, n_z).
+        length: Samples of each that count, (N,).
+        backend: "dtaidistance", or "tslearn", the slower oracle with the same values.
+
+    Returns:
+        Symmetric matrix (N, N).
+
+    Raises:
+        ValueError: Unknown backend, or more than 4000 segments: use `neighbour_graph`.
+    """
+    num_segments = len(error)
+    if num_segments > _MAX_DENSE:
+        raise ValueError(
+            f"dtw_matrix: {num_segments} segments would need a dense matrix, expected at most "
+            f"{_MAX_DENSE}; neighbour_graph with backend 'dtaidistance' has no such limit"
+        )
+    _check_backend(backend)
+    series = _series(error, length)
+    if backend == "tslearn":
+        from tslearn.metrics import cdist_dtw
+        from tslearn.utils import to_time_series_dataset
+
+        return np.asarray(cdist_dtw(to_time_series_dataset(series)))
+    return _dtw_block(series, slice(0, num_segments), slice(0, num_segments))
+
+
+def neighbour_graph(
+    error: np.ndarray,
+    length: np.ndarray,
+    score: np.ndarray,
+    *,
+    score_weight: float,
+    num_neighbours: int,
+    backend: str = "dtaidistance",
+    progress: Callable[[float], None] | None = None,
+) -> NeighbourGraph:
+    """The exact nearest neighbours under the safety distance Omega.
+
+    Args:
+        error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H, n_z).
+        length: Samples of each that count, (N,).
+        score: Unsafety scores lambda, (N,).
+        score_weight: delta, the weight of a score difference.
+        num_neighbours: k, below N.
+        backend: "dtaidistance", or "tslearn" for up to 4000 segments.
+        progress: Called with the fraction done.
+
+    Returns:
+        The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
+
+    Raises:
+        ValueError: Unknown backend, errors that are not finite, or too few segments.
+    """
+    _check_backend(backend)
+    error = np.asarray(error, dtype=float)
+    score = np.asarray(score, dtype=float)
+    num_segments = len(error)
+    if not 0 < num_neighbours < num_segments:
+        raise ValueError(
+            f"neighbour_graph: {num_neighbours} neighbours are asked for among {num_segments} segments, "
+            "expected fewer neighbours than segments"
+        )
+    if not np.all(np.isfinite(error)):
+        raise ValueError("neighbour_graph: the errors hold values that are not finite")
+    if backend == "tslearn":
+        return _dense_graph(
+            dtw_matrix(error, length, backend=backend), score, score_weight, num_neighbours
+        )
+    series = _series(error, length)
+    held = _hold_last(error, length)
+    max_dtw = _max_dtw(series, held)
+    scale = 1.0 / max_dtw if max_dtw > 0.0 else 0.0
+    radius = np.empty(num_segments)
+    for rows, bound in _euclidean_blocks(held):
+        bound *= scale
+        bound += score_weight * np.abs(score[rows, None] - score)
+        bound[np.arange(len(bound)), np.arange(rows.start, rows.stop)] = np.inf
+        radius[rows] = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1]
+    radius *= 1.0 + _SLACK
+
+    order = np.argsort(radius, kind="stable")
+    radius, sorted_score = radius[order], score[order]
+    series = [series[i] for i in order]
+    distances = np.full((num_segments, num_neighbours), np.inf)
+    indices = np.full((num_segments, num_neighbours), -1)
+    for start in range(0, num_segments, _BLOCK):
+        stop = min(start + _BLOCK, num_segments)
+        limit = radius[stop - 1] * max_dtw * (1.0 + _SLACK)
+        omega = _dtw_block(series, slice(0, stop), slice(start, stop), limit)
+        # Omega^ij = w^ij / w_max + delta |lambda^i - lambda^j|
+        omega *= scale
+        omega += score_weight * np.abs(sorted_score[:stop, None] - sorted_score[start:stop])
+        omega[np.arange(start, stop), np.arange(stop - start)] = np.inf
+        columns = np.broadcast_to(np.arange(stop), (stop - start, stop))
+        _keep_nearest(distances, indices, np.arange(start, stop), omega.T, columns)
+        earlier = np.flatnonzero(np.any(omega[:start] <= radius[:start, None], axis=1))
+        columns = np.broadcast_to(np.arange(start, stop), (len(earlier), stop - start))
+        _keep_nearest(distances, indices, earlier, omega[earlier], columns)
+        if progress is not None:
+            progress((stop / num_segments) ** 2)
+    original = order[indices]
+    rank = np.lexsort((original, distances), axis=1)
+    result_indices, result_distances = np.empty_like(original), np.empty_like(distances)
+    result_indices[order] = np.take_along_axis(original, rank, axis=1)
+    result_distances[order] = np.take_along_axis(distances, rank, axis=1)
+    return NeighbourGraph(indices=result_indices, distances=result_distances, max_dtw=max_dtw)
+
+
+def _check_backend(backend: str) -> None:
+    if backend not in BACKENDS:
+        raise ValueError(f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}")
+
+
+def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
+    return [
+        np.ascontiguousarray(sequence[:count], dtype=float)
+        for sequence, count in zip(error, length, strict=True)
+    ]
+
+
+def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Each sequence with its last counted sample repeated, flattened, (N, H*n_z)."""
+    steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
+    return np.take_along_axis(error, steps[:, :, None], axis=1).reshape(len(error), -1)
+
+
+def _dtw_block(
+    series: list[np.ndarray], rows: slice, columns: slice, limit: float = np.inf
+) -> np.ndarray:
+    """DTW of `rows` against `columns`; infinite where it exceeds `limit`."""
+    from dtaidistance import dtw_ndim
+
+    if limit <= 0.0:
+        limit = np.finfo(float).tiny
+    distances = dtw_ndim.distance_matrix_fast(
+        series,
+        ndim=series[0].shape[1],
+        block=((rows.start, rows.stop), (columns.start, columns.stop), False),
+        max_dist=limit if np.isfinite(limit) else None,
+        compact=True,
+        parallel=True,
+    )
+    shape = (rows.stop - rows.start, columns.stop - columns.start)
+    return np.frombuffer(distances, dtype=float).reshape(shape).copy()
+
+
+def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Blocks of rows of the matrix of Euclidean distances, rounded upwards."""
+    squares = np.einsum("ij,ij->i", held, held)
+    for start in range(0, len(held), _BLOCK):
+        rows = slice(start, min(start + _BLOCK, len(held)))
+        block = held[rows] @ held.T
+        block *= -2.0
+        block += (1.0 + 1e-12) * squares[rows, None]
+        block += (1.0 + 1e-12) * squares
+        np.maximum(block, 0.0, out=block)
+        yield rows, np.sqrt(block, out=block)
+
+
+def _max_dtw(series: list[np.ndarray], held: np.ndarray) -> float:
+    """w_max over all pairs: DTW is computed only where the Euclidean bound exceeds the largest yet."""
+    by_size = np.argsort(-np.linalg.norm(held - held.mean(axis=0), axis=1), kind="stable")
+    held = held[by_size] - held.mean(axis=0)
+    first = [series[i] for i in by_size[:64]]
+    largest = float(_dtw_block(first, slice(0, len(first)), slice(0, len(first))).max())
+    for rows, bound in _euclidean_blocks(held):
+        is_open = bound > largest
+        is_open[:, : rows.start] = False
+        open_rows = rows.start + np.flatnonzero(is_open.any(axis=1))
+        open_columns = np.flatnonzero(is_open.any(axis=0))
+        for first_column in range(0, len(open_columns), 8 * _BLOCK):
+            chosen = open_columns[first_column : first_column + 8 * _BLOCK]
+            pool = [series[by_size[i]] for i in (*open_rows, *chosen)]
+            split = len(open_rows)
+            block = _dtw_block(pool, slice(0, split), slice(split, len(pool)))
+            largest = max(largest, float(block.max()))
+    return largest
+
+
+def _keep_nearest(
+    distances: np.ndarray,
+    indices: np.ndarray,
+    rows: np.ndarray,
+    candidates: np.ndarray,
+    candidate_indices: np.ndarray,
+) -> None:
+    """Merges candidates (M, c) into the k nearest neighbours of `rows` (M,), in place."""
+    if len(rows) == 0:
+        return
+    num_neighbours = distances.shape[1]
+    pool = np.concatenate([distances[rows], candidates], axis=1)
+    pool_indices = np.concatenate([indices[rows], candidate_indices], axis=1)
+    nearest = np.argpartition(pool, num_neighbours - 1, axis=1)[:, :num_neighbours]
+    distances[rows] = np.take_along_axis(pool, nearest, axis=1)
+    indices[rows] = np.take_along_axis(pool_indices, nearest, axis=1)
+
+
+def _dense_graph(
+    dtw: np.ndarray, score: np.ndarray, score_weight: float, num_neighbours: int
+) -> NeighbourGraph:
+    max_dtw = float(dtw.max())
+    omega = dtw / max_dtw if max_dtw > 0.0 else np.zeros_like(dtw)
+    omega += score_weight * np.abs(score[:, None] - score)
+    np.fill_diagonal(omega, np.inf)
+    indices = np.argsort(omega, axis=1, kind="stable")[:, :num_neighbours]
+    return NeighbourGraph(
+        indices=indices, distances=np.take_along_axis(omega, indices, axis=1), max_dtw=max_dtw
+    )

@@ -1,0 +1,401 @@
+"""The low-dimensional embedding: its t-SNE target and the map Psi that reproduces it.
+
+torch trains the map; numpy evaluates it, so that an online run needs no torch.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drake_safety.learning.distance import NeighbourGraph
+
+_SMALLEST_SPREAD = 1e-3
+_CHUNK = 8192
+_SAFETY_HIDDEN = 32
+
+
+def tsne(
+    graph: NeighbourGraph,
+    *,
+    perplexity: float,
+    seed: int,
+    progress: Callable[[float], None] | None = None,
+) -> np.ndarray:
+    """The t-SNE embedding of a neighbour graph, (N, 2); the same seed gives the same bits.
+
+    The distances enter as they are: openTSNE squares them itself.
+
+    Raises:
+        ValueError: The graph has fewer than three times `perplexity` neighbours a segment.
+    """
+    num_neighbours = graph.indices.shape[1]
+    if num_neighbours < int(3 * perplexity):
+        raise ValueError(
+            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours a segment, "
+            f"the graph has {num_neighbours}"
+        )
+    import openTSNE
+    from openTSNE.affinity import PerplexityBasedNN
+    from openTSNE.nearest_neighbors import PrecomputedNeighbors
+
+    done = 0
+
+    def report(iteration: int, error: float, embedding: np.ndarray) -> bool:
+        nonlocal done
+        done += 50
+        if progress is not None:
+            progress(min(done / 750, 1.0))
+        return False
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        affinities = PerplexityBasedNN(
+            knn_index=PrecomputedNeighbors(graph.indices, graph.distances),
+            perplexity=perplexity,
+            random_state=seed,
+            n_jobs=-1,
+        )
+        embedding = openTSNE.TSNE(
+            initialization="random",
+            random_state=seed,
+            n_jobs=-1,
+            callbacks=report,
+            callbacks_every_iters=50,
+        ).fit(affinities=affinities)
+    return np.asarray(embedding, dtype=float).copy()
+
+
+class EmbeddingOutput(NamedTuple):
+    """What a stack of K maps says of inputs.
+
+    Attributes:
+        embedding: y, (K, N, 2).
+        unsafe_logit: Logit of an unsafe end, (K, N); NaN for maps without a safety head.
+        margins: Predicted smallest future margin of each constraint, in the margins' own unit,
+            (K, N, n_c); NaN for maps without a margin head.
+    """
+
+    embedding: np.ndarray
+    unsafe_logit: np.ndarray
+    margins: np.ndarray
+
+
+class Embedding:
+    """A stack of K trained maps Psi of equal shape, immutable.
+
+    Its weights are the arrays `weights`: "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
+    "output.weight" (K, width, 2 + n_c) whose first two columns give y and the others the margins;
+    with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
+    (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
+    """
+
+    def __init__(self, weights: Mapping[str, np.ndarray], *, num_margins: int):
+        """Takes the weights as they are.
+
+        Raises:
+            ValueError: Weights are missing or their shapes do not fit each other.
+        """
+        self.weights = {
+            name: np.ascontiguousarray(w, dtype=np.float32) for name, w in weights.items()
+        }
+        for w in self.weights.values():
+            w.setflags(write=False)
+        self.num_margins = num_margins
+        self.num_layers = sum(name.startswith("trunk.") for name in self.weights) // 2
+        names = [f"trunk.{i}" for i in range(self.num_layers)] + ["output"]
+        missing = [
+            f"{name}.{kind}"
+            for name in names
+            for kind in ("weight", "bias")
+            if f"{name}.{kind}" not in self.weights
+        ]
+        if missing or self.num_layers == 0:
+            raise ValueError(f"Embedding: {missing or 'trunk layers'} missing in {list(self.weights)}")
+        self._layers = [
+            (self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :])
+            for name in names
+        ]
+        for (w, _), (following, _) in zip(self._layers, self._layers[1:], strict=False):
+            if w.shape[0] != following.shape[0] or w.shape[2] != following.shape[1]:
+                raise ValueError(
+                    f"Embedding: a layer of shape {w.shape} is followed by one of {following.shape}"
+                )
+        first, first_bias = self._layers[0]
+        self.num_members, self.num_inputs, width = first.shape
+        if self._layers[-1][0].shape[2] != 2 + num_margins:
+            raise ValueError(
+                f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
+                f"{2 + num_margins} for {num_margins} margins"
+            )
+        self.has_safety_head = "safety.0.weight" in self.weights
+        # All members share the input, so that one product serves their first layers.
+        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(self.num_inputs, -1)
+        self._first_bias = first_bias.reshape(-1).copy()
+        self._stacked = (self.num_members, 1, width)
+
+    def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
+        """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
+        x = np.asarray(x, dtype=np.float32)
+        if x.ndim != 2 or x.shape[1] != self.num_inputs:
+            raise ValueError(f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})")
+        shape = (self.num_members, len(x))
+        output = EmbeddingOutput(
+            np.empty((*shape, 2)),
+            np.full(shape, np.nan),
+            np.full((*shape, self.num_margins), np.nan),
+        )
+        for start in range(0, len(x), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            is_finite = np.all(np.isfinite(x[rows]), axis=1)
+            chunk = np.where(is_finite[:, None], x[rows], np.float32(0.0))
+            for member in range(self.num_members):
+                z = chunk
+                for weight, bias in self._layers[:-1]:
+                    z = z @ weight[member]
+                    z += bias[member]
+                    np.maximum(z, 0.0, out=z)
+                weight, bias = self._layers[-1]
+                z = z @ weight[member]
+                z += bias[member]
+                z[~is_finite] = np.nan
+                output.embedding[member, rows] = z[:, :2]
+                output.margins[member, rows] = z[:, 2:]
+                if self.has_safety_head:
+                    output.unsafe_logit[member, rows] = self._logit(z[None, :, :2], member)
+        return output
+
+    def embed(self, x: np.ndarray) -> np.ndarray:
+        """Psi: inputs (N, n_x) to points (K, N, 2)."""
+        return self.evaluate(x).embedding
+
+    def evaluate_one(self, x: np.ndarray) -> np.ndarray:
+        """y and margins of one finite float32 input (n_x,) by every member, (K, 2 + n_c)."""
+        z = x.dot(self._first)
+        z += self._first_bias
+        np.maximum(z, 0.0, out=z)
+        z = z.reshape(self._stacked)
+        layers = self._layers
+        for weight, bias in layers[1:-1]:
+            z = z @ weight
+            z += bias
+            np.maximum(z, 0.0, out=z)
+        weight, bias = layers[-1]
+        z = z @ weight
+        z += bias
+        return z[:, 0]
+
+    def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
+        w = self.weights
+        hidden = np.maximum(y[0] @ w["safety.0.weight"][member] + w["safety.0.bias"][member], 0.0)
+        return (hidden @ w["safety.1.weight"][member] + w["safety.1.bias"][member])[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapSettings:
+    """How a map Psi is built and trained.
+
+    Attributes:
+        hidden_sizes: Widths of the trunk's layers.
+        dropout: Share of trunk activations dropped while training.
+        epochs: Passes over the inputs.
+        batch_size: Inputs a step.
+        learning_rate: Peak of the one-cycle schedule.
+        safety_weight: Weight of the safety head's cross entropy; 0 leaves the head out.
+        margin_weight: Weight of the margin head's Huber loss; 0 leaves the head out.
+        margin_unit: Margin that counts as one in the Huber loss [unit of the margins].
+        margin_range: Margins are clipped to this range [unit of the margins].
+    """
+
+    hidden_sizes: tuple[int, ...]
+    dropout: float
+    epochs: int
+    batch_size: int
+    learning_rate: float
+    safety_weight: float
+    margin_weight: float
+    margin_unit: float
+    margin_range: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapData:
+    """What a map Psi learns from.
+
+    Attributes:
+        x: Inputs, (N, n_x).
+        has_target: Inputs that t-SNE saw, (N,).
+        target: Their points, in the order of x, (M, 2).
+        is_unsafe: Whether the input's episode ended unsafely, (N,).
+        margins: Smallest future margins, (N, n_c).
+        sample_weight: Weight of each input in all losses, (N,).
+    """
+
+    x: np.ndarray
+    has_target: np.ndarray
+    target: np.ndarray
+    is_unsafe: np.ndarray
+    margins: np.ndarray
+    sample_weight: np.ndarray
+
+
+def train_map(
+    data: MapData,
+    settings: MapSettings,
+    *,
+    seed: int,
+    progress: Callable[[float], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Trains one map Psi; the same seed on the same machine gives the same weights.
+
+    Departure: the paper trains Psi on ||y - Psi(x)|| alone and leaves safety out. With a safety head on
+    y and a margin head on the trunk, the map separates what t-SNE places together but ends
+    differently; held-out accuracy on the robots rises from weak to that of a direct classifier.
+
+    Args:
+        data: Inputs and targets; x is standardised here, with a floor under the spread so that a
+            column that hardly moves is not amplified.
+        settings: Shape of the network and of the training.
+        seed: Seeds the initial weights, the batches and the dropout.
+        progress: Called with the fraction done.
+
+    Returns:
+        The weights of one member, as `Embedding` names them, without the leading member axis.
+    """
+    import torch
+
+    num_threads = torch.get_num_threads()
+    # Layers this small gain nothing from threads; one is also the quickest on the wall clock.
+    torch.set_num_threads(1)
+    try:
+        return _train(torch, data, settings, seed, progress)
+    finally:
+        torch.set_num_threads(num_threads)
+
+
+def _train(
+    torch: Any,
+    data: MapData,
+    settings: MapSettings,
+    seed: int,
+    progress: Callable[[float], None] | None,
+) -> dict[str, np.ndarray]:
+    has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
+    mean = data.x.mean(axis=0)
+    spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD)
+    target_scale = float(data.target.std())
+    num_inputs, num_margins = data.x.shape[1], data.margins.shape[1] if has_margins else 0
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        net = _build_network(torch, num_inputs, num_margins, has_safety, settings)
+        x = torch.from_numpy(((data.x - mean) / spread).astype(np.float32))
+        target = torch.zeros(len(x), 2)
+        has_target = torch.from_numpy(np.asarray(data.has_target, dtype=bool))
+        target[has_target] = torch.from_numpy((data.target / target_scale).astype(np.float32))
+        weight = torch.from_numpy(np.asarray(data.sample_weight, dtype=np.float32))
+        target_weight = weight * has_target
+        is_unsafe = torch.from_numpy(np.asarray(data.is_unsafe, dtype=np.float32))
+        margins = torch.from_numpy(
+            (np.clip(data.margins, *settings.margin_range) / settings.margin_unit).astype(np.float32)
+        )
+        num_batches = -(-len(x) // settings.batch_size)
+        optimiser = torch.optim.AdamW(
+            net.parameters(), lr=settings.learning_rate, weight_decay=1e-4, fused=True
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser,
+            max_lr=settings.learning_rate,
+            total_steps=settings.epochs * num_batches + 1,
+        )
+        functional = torch.nn.functional
+        # The targets' share of a batch varies by chance, so its mean over the whole set divides.
+        mean_target_weight = float(target_weight.mean())
+        for epoch in range(settings.epochs):
+            for batch in torch.randperm(len(x)).split(settings.batch_size):
+                z = net["trunk"](x[batch])
+                output = net["output"](z)
+                y, w = output[:, :2], weight[batch]
+                squared = ((y - target[batch]) ** 2).sum(dim=1)
+                loss = (target_weight[batch] * squared).mean() / mean_target_weight
+                if has_safety:
+                    logit = net["safety"](y)[:, 0]
+                    entropy = functional.binary_cross_entropy_with_logits(
+                        logit, is_unsafe[batch], weight=w
+                    )
+                    loss = loss + settings.safety_weight * entropy
+                if has_margins:
+                    huber = functional.huber_loss(output[:, 2:], margins[batch], reduction="none")
+                    loss = loss + settings.margin_weight * (w * huber.mean(dim=1)).mean()
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+            if progress is not None:
+                progress((epoch + 1) / settings.epochs)
+    return _folded_weights(net, mean, spread, target_scale, num_margins, settings)
+
+
+def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:
+    """One `Embedding` of the members that `train_map` returned."""
+    weights = {name: np.stack([member[name] for member in members]) for name in members[0]}
+    return Embedding(weights, num_margins=num_margins)
+
+
+def _build_network(
+    torch: Any, num_inputs: int, num_margins: int, has_safety: bool, settings: MapSettings
+) -> Any:
+    nn = torch.nn
+    trunk, width = [], num_inputs
+    for size in settings.hidden_sizes:
+        trunk += [nn.Linear(width, size), nn.ReLU()]
+        if settings.dropout > 0.0:
+            trunk.append(nn.Dropout(settings.dropout))
+        width = size
+    net = nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)})
+    if has_safety:
+        net["safety"] = nn.Sequential(
+            nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1)
+        )
+    return net
+
+
+def _folded_weights(
+    net: Any,
+    mean: np.ndarray,
+    spread: np.ndarray,
+    target_scale: float,
+    num_margins: int,
+    settings: MapSettings,
+) -> dict[str, np.ndarray]:
+    """The trained layers with the standardisation of x, y and the margins folded in."""
+
+    def linear_layers(module: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [
+            (
+                layer.weight.detach().numpy().astype(float).T,
+                layer.bias.detach().numpy().astype(float),
+            )
+            for layer in module
+            if hasattr(layer, "weight")
+        ]
+
+    weights: dict[str, np.ndarray] = {}
+    for index, (weight, bias) in enumerate(linear_layers(net["trunk"])):
+        if index == 0:
+            bias = bias - (mean / spread) @ weight
+            weight = weight / spread[:, None]
+        weights[f"trunk.{index}.weight"], weights[f"trunk.{index}.bias"] = weight, bias
+    ((weight, bias),) = linear_layers([net["output"]])
+    column_scale = np.array([target_scale] * 2 + [settings.margin_unit] * num_margins)
+    weights["output.weight"], weights["output.bias"] = weight * column_scale, bias * column_scale
+    if "safety" in net:
+        for index, (weight, bias) in enumerate(linear_layers(net["safety"])):
+            if index == 0:
+                weight = weight / target_scale
+            weights[f"safety.{index}.weight"], weights[f"safety.{index}.bias"] = weight, bias
+    return weights

@@ -1,0 +1,280 @@
+"""Episodes of a closed loop, their unsafety scores, and their split into horizon-long segments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import overload
+
+import numpy as np
+
+DIVERGED = "diverged"
+"""Cause of an episode whose simulation failed; such an episode says nothing about safety."""
+
+
+@dataclass(kw_only=True)
+class EpisodesInfo:
+    """What all episodes of a set share.
+
+    Attributes:
+        scenario: Name of the scenario.
+        scenario_hash: SHA-256 (hex) of the canonical text of the scenario.
+        variation: Which plant was simulated, e.g. "nominal" or "actual".
+        seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
+        step_s: Time between two rows of an episode, the assessment step [s].
+        horizon: The safety assessment horizon H [steps].
+        constraint_names: The n_c safety constraints: the columns of `margins` and the possible causes.
+        state_names: Names of the n_s columns of `state`.
+        output_names: Names of the n_z columns of `output`.
+        feature_names: Names of the n_f columns of `features`.
+        versions: Package versions the episodes were made with.
+    """
+
+    scenario: str
+    scenario_hash: str
+    variation: str
+    seed: int
+    step_s: float
+    horizon: int
+    constraint_names: list[str]
+    state_names: list[str]
+    output_names: list[str]
+    feature_names: list[str]
+    versions: dict[str, str]
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ValueError(f"episodes of '{self.scenario}': horizon is {self.horizon}, expected >= 1")
+        if not self.step_s > 0.0:
+            raise ValueError(f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0")
+
+
+@dataclass(kw_only=True, eq=False)
+class Episode:
+    """One closed-loop rollout, sampled at rows 0..K; row r is at time r * step_s.
+
+    The last row is the sample at the end: t = T, or the instant at which the safe set was left.
+
+    Attributes:
+        index: Number of the episode within its set.
+        time_s: Time [s], (K+1,).
+        state: State as the assessor sees it, observation noise included, (K+1, n_s).
+        true_state: State without observation noise, (K+1, n_s).
+        output: Measured output z [m], (K+1, n_z).
+        desired_output: Desired output z* [m], (K+1, n_z).
+        desired_preview: The coming H desired outputs, row-major in time, in the frame of `state`,
+            (K+1, H*n_z).
+        features: Features as the assessor sees them, (K+1, n_f).
+        margins: Signed distance to each safety constraint, negative where violated, (K+1, n_c).
+        is_safe: Whether the whole rollout stayed in the safe set.
+        cause: "" when safe, else the name of the violated constraint, or "diverged".
+        first_step: First row whose future is undisturbed; the rows before are no training data.
+    """
+
+    index: int
+    time_s: np.ndarray
+    state: np.ndarray
+    true_state: np.ndarray
+    output: np.ndarray
+    desired_output: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    margins: np.ndarray
+    is_safe: bool
+    cause: str
+    first_step: int = 0
+
+    @property
+    def num_steps(self) -> int:
+        """K, the number of steps from the first row to the last."""
+        return len(self.time_s) - 1
+
+
+class Episodes(Sequence[Episode]):
+    """A set of episodes that share one `EpisodesInfo`; a slice of it is again a set."""
+
+    def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
+        """Checks every episode against `info`.
+
+        Raises:
+            ValueError: An array has not the width or the number of rows that `info` and `time_s` imply,
+                or the cause is unknown or contradicts `is_safe`.
+        """
+        self.info = info
+        self._episodes = list(episodes)
+        for episode in self._episodes:
+            _check_episode(info, episode)
+
+    def __len__(self) -> int:
+        return len(self._episodes)
+
+    @overload
+    def __getitem__(self, key: int) -> Episode: ...
+    @overload
+    def __getitem__(self, key: slice) -> Episodes: ...
+    def __getitem__(self, key: int | slice) -> Episode | Episodes:
+        """One episode, or the set of the episodes of a slice."""
+        if isinstance(key, slice):
+            return Episodes(self.info, self._episodes[key])
+        return self._episodes[key]
+
+    @property
+    def num_safe(self) -> int:
+        """Number of safe episodes."""
+        return sum(episode.is_safe for episode in self._episodes)
+
+    @property
+    def num_diverged(self) -> int:
+        """Number of episodes whose simulation failed."""
+        return sum(episode.cause == DIVERGED for episode in self._episodes)
+
+    @property
+    def num_unsafe(self) -> int:
+        """Number of episodes that left the safe set."""
+        return len(self) - self.num_safe - self.num_diverged
+
+
+def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
+    who = f"episode {episode.index} of '{info.scenario}'"
+    num_rows = len(episode.time_s)
+    num_states, num_outputs = len(info.state_names), len(info.output_names)
+    widths = {
+        "state": num_states,
+        "true_state": num_states,
+        "output": num_outputs,
+        "desired_output": num_outputs,
+        "desired_preview": info.horizon * num_outputs,
+        "features": len(info.feature_names),
+        "margins": len(info.constraint_names),
+    }
+    for name, width in widths.items():
+        shape = np.shape(getattr(episode, name))
+        if shape != (num_rows, width):
+            raise ValueError(f"{who}: {name} has shape {shape}, expected {(num_rows, width)}")
+    if num_rows == 0:
+        raise ValueError(f"{who}: it has no rows, expected at least one")
+    if not 0 <= episode.first_step < num_rows:
+        raise ValueError(f"{who}: first_step is {episode.first_step}, expected 0..{num_rows - 1}")
+    if episode.is_safe != (episode.cause == ""):
+        raise ValueError(f"{who}: is_safe is {episode.is_safe} but the cause is '{episode.cause}'")
+    if episode.cause not in ("", DIVERGED, *info.constraint_names):
+        raise ValueError(
+            f"{who}: unknown cause '{episode.cause}'; the constraints are {info.constraint_names}"
+        )
+
+
+def unsafety_score(remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float) -> np.ndarray:
+    """How much each segment contributes to its episode's unsafe end: lambda, in [0, 1].
+
+    Args:
+        remaining_steps: R, steps from the segment's start to the termination, (N,).
+        is_unsafe: Whether the segment's episode ended unsafely, (N,).
+        discount: gamma in [0, 1].
+
+    Returns:
+        The unsafety scores, (N,): 0 for a safe episode's segments.
+    """
+    # Eq. (unsafety_score): lambda = gamma^R(i) if the trajectory is unsafe, else 0.
+    return np.where(is_unsafe, float(discount) ** np.asarray(remaining_steps, dtype=float), 0.0)
+
+
+@dataclass(kw_only=True, eq=False)
+class Segments:
+    """Pieces of episodes, each at most H steps long, with what a safety assessment learns from.
+
+    Attributes:
+        episode: Position of the episode in its set, (N,).
+        start_row: Row of the episode at which the segment starts, (N,).
+        is_first: Whether the segment starts at its episode's `first_step`, (N,).
+        remaining_steps: R, steps until the episode ends, (N,).
+        is_unsafe: Whether the episode ended unsafely, (N,).
+        score: Unsafety score lambda, (N,).
+        cause: Column of the constraint that ended the episode, -1 when safe, (N,).
+        state: Starting state as the assessor sees it, (N, n_s).
+        true_state: Starting state without observation noise, (N, n_s).
+        desired_preview: Coming desired outputs, (N, H*n_z).
+        features: Features at the start, (N, n_f).
+        future_margins: Smallest margin of each constraint from the start to the episode's end, (N, n_c).
+        error: Tracking errors z* - z [m], the last one repeated beyond the segment's length, (N, H, n_z).
+        length: Number of samples of `error` that were recorded, (N,): H, or less where cut short.
+    """
+
+    episode: np.ndarray
+    start_row: np.ndarray
+    is_first: np.ndarray
+    remaining_steps: np.ndarray
+    is_unsafe: np.ndarray
+    score: np.ndarray
+    cause: np.ndarray
+    state: np.ndarray
+    true_state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    future_margins: np.ndarray
+    error: np.ndarray
+    length: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def take(self, rows: np.ndarray) -> Segments:
+        """The segments chosen by a mask or by indices, (M,)."""
+        return Segments(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
+    """Cuts episodes into segments of the assessment horizon H.
+
+    A safe episode gives segments that fit whole into it. An unsafe one gives a segment from every start
+    before its end; those that reach beyond the end are cut short and keep the terminal sample.
+    Diverged episodes give none.
+
+    Args:
+        episodes: The episodes; H is `episodes.info.horizon`.
+        stride: Rows between two starts; `stride=H` is the paper's split.
+        discount: gamma of the unsafety score.
+
+    Raises:
+        ValueError: The stride is below 1, or no episode is long enough for one segment.
+    """
+    if stride < 1:
+        raise ValueError(f"split: stride is {stride}, expected >= 1")
+    horizon = episodes.info.horizon
+    offsets = np.arange(horizon)
+    names = episodes.info.constraint_names
+    pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
+    for position, episode in enumerate(episodes):
+        if episode.cause == DIVERGED:
+            continue
+        num_steps = episode.num_steps
+        end = num_steps - horizon + 1 if episode.is_safe else num_steps
+        rows = np.arange(episode.first_step, end, stride)
+        if rows.size == 0:
+            continue
+        remaining = num_steps - rows
+        is_unsafe = np.full(rows.size, not episode.is_safe)
+        error = episode.desired_output - episode.output
+        piece = {
+            "episode": np.full(rows.size, position),
+            "start_row": rows,
+            "is_first": rows == episode.first_step,
+            "remaining_steps": remaining,
+            "is_unsafe": is_unsafe,
+            "score": unsafety_score(remaining, is_unsafe, discount),
+            "cause": np.full(rows.size, -1 if episode.is_safe else names.index(episode.cause)),
+            "state": episode.state[rows],
+            "true_state": episode.true_state[rows],
+            "desired_preview": episode.desired_preview[rows],
+            "features": episode.features[rows],
+            "future_margins": np.minimum.accumulate(episode.margins[::-1], axis=0)[::-1][rows],
+            "error": error[np.minimum(rows[:, None] + offsets, num_steps)],
+            "length": np.minimum(horizon, remaining + 1),
+        }
+        for name, values in piece.items():
+            pieces[name].append(values)
+    if not pieces["score"]:
+        raise ValueError(
+            f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives a segment of "
+            f"{horizon} steps ({episodes.num_diverged} diverged)"
+        )
+    return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})

@@ -1,0 +1,1 @@
+"""Closed loops, scenarios, rollouts, and episodes on disk."""

@@ -1,0 +1,135 @@
+"""Balls as free bodies that are thrown at a robot."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
+from pydrake.systems.framework import Context
+
+from drake_safety.control.robot import add_to_package_map
+
+_GRAVITY = np.array([0.0, 0.0, -9.81])
+_PARKED = np.array([50.0, 50.0, 0.0])
+
+
+@dataclass(kw_only=True)
+class Throw:
+    """One ball: how heavy, how fast, from where."""
+
+    time_s: float = 0.0
+    """When it touches the robot [s]."""
+    mass_kg: float = 2.0
+    speed_m_s: float = 6.0
+    """Horizontal speed at impact [m/s]."""
+    direction_rad: float = math.pi / 2
+    """Where it flies to, as an angle from the world's x axis [rad]."""
+    offset_m: float = 0.0
+    """Sideways offset of its line from the base's origin [m]."""
+    height_m: float = 0.0
+    """Height of its line over the base's origin [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("mass_kg", "speed_m_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"throw: {name} must be positive; got {getattr(self, name)}")
+
+
+def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
+    """Adds a ball to a plant that is not finalised."""
+    parser = Parser(plant)
+    add_to_package_map(parser.package_map())
+    (instance,) = parser.AddModels(url="package://drake_safety_models/scenes/ball.sdf")
+    return instance
+
+
+class Ball:
+    """A ball in a finalised plant.
+
+    Args:
+        plant: The plant.
+        scene_graph: Its scene graph.
+        instance: The ball's model instance.
+        target: Body to throw at.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        instance: ModelInstanceIndex,
+        target: str,
+    ):
+        self._plant = plant
+        self._body = plant.get_body(plant.GetBodyIndices(instance)[0])
+        self._target = plant.GetBodyByName(target)
+        inspector = scene_graph.model_inspector()
+        (self._geometry,) = plant.GetCollisionGeometriesForBody(self._body)
+        self.radius_m = inspector.GetShape(self._geometry).radius()
+        robot = self._target.model_instance()
+        self._robot_geometries = [
+            geometry
+            for index in plant.GetBodyIndices(robot)
+            for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        ]
+
+    def park(self, context: Context) -> None:
+        """Puts the ball at rest on the ground, far away.
+
+        Args:
+            context: The plant's Context.
+        """
+        p = _PARKED + [0.0, 0.0, self.radius_m]
+        self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
+        self._plant.SetFreeBodySpatialVelocity(context, self._body, SpatialVelocity.Zero())
+
+    def throw(self, context: Context, throw: Throw, lead_s: float) -> None:
+        """Puts the ball in flight so that it touches the robot after ``lead_s``.
+
+        The line of flight is traced to the first touch with any collision geometry of the
+        robot as it is posed now, sphere by sphere; gravity during the flight is allowed for, so
+        that the ball arrives horizontally.
+
+        Args:
+            context: The plant's Context.
+            throw: Mass, speed, direction, offsets.
+            lead_s: Time of flight until the touch [s].
+
+        Raises:
+            ValueError: The line misses the robot.
+        """
+        inertia = SpatialInertia.SolidSphereWithMass(throw.mass_kg, self.radius_m)
+        self._body.SetSpatialInertiaInBodyFrame(context, inertia)
+        direction = np.array([math.cos(throw.direction_rad), math.sin(throw.direction_rad), 0.0])
+        sideways = np.array([-direction[1], direction[0], 0.0])
+        aim = self._plant.EvalBodyPoseInWorld(context, self._target).translation()
+        aim = aim + throw.offset_m * sideways + [0.0, 0.0, throw.height_m]
+        # Sphere tracing: the signed distance is a step that cannot overshoot.
+        query = self._plant.get_geometry_query_input_port().Eval(context)
+        p = aim - 2.0 * direction
+        for _ in range(100):
+            self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
+            query = self._plant.get_geometry_query_input_port().Eval(context)
+            distance = min(
+                query.ComputeSignedDistancePairClosestPoints(self._geometry, other).distance
+                for other in self._robot_geometries
+            )
+            if distance < 1e-4 or (p - aim) @ direction > 1.0:
+                break
+            p = p + distance * direction
+        else:
+            distance = math.inf
+        if not distance < 1e-4:
+            self.park(context)
+            raise ValueError(f"throw: the line of flight of {throw} misses the robot")
+        velocity = throw.speed_m_s * direction - _GRAVITY * lead_s
+        start = p - velocity * lead_s - 0.5 * _GRAVITY * lead_s**2
+        self._plant.SetFreeBodyPose(context, self._body, RigidTransform(start))
+        self._plant.SetFreeBodySpatialVelocity(
+            context, self._body, SpatialVelocity(np.zeros(3), velocity)
+        )

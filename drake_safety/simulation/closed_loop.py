@@ -1,0 +1,158 @@
+"""ClosedLoop: the contract between a task's diagram and everything that runs or judges it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.scenario import Scenario
+
+REQUIRED_PORTS = (
+    "state",
+    "true_state",
+    "output",
+    "desired_output",
+    "desired_preview",
+    "features",
+    "margins",
+    "safe",
+)
+ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
+RECOVERY_PORTS = ("recovery_active",)
+
+
+class ClosedLoop(Diagram):
+    """A task's diagram: plant, controller, planner, monitor, and the assessor when there is Γ.
+
+    Whoever runs, records or judges a task uses only what this class promises: the output ports
+    below, :meth:`reset`, and the names of what the ports carry. A subclass wires its systems in
+    ``__init__`` and ends with :meth:`finish`.
+
+    ====================== ======= ============================================================
+    output port            size    meaning
+    ====================== ======= ============================================================
+    ``state``              n_s     s_k as the assessor sees it, in the stance frame
+    ``true_state``         n_s     s_k without observation noise
+    ``output``             n_z     z_k, measured, in the world [m]
+    ``desired_output``     n_z     z*_k, in the world [m]
+    ``desired_preview``    H n_z   z*_{k:k+H}, row-major in time, in the stance frame [m]
+    ``features``           n_f     the safe set's features of state and preview
+    ``margins``            n_c     signed margins of the safe set, negative = violated
+    ``safe``               1       1 while the state is inside the safe set
+    ``safety_probability`` 1       Γ, with an assessment (also ``normalized_…``)
+    ``belief``             3       (safe, unsafe, unknown), with an assessment
+    ``recovery_active``    1       1 during a recovery step, with recovery
+    ====================== ======= ============================================================
+
+    Args:
+        scenario: The scenario.
+        variation: Name of the plant variation.
+        assessment: Γ, or None.
+
+    Attributes:
+        state_names, output_names, feature_names, constraint_names: What the ports carry.
+    """
+
+    Parameters: type
+    """Schema of the task's own part of the scenario file."""
+
+    state_names: list[str]
+    output_names: list[str]
+    feature_names: list[str]
+    constraint_names: list[str]
+
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
+        super().__init__()
+        self.scenario = scenario
+        self.variation_name = variation
+        self.variation = scenario.variation(variation)
+        self.assessment = assessment
+
+    def finish(self, builder: DiagramBuilder) -> None:
+        """Builds the diagram and checks that it keeps the contract.
+
+        Raises:
+            ValueError: A promised port is missing, or the assessment was made for a diagram
+                with other names or sizes.
+        """
+        builder.BuildInto(self)
+        ports = [self.get_output_port(i).get_name() for i in range(self.num_output_ports())]
+        required = REQUIRED_PORTS + (ASSESSMENT_PORTS if self.assessment else ())
+        missing = [name for name in required if name not in ports]
+        if missing:
+            raise ValueError(
+                f"task '{type(self).__name__}' exports no port {missing}; it exports {ports}"
+            )
+
+    @classmethod
+    def model_files(cls, scenario: Scenario) -> list[str]:
+        """Files besides the scenario that decide what the plant is; part of its hash."""
+        del scenario
+        return []
+
+    def reset(self, context: Context, rng: np.random.Generator) -> int:
+        """Samples an initial state and a plan into the root Context.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            rng: Source of every draw.
+
+        Returns:
+            The first step whose future is undisturbed: 0, or later when the episode begins
+            with a push.
+        """
+        raise NotImplementedError
+
+    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
+        """Sets a ball in flight towards the robot; tasks with a ball override this.
+
+        Args:
+            context: The diagram's Context.
+            throw: Mass, speed and direction.
+            lead_s: Time from now until the ball touches the robot, were it to stay still [s].
+
+        Returns:
+            When the ball touches, simulation time [s].
+
+        Raises:
+            ValueError: The task was built without a ball.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has no ball to throw")
+
+
+def check_assessment(
+    assessment: SafetyAssessment,
+    *,
+    scenario: Scenario,
+    state_names: list[str],
+    output_names: list[str],
+    feature_names: list[str],
+    constraint_names: list[str],
+) -> None:
+    """Refuses an assessment that was learned from something else.
+
+    Raises:
+        ValueError: Both sides are named.
+    """
+    info = assessment.info_
+    sides = {
+        "scenario": (info.scenario, scenario.name),
+        "horizon": (info.horizon, scenario.assessment.horizon),
+        "step_s": (info.step_s, scenario.step_s),
+        "state": (list(info.state_names), list(state_names)),
+        "output": (list(info.output_names), list(output_names)),
+        "features": (list(info.feature_names), list(feature_names)),
+        "constraints": (list(info.constraint_names), list(constraint_names)),
+        "scenario hash": (info.scenario_hash, scenario.simulation_hash()),
+    }
+    for what, (learned, here) in sides.items():
+        if learned != here:
+            raise ValueError(
+                f"assessment and diagram differ in {what}: the assessment was learned with "
+                f"{learned}, the diagram has {here}"
+            )

@@ -1,0 +1,393 @@
+"""Episodes on disk: a folder with an ``info.json`` and Parquet shards, written as they finish.
+
+``info.json`` holds what all episodes share. Each ``episodes-NNNNN.parquet`` has one row per
+(episode, step); arrays are columns of fixed-size lists of float64 in SI units. A file is written
+under a temporary name, which starts with a dot, and renamed: whatever carries its final name is
+whole, and a run that was stopped loses at most the episodes it had not flushed. Without this
+library the rows are read by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
+"""
+
+import dataclasses
+import itertools
+import json
+import logging
+import os
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+__all__ = ["EpisodeWriter", "completed", "load_episodes", "read_info"]
+
+_SCHEMA_VERSION = 1
+_INFO_NAME = "info.json"
+_SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
+_LOGGER = logging.getLogger("drake_safety")
+
+
+class EpisodeWriter:
+    """Appends episodes to a folder, a shard at a time; a context manager.
+
+    Leaving the ``with`` block writes what is pending, after an exception or Ctrl-C too. Opening a
+    folder that holds episodes goes on where it ended: ``completed(path)`` says which are done. One
+    folder has one writer at a time.
+
+    Args:
+        path: The folder; made if it does not exist.
+        info: What all episodes share.
+        extra: Anything else worth keeping in ``info.json``, as JSON types (the command, the
+            scenario's text, ...). On going on, what the folder already holds is kept.
+        flush_episodes: Number of pending episodes that make a shard.
+        flush_seconds: Age of the oldest pending episode that makes a shard [s]; looked at when an
+            episode is appended.
+
+    Raises:
+        ValueError: The folder holds episodes of another set, or is not such a folder.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        info: EpisodesInfo,
+        extra: Mapping[str, Any] | None = None,
+        *,
+        flush_episodes: int = 64,
+        flush_seconds: float = 10.0,
+    ) -> None:
+        if flush_episodes < 1:
+            raise ValueError(f"EpisodeWriter: flush_episodes must be >= 1; got {flush_episodes}")
+        if not flush_seconds > 0:
+            raise ValueError(f"EpisodeWriter: flush_seconds must be > 0; got {flush_seconds}")
+        self.path = Path(path)
+        self.info = info
+        self._flush_episodes = flush_episodes
+        self._flush_seconds = flush_seconds
+        self._pending: list[Episode] = []
+        self._pending_since_s = 0.0
+        self._is_closed = False
+        self.path.mkdir(parents=True, exist_ok=True)
+        # Before info.json is written: a folder with shards but no info.json is refused.
+        self._indices = completed(self.path)
+        if (self.path / _INFO_NAME).exists():
+            stored, _ = read_info(self.path)
+            _check_same_set(self.path, stored, info)
+        else:
+            _write_info(self.path, info, extra or {})
+        self._next_shard = 1 + max(
+            (_shard_number(shard) for shard in _shards(self.path)), default=-1
+        )
+
+    def append(self, episode: Episode) -> None:
+        """Adds one episode; it is on disk after the next flush.
+
+        Raises:
+            ValueError: The writer is closed, the episode's index is there already, or the episode
+                does not fit the info.
+        """
+        if self._is_closed:
+            raise ValueError(f"EpisodeWriter of {self.path} is closed; open it again to append")
+        if episode.index in self._indices:
+            raise ValueError(
+                f"episode {episode.index} is already in {self.path}; completed() says which are"
+            )
+        Episodes(self.info, [episode])  # refuses what does not fit the info
+        if not self._pending:
+            self._pending_since_s = time.monotonic()
+        self._pending.append(episode)
+        self._indices.add(episode.index)
+        age_s = time.monotonic() - self._pending_since_s
+        if len(self._pending) >= self._flush_episodes or age_s >= self._flush_seconds:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes the pending episodes as one shard."""
+        if not self._pending:
+            return
+        import pyarrow.parquet as pq
+
+        table = _to_table(self._pending, self.info)
+        columns = [f"{name}.list.element" for name, width in _widths(self.info).items() if width]
+        final = self.path / f"episodes-{self._next_shard:05d}.parquet"
+        with _Replacing(final) as temporary:
+            # Byte streams of float64 compress better split by significance; checksums tell a
+            # damaged page from a whole one.
+            pq.write_table(
+                table,
+                temporary,
+                compression="zstd",
+                use_dictionary=["cause"],
+                use_byte_stream_split=["time_s", *columns],
+                write_page_checksum=True,
+            )
+        self._next_shard += 1
+        self._pending = []
+
+    def close(self) -> None:
+        """Writes the pending episodes; the writer takes no more."""
+        self.flush()
+        self._is_closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exception_type: type[BaseException] | None,
+        exception: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
+    """Reads what all episodes of a folder share, and the extra that was stored with it.
+
+    Raises:
+        ValueError: There is no ``info.json``, or it is not one of ours.
+    """
+    file = Path(path) / _INFO_NAME
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path} holds no episodes: it has no {_INFO_NAME}") from None
+    except ValueError as error:
+        raise ValueError(f"{file} is not JSON: {error}") from error
+    schema_version = content.get("schema_version") if isinstance(content, dict) else None
+    if schema_version != _SCHEMA_VERSION:
+        raise ValueError(
+            f"{file} has schema version {schema_version!r}; expected {_SCHEMA_VERSION}"
+        )
+    names = [field.name for field in dataclasses.fields(EpisodesInfo)]
+    fields, extra = content.get("info"), content.get("extra")
+    if not isinstance(fields, dict) or not isinstance(extra, dict) or set(fields) != set(names):
+        got = sorted(fields) if isinstance(fields, dict) else fields
+        raise ValueError(f"{file} does not describe episodes: info has {got}; expected {names}")
+    return EpisodesInfo(**fields), extra
+
+
+def completed(path: str | os.PathLike[str]) -> set[int]:
+    """Indices of the episodes on disk; empty where nothing was written yet.
+
+    Raises:
+        ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
+    """
+    shards = _shards(Path(path))
+    if shards and not (Path(path) / _INFO_NAME).exists():
+        raise ValueError(
+            f"{path} holds {len(shards)} shards but no {_INFO_NAME}: it cannot be told which set "
+            "they belong to"
+        )
+    indices: set[int] = set()
+    for shard in shards:
+        indices.update(_read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
+    return indices
+
+
+def load_episodes(path: str | os.PathLike[str]) -> Episodes:
+    """Loads all episodes of a folder, sorted by index, bit for bit as they were appended.
+
+    An episode that stands in two shards is taken once where both are the same to the last bit.
+
+    Raises:
+        ValueError: The folder has no ``info.json``, a shard is truncated, damaged or of another
+            set, or two shards hold different episodes of the same index.
+    """
+    info, _ = read_info(path)
+    episodes: dict[int, tuple[Episode, Path]] = {}
+    for shard in _shards(Path(path)):
+        for episode in _from_table(_read_shard(shard), info, shard):
+            known, where = episodes.setdefault(episode.index, (episode, shard))
+            if known is not episode and not _is_same(known, episode):
+                raise ValueError(
+                    f"episode {episode.index} stands in {where} and in {shard.name}, and the two "
+                    "differ; remove one of the shards"
+                )
+    return Episodes(info, [episodes[index][0] for index in sorted(episodes)])
+
+
+class _Replacing:
+    """A temporary file beside `final`, renamed to it on success and removed on any exception."""
+
+    def __init__(self, final: Path) -> None:
+        self._final = final
+        # Readers of whole folders (pyarrow, pandas) skip names that start with a dot.
+        self._temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
+
+    def __enter__(self) -> Path:
+        return self._temporary
+
+    def __exit__(
+        self,
+        exception_type: type[BaseException] | None,
+        exception: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            if exception_type is None:
+                # The bytes reach the disk before the name does.
+                with self._temporary.open("rb+") as file:
+                    os.fsync(file.fileno())
+                self._temporary.replace(self._final)
+        finally:
+            self._temporary.unlink(missing_ok=True)
+
+
+def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
+    content = {
+        "schema_version": _SCHEMA_VERSION,
+        "info": dataclasses.asdict(info),
+        "extra": dict(extra),
+    }
+    try:
+        text = json.dumps(content, indent=2, ensure_ascii=False)
+    except TypeError as error:
+        raise ValueError(f"{path}: info and extra must be made of JSON types: {error}") from error
+    with _Replacing(path / _INFO_NAME) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> None:
+    """Refuses to mix sets; other package versions are only worth a warning."""
+    there = dataclasses.asdict(stored)
+    # Through JSON, as the stored one went: a tuple of names equals the list of the same names.
+    here = json.loads(json.dumps(dataclasses.asdict(given)))
+    differences = {
+        name: f"{name}: there {there[name]!r}, here {here[name]!r}"
+        for name in there
+        if there[name] != here[name]
+    }
+    versions = differences.pop("versions", None)
+    if differences:
+        raise ValueError(
+            f"{path} holds episodes of another set and cannot be continued "
+            f"({'; '.join(differences.values())})"
+        )
+    if versions:
+        _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
+
+
+def _widths(info: EpisodesInfo) -> dict[str, int]:
+    """Number of columns of each array of an episode."""
+    num_states, num_outputs = len(info.state_names), len(info.output_names)
+    return {
+        "state": num_states,
+        "true_state": num_states,
+        "output": num_outputs,
+        "desired_output": num_outputs,
+        "desired_preview": info.horizon * num_outputs,
+        "features": len(info.feature_names),
+        "margins": len(info.constraint_names),
+    }
+
+
+def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
+    import pyarrow as pa
+
+    counts = [len(episode.time_s) for episode in episodes]
+
+    def repeat(values: Sequence[Any], dtype: Any) -> np.ndarray:
+        return np.repeat(np.asarray(values, dtype=dtype), counts)
+
+    columns: dict[str, Any] = {
+        "episode": repeat([episode.index for episode in episodes], np.int64),
+        "step": np.concatenate([np.arange(count, dtype=np.int32) for count in counts]),
+        "time_s": np.concatenate([np.asarray(e.time_s, dtype=np.float64) for e in episodes]),
+    }
+    for name, width in _widths(info).items():
+        # Parquet has no lists of length 0: such an array has no column and is restored from info.
+        if width:
+            rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
+            columns[name] = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(rows)), width)
+    causes = [episode.cause for episode in episodes]
+    columns["is_safe"] = repeat([episode.is_safe for episode in episodes], np.bool_)
+    columns["cause"] = pa.array(np.repeat(np.asarray(causes, dtype=object), counts), pa.string())
+    columns["first_step"] = repeat([episode.first_step for episode in episodes], np.int32)
+    return pa.table(columns)
+
+
+def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Episode]:
+    widths = _widths(info)
+    names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
+    names += ["is_safe", "cause", "first_step"]
+    if table.column_names != names:
+        raise ValueError(f"{shard} has columns {table.column_names}; expected {names}")
+    arrays: dict[str, np.ndarray] = {}
+    for name, width in widths.items():
+        if not width:
+            arrays[name] = np.empty((table.num_rows, 0))
+            continue
+        column = table.column(name).combine_chunks()
+        if getattr(column.type, "list_size", None) != width:
+            raise ValueError(f"{shard}: {name} is {column.type}; expected lists of length {width}")
+        arrays[name] = column.flatten().to_numpy().reshape(table.num_rows, width)
+    for name in ["episode", "step", "time_s", "is_safe", "cause", "first_step"]:
+        arrays[name] = table.column(name).to_numpy()
+    episode = arrays["episode"]
+    bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), table.num_rows]
+    result = []
+    for first, last in itertools.pairwise(bounds):
+        rows = slice(first, last)
+        if not np.array_equal(arrays["step"][rows], np.arange(last - first)):
+            raise ValueError(f"{shard}: the steps of episode {episode[first]} are not 0, 1, 2, ...")
+        result.append(
+            Episode(
+                index=int(episode[first]),
+                time_s=arrays["time_s"][rows].copy(),
+                **{name: arrays[name][rows].copy() for name in widths},
+                is_safe=bool(arrays["is_safe"][first]),
+                cause=str(arrays["cause"][first]),
+                first_step=int(arrays["first_step"][first]),
+            )
+        )
+    return result
+
+
+def _is_same(a: Episode, b: Episode) -> bool:
+    for field in dataclasses.fields(Episode):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(left, np.ndarray):
+            # As bytes: NaN equals itself, and 0.0 differs from -0.0.
+            if left.shape != right.shape or left.tobytes() != right.tobytes():
+                return False
+        elif left != right:
+            return False
+    return True
+
+
+def _shards(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return []
+    return sorted(
+        (file for file in path.iterdir() if _SHARD_NAME.fullmatch(file.name)), key=_shard_number
+    )
+
+
+def _shard_number(shard: Path) -> int:
+    return int(shard.stem.removeprefix("episodes-"))
+
+
+def _read_shard(shard: Path, columns: list[str] | None = None) -> "pa.Table":
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        # ParquetFile and not read_table, which adds columns for folders named like `seed=1`.
+        with pq.ParquetFile(shard, page_checksum_verification=True) as file:
+            table = file.read(columns=columns)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(
+            f"shard {shard} is truncated or damaged ({error}); remove it and resume: its episodes "
+            "will be run again"
+        ) from error
+    if columns is not None and table.column_names != columns:
+        raise ValueError(f"{shard} holds no episodes: expected columns {columns}")
+    return table

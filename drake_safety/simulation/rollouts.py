@@ -1,0 +1,257 @@
+"""Rollouts: closed loops simulated to episodes, on one core or many, the same bits either way."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Iterable, Iterator
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus
+
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
+from drake_safety.simulation.scenario import Scenario
+
+_ROW_PORTS = (
+    "state",
+    "true_state",
+    "output",
+    "desired_output",
+    "desired_preview",
+    "features",
+    "margins",
+)
+_BATCH = 4  # Episodes a worker takes at a time.
+
+Progress = Callable[[int, int], None]
+
+
+def episode_rng(seed: int, index: int) -> np.random.Generator:
+    """The generator of episode ``index`` of a set: independent of who runs it, and when."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+
+
+def episodes_info(loop: ClosedLoop, seed: int) -> EpisodesInfo:
+    """What all episodes of a loop share."""
+    scenario = loop.scenario
+    return EpisodesInfo(
+        scenario=scenario.name,
+        scenario_hash=scenario.simulation_hash(),
+        variation=loop.variation_name,
+        seed=seed,
+        step_s=scenario.step_s,
+        horizon=scenario.assessment.horizon,
+        constraint_names=list(loop.constraint_names),
+        state_names=list(loop.state_names),
+        output_names=list(loop.output_names),
+        feature_names=list(loop.feature_names),
+        versions={name: importlib.metadata.version(name) for name in ("drake", "numpy")},
+    )
+
+
+class Recorder:
+    """Reads the contract's output ports of a loop, a row at a time.
+
+    Args:
+        loop: The closed loop.
+        names: Ports to read.
+    """
+
+    def __init__(self, loop: ClosedLoop, names: Iterable[str] = _ROW_PORTS):
+        self._ports = {name: loop.GetOutputPort(name) for name in names}
+        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in self._ports}
+        self._times: list[float] = []
+
+    def record(self, context: Context) -> None:
+        """Appends a row."""
+        for name, port in self._ports.items():
+            self._rows[name].append(port.Eval(context).copy())
+        self._times.append(context.get_time())
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The rows, ``time_s`` among them."""
+        arrays = {name: np.array(rows) for name, rows in self._rows.items()}
+        return {"time_s": np.array(self._times), **arrays}
+
+
+def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
+    """Simulates one episode: until it leaves the safe set, or its time is over.
+
+    Args:
+        loop: The closed loop; it keeps no state, and can be used again.
+        index: Number of the episode in its set.
+        seed: Seed of the set.
+
+    Returns:
+        The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
+        that were finite.
+    """
+    scenario = loop.scenario
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    first_step = loop.reset(context, episode_rng(seed, index))
+    safe = loop.GetOutputPort("safe")
+
+    def stop_when_unsafe(root: Context) -> EventStatus:
+        if safe.Eval(root)[0] < 1:
+            return EventStatus.ReachedTermination(loop, "the state left the safe set")
+        return EventStatus.DidNothing()
+
+    recorder = Recorder(loop)
+    is_diverged = False
+    try:
+        simulator.Initialize()
+        recorder.record(context)
+        if safe.Eval(context)[0] >= 1:
+            simulator.set_monitor(stop_when_unsafe)
+            for step in range(1, scenario.num_steps + 1):
+                simulator.AdvanceTo(step * scenario.step_s)
+                recorder.record(context)
+                if safe.Eval(context)[0] < 1:
+                    break
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):
+        is_diverged = True
+    arrays = recorder.arrays()
+    is_finite = np.all([np.isfinite(rows).all(axis=1) for rows in list(arrays.values())[1:]], axis=0)
+    if is_diverged or not is_finite.all():
+        num_rows = int(np.argmin(is_finite)) if not is_finite.all() else len(is_finite)
+        if num_rows == 0:
+            raise RuntimeError(
+                f"episode {index} of '{scenario.name}' (seed {seed}) has no finite initial state"
+            )
+        cause = DIVERGED
+        arrays = {name: rows[:num_rows] for name, rows in arrays.items()}
+    else:
+        worst = int(np.argmin(arrays["margins"][-1]))
+        is_safe = safe.Eval(context)[0] >= 1
+        cause = "" if is_safe else loop.constraint_names[worst]
+    first_step = min(first_step, len(arrays["time_s"]) - 1)
+    return Episode(
+        index=index, **arrays, is_safe=cause == "", cause=cause, first_step=first_step
+    )
+
+
+def run_episodes(
+    scenario: Scenario,
+    num_episodes: int,
+    *,
+    variation: str = "nominal",
+    seed: int = 0,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | None = None,
+    extra: dict[str, Any] | None = None,
+    **loop_options: Any,
+) -> Episodes:
+    """Simulates a set of episodes, in worker processes.
+
+    Episode i depends on the scenario, the variation, the seed and i alone: the arrays are the
+    same to the last bit for any number of workers.
+
+    Args:
+        scenario: The scenario.
+        num_episodes: Size of the set.
+        variation: Which plant.
+        seed: Seed of the set.
+        num_workers: Processes; as many as there are cores by default. 1 runs in this process.
+        path: Folder where episodes are kept as they finish; those of the same set that it
+            already holds are not simulated again.
+        progress: Called with the number done and the number wanted.
+        extra: Stored beside the episodes' info.
+        **loop_options: For the task.
+
+    Raises:
+        ValueError: The folder holds another set.
+    """
+    loop = scenario.make_loop(variation, **loop_options)
+    info = episodes_info(loop, seed)
+    done = completed(path) & set(range(num_episodes)) if path is not None else set()
+    todo = [index for index in range(num_episodes) if index not in done]
+    if progress is not None:
+        progress(len(done), num_episodes)
+    finished: list[Episode] = []
+    writer = EpisodeWriter(path, info, extra) if path is not None else None
+    try:
+        results = parallel_map(
+            _episode_batch,
+            [
+                (scenario, variation, loop_options, seed, todo[i : i + _BATCH])
+                for i in range(0, len(todo), _BATCH)
+            ],
+            num_workers,
+        )
+        count = len(done)
+        for batch in results:
+            for episode in batch:
+                finished.append(episode)
+                if writer is not None:
+                    writer.append(episode)
+            count += len(batch)
+            if progress is not None:
+                progress(count, num_episodes)
+    finally:
+        if writer is not None:
+            writer.close()
+    if done:
+        stored = [e for e in load_episodes(path) if e.index in done]
+        finished += stored
+    return Episodes(info, sorted(finished, key=lambda episode: episode.index))
+
+
+def parallel_map(
+    function: Callable[..., Any], arguments: list[tuple], num_workers: int | None = None
+) -> Iterator[Any]:
+    """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
+
+    Every worker has one BLAS thread, this process too when it does the work, so results do not
+    depend on the number of workers. On Ctrl-C or any error the workers end.
+
+    Args:
+        function: A function at module level.
+        arguments: One tuple a call.
+        num_workers: Processes; as many as there are cores by default.
+    """
+    import joblib
+    from threadpoolctl import threadpool_limits
+
+    num_workers = num_workers or joblib.cpu_count()
+    if num_workers == 1 or len(arguments) <= 1:
+        with threadpool_limits(1):
+            for args in arguments:
+                yield function(*args)
+        return
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(
+            n_jobs=num_workers, return_as="generator_unordered", batch_size=1
+        )
+        results = parallel(joblib.delayed(function)(*args) for args in arguments)
+        try:
+            yield from results
+        except BaseException:
+            from joblib.externals.loky import get_reusable_executor
+
+            get_reusable_executor().shutdown(wait=False, kill_workers=True)
+            raise
+
+
+_LOOPS: dict[tuple, ClosedLoop] = {}
+
+
+def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> ClosedLoop:
+    """The loop of a worker process, built once per scenario, variation and options."""
+    key = (scenario.name, scenario.simulation_hash(), variation, repr(sorted(options.items())))
+    if key not in _LOOPS:
+        _LOOPS.clear()
+        _LOOPS[key] = scenario.make_loop(variation, **options)
+    return _LOOPS[key]
+
+
+def _episode_batch(
+    scenario: Scenario, variation: str, options: dict[str, Any], seed: int, indices: list[int]
+) -> list[Episode]:
+    loop = worker_loop(scenario, variation, options)
+    return [run_episode(loop, index, seed=seed) for index in indices]

@@ -1,0 +1,237 @@
+"""A scenario: the YAML file that marries a robot and a task."""
+
+import hashlib
+import importlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+
+import drake_safety
+from drake_safety.control.robot import PlantVariation
+from drake_safety.learning.assessment import AssessmentParameters
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.closed_loop import ClosedLoop
+
+
+@dataclass(kw_only=True)
+class Scenario:
+    """What a scenario file holds. The fields under ``parameters`` are the task's own."""
+
+    name: str = ""
+    """File name without suffix; filled in by the loader."""
+    task: str = ""
+    """Import path ``package.module:Class`` of a ClosedLoop."""
+    robot: str = ""
+    """Name of a robot that comes with the package, or the path of a ``robot.yaml``."""
+    episode_duration_s: float = 2.0
+    """T [s]."""
+    step_s: float = 0.04
+    """Time between two assessment inputs, the unit of H [s]."""
+    time_step_s: float = 0.0025
+    """Step of the discrete plant [s]."""
+    control_period_s: float = 0.01
+    """Period of the controller and of the safety monitor [s]."""
+    variations: dict[str, PlantVariation] = field(default_factory=dict)
+    """Plants by name; ``nominal`` is the one that is learned from."""
+    assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
+    """How Γ is learned."""
+
+    parameters = None  # Set by the loader: an instance of the task's Parameters.
+
+    def __post_init__(self) -> None:
+        for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(
+                    f"scenario '{self.name}': {name} must be positive; got {getattr(self, name)}"
+                )
+        if self.assessment.horizon * self.step_s > self.episode_duration_s:
+            raise ValueError(
+                f"scenario '{self.name}': the assessment horizon of {self.assessment.horizon} "
+                f"steps of {self.step_s} s exceeds the episode of {self.episode_duration_s} s"
+            )
+
+    @property
+    def num_steps(self) -> int:
+        """Assessment steps of a whole episode."""
+        return round(self.episode_duration_s / self.step_s)
+
+    def variation(self, name: str) -> PlantVariation:
+        """A plant variation by name.
+
+        Raises:
+            ValueError: No such variation.
+        """
+        if name not in self.variations:
+            raise ValueError(
+                f"scenario '{self.name}' has no variation '{name}'; it has "
+                f"{list(self.variations)}"
+            )
+        return self.variations[name]
+
+    def task_class(self) -> "type[ClosedLoop]":
+        """The task, imported.
+
+        Raises:
+            ValueError: The import path is malformed or leads to no ClosedLoop.
+        """
+        return _import_task(self.task, self.name)
+
+    def make_loop(
+        self,
+        variation: str = "nominal",
+        *,
+        assessment: "SafetyAssessment | None" = None,
+        meshcat: "Meshcat | None" = None,
+        **options: Any,
+    ) -> "ClosedLoop":
+        """Builds the task's diagram.
+
+        Args:
+            variation: Which plant.
+            assessment: Γ; adds the assessor and what the task does with it.
+            meshcat: Adds a visualiser.
+            **options: The task's own, such as ``recovery=False``.
+
+        Raises:
+            ValueError: Unknown variation, or an assessment made for something else.
+        """
+        return self.task_class()(
+            self, variation, assessment=assessment, meshcat=meshcat, **options
+        )
+
+    def to_yaml(self) -> str:
+        """The scenario as canonical text, defaults included."""
+        head = yaml_dump_typed(self, schema=Scenario)
+        body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
+        return head + "---\n" + body
+
+    def simulation_hash(self) -> str:
+        """SHA-256 of all that decides what a rollout does and records, robot included.
+
+        How Γ is learned is left out, but for the horizon that shapes the preview: episodes stay
+        valid when only the learning changes.
+        """
+        text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario))
+        text["assessment"] = {"horizon": self.assessment.horizon}
+        body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
+        digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode() + body.encode())
+        for path in self.task_class().model_files(self):
+            digest.update(Path(path).read_bytes())
+        return digest.hexdigest()
+
+
+def _import_task(task: str, scenario_name: str) -> "type[ClosedLoop]":
+    module_name, _, class_name = task.partition(":")
+    if not class_name:
+        raise ValueError(
+            f"scenario '{scenario_name}': task must be 'package.module:Class'; got '{task}'"
+        )
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module_name.startswith(error.name):
+            raise
+        raise ValueError(
+            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks "
+            f"that come with the package are {task_names()}"
+        ) from error
+    if not hasattr(module, class_name):
+        from drake_safety.simulation.closed_loop import ClosedLoop
+
+        known = [
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and issubclass(value, ClosedLoop) and value is not ClosedLoop
+        ]
+        raise ValueError(
+            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'; "
+            f"it has {known}"
+        )
+    return getattr(module, class_name)
+
+
+def _scenario_folder() -> Path:
+    for folder in drake_safety.__path__:
+        if (Path(folder) / "diagrams").is_dir():
+            return Path(folder) / "diagrams"
+    raise ValueError(f"no diagrams folder beside or inside {list(drake_safety.__path__)}")
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(path.stem for path in _scenario_folder().glob("*.yaml"))
+
+
+def task_names() -> list[str]:
+    """Import paths of the modules of tasks that come with the package."""
+    return sorted(
+        f"drake_safety.diagrams.{path.stem}"
+        for path in _scenario_folder().glob("*.py")
+        if path.stem != "__init__"
+    )
+
+
+def load_scenario(name: str | Path) -> Scenario:
+    """Loads a scenario by name, or by the path of a YAML file of your own.
+
+    A relative ``robot`` path is taken from the scenario file's folder.
+
+    Args:
+        name: ``"NAME"`` of one that comes with the package, or a path.
+
+    Raises:
+        ValueError: No such scenario, unknown or ill-typed keys, or no such task.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        path = _scenario_folder() / f"{name}.yaml"
+        if not path.is_file():
+            raise ValueError(
+                f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give "
+                "the path of a YAML file"
+            )
+    if not path.is_file():
+        raise ValueError(f"scenario file '{path}' does not exist")
+    return parse_scenario(path.read_text(), name=path.stem, folder=path.resolve().parent)
+
+
+def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
+    """Reads a scenario from YAML text.
+
+    Args:
+        text: The YAML.
+        name: The scenario's name.
+        folder: Where a relative robot path starts.
+
+    Raises:
+        ValueError: As :func:`load_scenario`.
+    """
+    try:
+        raw = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"scenario '{name}' is not YAML: {error}") from error
+    if not isinstance(raw, dict) or not {"task", "robot"} <= raw.keys():
+        raise ValueError(f"scenario '{name}' must be a mapping with the keys 'task' and 'robot'")
+    parameters = raw.pop("parameters", None) or {}
+    scenario = _load_typed(Scenario, raw, f"scenario '{name}'")
+    scenario.name = name
+    if Path(scenario.robot).suffix in (".yaml", ".yml"):
+        scenario.robot = str((folder / scenario.robot).resolve())
+    schema = scenario.task_class().Parameters
+    scenario.parameters = _load_typed(schema, parameters, f"scenario '{name}', parameters")
+    return scenario
+
+
+def _load_typed(schema: type, raw: dict, who: str) -> Any:
+    try:
+        return yaml_load_typed(schema=schema, data=yaml.safe_dump(raw))
+    except Exception as error:  # Drake's loader raises several types for a misfit.
+        known = list(schema.__dataclass_fields__)
+        raise ValueError(f"{who}: {error}; keys are {known}") from error

@@ -1,0 +1,1 @@
+"""LeafSystems of the closed loop, one a file; each is usable alone."""

@@ -1,0 +1,125 @@
+"""InverseKinematicsController: a desired base position becomes joint position commands."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
+
+_LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
+
+
+class InverseKinematicsController(LeafSystem):
+    """Joint positions that carry a level base over given feet, with a gravity offset.
+
+    .. pydrake_system::
+
+        name: InverseKinematicsController
+        input_ports:
+        - plant_state
+        - desired_output
+        - desired_foot_positions (optional)
+        output_ports:
+        - desired_joint_state
+
+    The command is a discrete state, so the output has no direct feedthrough. Base yaw follows
+    the planar fit of the feet. The joint servos are the plant's own implicit ones (q̇ of the
+    command is the rate of the set point); to their set point the static offset τ/k_p is added,
+    with τ from the robot model's weight split over the feet that are down, which removes the
+    sag that a stiff-less-than-infinite servo would show. Commands respect the joint limits.
+
+    Args:
+        kinematics: The robot as the controller believes it to be.
+        stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
+        period_s: Control period [s].
+        offset_s: Time of the first tick; commands of what drives it are then fresh [s].
+
+    Raises:
+        ValueError: A stiffness is not positive.
+    """
+
+    def __init__(
+        self,
+        kinematics: RobotKinematics,
+        stiffness: np.ndarray,
+        *,
+        period_s: float,
+        offset_s: float = 0.0,
+    ):
+        super().__init__()
+        stiffness = np.asarray(stiffness, dtype=float)
+        if stiffness.shape != (kinematics.num_joints,) or not np.all(stiffness > 0):
+            raise ValueError(
+                f"inverse kinematics controller: stiffness must be {kinematics.num_joints} "
+                f"positive numbers, in the order of {kinematics.joint_names}; got {stiffness}"
+            )
+        self._kinematics = kinematics
+        self._stiffness = stiffness
+        self._period_s = period_s
+        n_j = kinematics.num_joints
+        self.DeclareVectorInputPort(
+            "plant_state", kinematics.num_positions + kinematics.num_velocities
+        )
+        self.DeclareVectorInputPort("desired_output", 3)
+        self.DeclareVectorInputPort("desired_foot_positions", 3 * kinematics.num_contacts)
+        self._feet_index = self.DeclareNumericParameter(BasicVector(3 * kinematics.num_contacts))
+        # State: joint set point without offset, then the published position and rate command.
+        state = self.DeclareDiscreteState(3 * n_j)
+        self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        self.DeclareVectorOutputPort(
+            "desired_joint_state",
+            BasicVector(2 * n_j),
+            self._calc_command,
+            {self.discrete_state_ticket(state)},
+        )
+
+    def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
+        """Sets where the feet stand while ``desired_foot_positions`` is not connected.
+
+        Args:
+            context: This system's Context.
+            p_WC: Centres of the contact spheres, (n_c, 3) [m].
+        """
+        context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
+
+    def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        kinematics = self._kinematics
+        feet_port = self.GetInputPort("desired_foot_positions")
+        if feet_port.HasValue(context):
+            feet = feet_port.Eval(context)
+        else:
+            feet = context.get_numeric_parameter(self._feet_index).get_value()
+        p_WC = feet.reshape(-1, 3)
+        yaw = fit_stance(p_WC, kinematics.nominal_contacts)[2]
+        X_WB = RigidTransform(
+            RotationMatrix.MakeZRotation(yaw), self.GetInputPort("desired_output").Eval(context)
+        )
+        joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, guess)
+        is_stance = p_WC[:, 2] - kinematics.foot_radii <= _LIFTED_M
+        torques = kinematics.gravity_torques(kinematics.positions_at(X_WB, joints), is_stance)
+        return joints, torques
+
+    def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
+        plant_state = self.GetInputPort("plant_state").Eval(context)
+        guess = plant_state[7 : self._kinematics.num_positions]
+        joints, torques = self._solve(context, guess)
+        command = joints + torques / self._stiffness
+        discrete_state.set_value(np.concatenate([joints, command, np.zeros_like(joints)]))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        n_j = self._kinematics.num_joints
+        previous = context.get_discrete_state_vector().get_value()[:n_j].copy()
+        joints, torques = self._solve(context, previous)
+        limit = self._kinematics.velocity_limits
+        rate = np.clip((joints - previous) / self._period_s, -limit, limit)
+        discrete_state.set_value(
+            np.concatenate([joints, joints + torques / self._stiffness, rate])
+        )
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        n_j = self._kinematics.num_joints
+        output.SetFromVector(context.get_discrete_state_vector().get_value()[n_j:])

@@ -1,0 +1,66 @@
+"""PlanFeatures: the safe set's margins now and along the plan, as inputs of the assessor."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+
+class FeatureMap(Protocol):
+    """What a safe set with features offers beside its margins."""
+
+    feature_names: list[str]
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """Features (n_f,) of a measured state and the preview (H, n_z)."""
+        ...
+
+
+class PlanFeatures(LeafSystem):
+    """Evaluates the safe set's features on the measured state and the desired preview.
+
+    .. pydrake_system::
+
+        name: PlanFeatures
+        input_ports:
+        - plant_state
+        - desired_preview
+        output_ports:
+        - features
+
+    Args:
+        feature_map: The safe set.
+        num_positions: n_q of the plant state.
+        num_velocities: n_v of the plant state.
+        horizon: H, samples of the preview.
+        num_outputs: n_z.
+    """
+
+    def __init__(
+        self,
+        feature_map: FeatureMap,
+        num_positions: int,
+        num_velocities: int,
+        *,
+        horizon: int,
+        num_outputs: int = 3,
+    ):
+        super().__init__()
+        self._feature_map = feature_map
+        self._n_q = num_positions
+        self._preview_shape = (horizon, num_outputs)
+        self.feature_names = list(feature_map.feature_names)
+        self.DeclareVectorInputPort("plant_state", num_positions + num_velocities)
+        self.DeclareVectorInputPort("desired_preview", horizon * num_outputs)
+        self.DeclareVectorOutputPort(
+            "features", BasicVector(len(self.feature_names)), self._calc_features
+        )
+
+    def _calc_features(self, context: Context, output: BasicVector) -> None:
+        state = self.GetInputPort("plant_state").Eval(context)
+        preview = self.GetInputPort("desired_preview").Eval(context).reshape(self._preview_shape)
+        output.SetFromVector(
+            self._feature_map.features(state[: self._n_q], state[self._n_q :], preview)
+        )

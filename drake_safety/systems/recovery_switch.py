@@ -1,0 +1,98 @@
+"""RecoverySwitch: trigger, step planner and Drake's PortSwitch as one block."""
+
+from __future__ import annotations
+
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import PortSwitch
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
+from drake_safety.systems.recovery_trigger import RecoveryTrigger
+
+
+class RecoverySwitch(Diagram):
+    """Passes the nominal set point through until Γ falls, then plays recovery steps.
+
+    .. pydrake_system::
+
+        name: RecoverySwitch
+        input_ports:
+        - safety_probability
+        - plant_state
+        - nominal_desired_output
+        - nominal_desired_preview
+        output_ports:
+        - desired_output
+        - desired_preview
+        - desired_foot_positions
+        - stance_pose
+        - recovery_active
+
+    Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan goes on over the new
+    footholds, and ``desired_foot_positions`` to the controller.
+
+    Args:
+        kinematics: The robot as the controller believes it to be.
+        parameters: Numbers of the step.
+        threshold: Γ_thre.
+        period_s: Period of trigger and step planner [s].
+        offset_s: Delay of the trigger behind Γ, and of the step planner behind the trigger [s].
+            Simultaneous discrete updates would each add a whole period.
+        horizon: H of the preview.
+    """
+
+    def __init__(
+        self,
+        kinematics: RobotKinematics,
+        parameters: RecoveryStepParameters,
+        *,
+        threshold: float,
+        period_s: float,
+        offset_s: float,
+        horizon: int,
+    ):
+        super().__init__()
+        builder = DiagramBuilder()
+        trigger = builder.AddNamedSystem(
+            "recovery_trigger", RecoveryTrigger(threshold=threshold, period_s=period_s, offset_s=offset_s)
+        )
+        self.step_planner = builder.AddNamedSystem(
+            "recovery_step_planner",
+            RecoveryStepPlanner(
+                kinematics,
+                parameters,
+                period_s=period_s,
+                offset_s=2 * offset_s,
+                horizon=horizon,
+            ),
+        )
+        planner = self.step_planner
+        builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
+        builder.ExportInput(planner.GetInputPort("plant_state"), "plant_state")
+        builder.ExportInput(
+            planner.GetInputPort("nominal_desired_output"), "nominal_desired_output"
+        )
+        builder.Connect(
+            trigger.GetOutputPort("recovery_active"), planner.GetInputPort("recovery_active")
+        )
+        builder.Connect(
+            planner.GetOutputPort("recovery_done"), trigger.GetInputPort("recovery_done")
+        )
+        for name, size in (("desired_output", 3), ("desired_preview", 3 * horizon)):
+            switch = builder.AddNamedSystem(f"{name}_switch", PortSwitch(size))
+            builder.Connect(
+                trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
+            )
+            nominal = switch.DeclareInputPort("nominal")
+            recovery = switch.DeclareInputPort("recovery")
+            if name == "desired_output":
+                builder.ConnectInput("nominal_desired_output", nominal)
+            else:
+                builder.ExportInput(nominal, "nominal_desired_preview")
+            builder.Connect(planner.GetOutputPort(name), recovery)
+            builder.ExportOutput(switch.GetOutputPort("value"), name)
+        for name in ("desired_foot_positions", "stance_pose"):
+            builder.ExportOutput(planner.GetOutputPort(name), name)
+        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
+        builder.BuildInto(self)

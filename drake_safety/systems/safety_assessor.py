@@ -1,0 +1,116 @@
+"""SafetyAssessor: the belief grid at work inside a diagram."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.learning.assessment import SafetyAssessment
+
+
+class SafetyAssessor(LeafSystem):
+    """Evaluates Γ on the measured state and the upcoming desired trajectory.
+
+    .. pydrake_system::
+
+        name: SafetyAssessor
+        input_ports:
+        - state
+        - desired_preview
+        - features (optional)
+        output_ports:
+        - safety_probability
+        - normalized_safety_probability
+        - belief
+        - embedding
+        - cause_probability
+        - predicted_margins
+
+    Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
+    ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
+    b_safe / (1 - μ), 0 where nothing is known. The beliefs of the grid are a numeric parameter
+    of the Context (:meth:`set_beliefs`); the embedding is immutable. A state, preview or feature
+    that is not finite has the EMPTY belief (0, 0, 1).
+
+    Args:
+        assessment: A fitted assessment.
+        period_s: Time between two evaluations [s].
+    """
+
+    def __init__(self, assessment: SafetyAssessment, *, period_s: float):
+        super().__init__()
+        info = assessment.info_
+        self._assessment = assessment
+        self._shape = assessment.beliefs_.shape
+        self._uses_features = assessment.uses_features
+        self.constraint_names = list(info.constraint_names)
+        n_c = len(self.constraint_names)
+        self._belief_index = self.DeclareNumericParameter(
+            BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
+        )
+        self.DeclareVectorInputPort("state", len(info.state_names))
+        self.DeclareVectorInputPort("desired_preview", info.horizon * len(info.output_names))
+        self.DeclareVectorInputPort("features", len(info.feature_names))
+        sizes = {
+            "safety_probability": 1,
+            "normalized_safety_probability": 1,
+            "belief": 3,
+            "embedding": 2,
+            "cause_probability": n_c,
+            "predicted_margins": n_c,
+        }
+        state = self.DeclareDiscreteState(sum(sizes.values()))
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
+        start = 0
+        for name, size in sizes.items():
+            rows = slice(start, start + size)
+            start += size
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(size),
+                lambda context, output, rows=rows: output.SetFromVector(
+                    context.get_discrete_state_vector().get_value()[rows]
+                ),
+                {self.discrete_state_ticket(state)},
+            )
+
+    def get_beliefs(self, context: Context) -> np.ndarray:
+        """The beliefs in a Context, shaped as the assessment's ``beliefs_``."""
+        return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
+
+    def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
+        """Replaces the beliefs of every cell.
+
+        Args:
+            context: This system's Context.
+            beliefs: Shaped as the assessment's ``beliefs_``.
+
+        Raises:
+            ValueError: Another shape.
+        """
+        beliefs = np.asarray(beliefs, dtype=float)
+        if beliefs.shape != self._shape:
+            raise ValueError(
+                f"safety assessor: beliefs must have shape {self._shape}; got {beliefs.shape}"
+            )
+        context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        result = self._assessment.predict_one(
+            self.GetInputPort("state").Eval(context),
+            self.GetInputPort("desired_preview").Eval(context),
+            self.GetInputPort("features").Eval(context) if self._uses_features else None,
+            beliefs=self.get_beliefs(context),
+        )
+        discrete_state.set_value(
+            np.concatenate(
+                [
+                    [result.safety_probability, result.normalized],
+                    result.belief,
+                    result.embedding,
+                    result.cause_probability,
+                    result.predicted_margins,
+                ]
+            )
+        )

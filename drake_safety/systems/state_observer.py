@@ -1,0 +1,71 @@
+"""StateObserver: what is measured of the robot, and the state as the assessor sees it."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.observation import add_noise, stance_state, state_names
+from drake_safety.control.robot import ObservationNoise
+
+
+class StateObserver(LeafSystem):
+    """Measures a robot: plant state plus noise, the stance-frame state s_k, the output z_k.
+
+    .. pydrake_system::
+
+        name: StateObserver
+        input_ports:
+        - plant_state
+        - noise (optional)
+        output_ports:
+        - measured_plant_state
+        - state
+        - output
+
+    Every output is a direct function of the inputs. Without the ``noise`` input, or with zero
+    standard deviations, the measurement is exact.
+
+    Args:
+        kinematics: The robot.
+        noise: Standard deviations that scale the standard normal ``noise`` input, which has
+            2 n_v entries: for positions (tangent space), then for velocities.
+    """
+
+    def __init__(self, kinematics: RobotKinematics, noise: ObservationNoise | None = None):
+        super().__init__()
+        self._kinematics = kinematics
+        self._noise = noise or ObservationNoise()
+        self._is_exact = self._noise.position == 0 and self._noise.velocity == 0
+        n_q, n_v = kinematics.num_positions, kinematics.num_velocities
+        self._n_q = n_q
+        self.state_names = state_names(kinematics)
+        self.output_names = ["base_x", "base_y", "base_z"]
+        self.DeclareVectorInputPort("plant_state", n_q + n_v)
+        self.DeclareVectorInputPort("noise", 2 * n_v)
+        measured = self.DeclareVectorOutputPort(
+            "measured_plant_state", BasicVector(n_q + n_v), self._calc_measured
+        )
+        self.DeclareVectorOutputPort("state", BasicVector(len(self.state_names)), self._calc_state)
+        self.DeclareVectorOutputPort("output", BasicVector(3), self._calc_output)
+        self._measured_port = measured
+
+    def _calc_measured(self, context: Context, output: BasicVector) -> None:
+        state = self.GetInputPort("plant_state").Eval(context)
+        noise_port = self.GetInputPort("noise")
+        if not self._is_exact and noise_port.HasValue(context):
+            q, v = add_noise(
+                state[: self._n_q], state[self._n_q :], noise_port.Eval(context), self._noise
+            )
+            state = np.concatenate([q, v])
+        output.SetFromVector(state)
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        measured = self._measured_port.Eval(context)
+        output.SetFromVector(
+            stance_state(self._kinematics, measured[: self._n_q], measured[self._n_q :])
+        )
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._measured_port.Eval(context)[4:7])

@@ -1,0 +1,152 @@
+"""TrajectoryPlanner: a desired trajectory with a preview of what is coming."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.polynomial import Polynomial
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.trajectories import PiecewisePolynomial
+
+
+def interpolate(
+    start: np.ndarray, goal: np.ndarray, duration_s: float, start_time_s: float = 0.0
+) -> PiecewisePolynomial:
+    """The minimum-jerk quintic from rest at ``start`` to rest at ``goal``.
+
+    Args:
+        start: (n_z,) [m].
+        goal: (n_z,) [m].
+        duration_s: Duration of the motion [s].
+        start_time_s: When it starts [s].
+
+    Raises:
+        ValueError: The duration is not positive.
+    """
+    if not duration_s > 0:
+        raise ValueError(f"plan: duration_s must be positive; got {duration_s}")
+    scale = np.array([10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
+    segment = [
+        [Polynomial(np.concatenate([[a, 0.0, 0.0], (b - a) * scale]))]
+        for a, b in zip(start, goal, strict=True)
+    ]
+    return PiecewisePolynomial([np.array(segment)], [start_time_s, start_time_s + duration_s])
+
+
+def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) [m] of the stance frame ``[x, y, yaw]``, in the world."""
+    x, y, yaw = stance_pose
+    c, s = math.cos(yaw), math.sin(yaw)
+    world = points.copy()
+    world[..., 0] = x + c * points[..., 0] - s * points[..., 1]
+    world[..., 1] = y + s * points[..., 0] + c * points[..., 1]
+    return world
+
+
+class TrajectoryPlanner(LeafSystem):
+    """Plays a plan z*(t) and previews its next H samples.
+
+    .. pydrake_system::
+
+        name: TrajectoryPlanner
+        input_ports:
+        - stance_pose (optional)
+        output_ports:
+        - desired_output
+        - desired_output_rate
+        - desired_preview
+
+    The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
+    Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
+    ``desired_preview`` is z*_{k:k+H}, row-major in time, in S: what the feet must do does not
+    depend on where they stand. After its end the plan holds its last value. The stance pose
+    [x, y, yaw] comes from the input if it is connected, else from the parameter.
+
+    Args:
+        horizon: H, samples of the preview.
+        step_s: Time between them [s].
+        num_outputs: n_z, a multiple of three.
+
+    Raises:
+        ValueError: ``num_outputs`` is not a multiple of three, or horizon or step is not
+            positive.
+    """
+
+    def __init__(self, *, horizon: int, step_s: float, num_outputs: int = 3):
+        super().__init__()
+        if num_outputs % 3 or num_outputs <= 0:
+            raise ValueError(f"planner: num_outputs must be a multiple of 3; got {num_outputs}")
+        if not (horizon >= 1 and step_s > 0):
+            raise ValueError(
+                f"planner: horizon and step_s must be positive; got {horizon}, {step_s}"
+            )
+        self._num_outputs = num_outputs
+        self._offsets = step_s * np.arange(horizon)
+        hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
+        self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
+        self._stance_index = self.DeclareNumericParameter(BasicVector(3))
+        self.DeclareVectorInputPort("stance_pose", 3)
+        self.DeclareVectorOutputPort(
+            "desired_output", BasicVector(num_outputs), self._calc_output
+        )
+        self.DeclareVectorOutputPort(
+            "desired_output_rate", BasicVector(num_outputs), self._calc_rate
+        )
+        self.DeclareVectorOutputPort(
+            "desired_preview",
+            BasicVector(horizon * num_outputs),
+            self._calc_preview,
+            {self.time_ticket(), self.all_parameters_ticket()},
+        )
+
+    def set_plan(
+        self,
+        context: Context,
+        plan: PiecewisePolynomial,
+        stance_pose: np.ndarray | None = None,
+    ) -> None:
+        """Sets the plan and, where no input says it, the stance pose.
+
+        Args:
+            context: This system's Context.
+            plan: Positions in the stance frame over simulation time, (n_z, 1) [m].
+            stance_pose: [x, y, yaw] (3,) [m, rad]; unchanged by default.
+
+        Raises:
+            ValueError: The plan's size is not n_z.
+        """
+        if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
+            raise ValueError(
+                f"planner: the plan must have {self._num_outputs} rows and one column; got "
+                f"{plan.rows()} x {plan.cols()}"
+            )
+        value = context.get_mutable_abstract_parameter(self._plan_index)
+        value.set_value((plan, plan.MakeDerivative()))
+        if stance_pose is not None:
+            context.get_mutable_numeric_parameter(self._stance_index).SetFromVector(stance_pose)
+
+    def get_plan(self, context: Context) -> PiecewisePolynomial:
+        """The plan in a Context, in the stance frame."""
+        return context.get_abstract_parameter(self._plan_index).get_value()[0]
+
+    def _stance_pose(self, context: Context) -> np.ndarray:
+        port = self.GetInputPort("stance_pose")
+        if port.HasValue(context):
+            return port.Eval(context)
+        return context.get_numeric_parameter(self._stance_index).get_value()
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        z = self.get_plan(context).value(context.get_time()).reshape(-1, 3)
+        output.SetFromVector(to_world(self._stance_pose(context), z).ravel())
+
+    def _calc_rate(self, context: Context, output: BasicVector) -> None:
+        _, derivative = context.get_abstract_parameter(self._plan_index).get_value()
+        rate = derivative.value(context.get_time()).reshape(-1, 3)
+        yaw = self._stance_pose(context)[2]
+        output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate).ravel())
+
+    def _calc_preview(self, context: Context, output: BasicVector) -> None:
+        times = context.get_time() + self._offsets
+        output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))

@@ -1,0 +1,30 @@
+"""Robots and scenes as data, and the loader of a robot by name."""
+
+from pathlib import Path
+
+from drake_safety.control.robot import RobotModel, add_to_package_map, load_robot_file
+
+__all__ = ["add_to_package_map", "load_robot", "robot_names"]
+
+_FOLDER = Path(__file__).parent
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that come with the package."""
+    return sorted(path.parent.name for path in _FOLDER.glob("*/robot.yaml"))
+
+
+def load_robot(name: str) -> RobotModel:
+    """Loads a robot by name, or by the path of a ``robot.yaml`` of your own.
+
+    Raises:
+        ValueError: No such robot, or the file does not fit the schema.
+    """
+    if name in robot_names():
+        return load_robot_file(_FOLDER / name / "robot.yaml")
+    if Path(name).suffix in (".yaml", ".yml"):
+        return load_robot_file(name)
+    raise ValueError(
+        f"robot '{name}' does not exist; robots are {robot_names()}, or give the path of a "
+        "robot.yaml"
+    )

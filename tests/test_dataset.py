@@ -1,0 +1,390 @@
+import dataclasses
+import json
+import logging
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from drake_safety.learning.segments import Episode, EpisodesInfo
+from drake_safety.simulation import dataset
+from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
+
+ARRAYS = [
+    "time_s",
+    "state",
+    "true_state",
+    "output",
+    "desired_output",
+    "desired_preview",
+    "features",
+    "margins",
+]
+
+
+def make_info(**changes):
+    fields = dict(
+        scenario="cart",
+        scenario_hash="ab" * 32,
+        variation="nominal",
+        seed=7,
+        step_s=0.04,
+        horizon=2,
+        constraint_names=["wall", "speed"],
+        state_names=["x", "v", "a"],
+        output_names=["x"],
+        feature_names=["gap"],
+        versions={"numpy": "2.4.6"},
+    )
+    return EpisodesInfo(**fields | changes)
+
+
+def make_episode(index, info=None, num_rows=5, **changes):
+    info = info or make_info()
+    rng = np.random.default_rng(np.random.SeedSequence(info.seed, spawn_key=(index,)))
+    num_states, num_outputs = len(info.state_names), len(info.output_names)
+    fields = dict(
+        index=index,
+        time_s=np.arange(num_rows) * info.step_s,
+        state=rng.normal(size=(num_rows, num_states)),
+        true_state=rng.normal(size=(num_rows, num_states)),
+        output=rng.normal(size=(num_rows, num_outputs)),
+        desired_output=rng.normal(size=(num_rows, num_outputs)),
+        desired_preview=rng.normal(size=(num_rows, info.horizon * num_outputs)),
+        features=rng.normal(size=(num_rows, len(info.feature_names))),
+        margins=rng.normal(size=(num_rows, len(info.constraint_names))),
+        is_safe=index % 2 == 0,
+        cause="" if index % 2 == 0 else info.constraint_names[0],
+        first_step=index % 3,
+    )
+    return Episode(**fields | changes)
+
+
+def write(path, indices, **options):
+    with EpisodeWriter(path, make_info(), **options) as writer:
+        for index in indices:
+            writer.append(make_episode(index))
+
+
+def names_in(path):
+    return sorted(file.name for file in path.iterdir())
+
+
+def assert_same_bits(a, b):
+    for name in ARRAYS:
+        left, right = getattr(a, name), getattr(b, name)
+        assert left.dtype == right.dtype == np.float64
+        assert left.shape == right.shape
+        assert left.tobytes() == right.tobytes()
+    for name in ["index", "is_safe", "cause", "first_step"]:
+        assert getattr(a, name) == getattr(b, name)
+
+
+def test_episodes_come_back_bit_for_bit_and_sorted_by_index(tmp_path):
+    write(tmp_path, [3, 0, 2, 1], flush_episodes=3)
+    episodes = load_episodes(tmp_path)
+    assert [episode.index for episode in episodes] == [0, 1, 2, 3]
+    for episode in episodes:
+        assert_same_bits(episode, make_episode(episode.index))
+    assert episodes.info == make_info()
+
+
+def test_nan_infinity_minus_zero_and_the_smallest_number_survive(tmp_path):
+    state = np.array([[np.nan, np.inf, -np.inf], [-0.0, 5e-324, 1 / 3]])
+    episode = make_episode(1, num_rows=2, state=state, cause="diverged")
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        writer.append(episode)
+    assert_same_bits(load_episodes(tmp_path)[0], episode)
+
+
+def test_episodes_of_different_lengths_share_a_shard(tmp_path):
+    written = [make_episode(index, num_rows=1 + index) for index in range(4)]
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        for episode in written:
+            writer.append(episode)
+    assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
+    for loaded, episode in zip(load_episodes(tmp_path), written, strict=True):
+        assert_same_bits(loaded, episode)
+
+
+def test_arrays_without_columns_come_back_without_columns(tmp_path):
+    info = make_info(feature_names=[])
+    with EpisodeWriter(tmp_path, info) as writer:
+        writer.append(make_episode(0, info))
+    assert load_episodes(tmp_path)[0].features.shape == (5, 0)
+
+
+def test_loaded_arrays_can_be_written_to(tmp_path):
+    write(tmp_path, [0, 1])
+    first, second = load_episodes(tmp_path)
+    first.state[:] = 0.0
+    assert_same_bits(second, make_episode(1))
+
+
+def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
+    write(tmp_path, [1, 0], flush_episodes=1)
+    frame = pd.read_parquet(sorted(tmp_path.glob("episodes-*.parquet")))
+    assert list(frame.columns) == [
+        "episode",
+        "step",
+        *ARRAYS,
+        "is_safe",
+        "cause",
+        "first_step",
+    ]
+    assert frame.episode.tolist() == [1] * 5 + [0] * 5
+    assert frame.step.tolist() == [0, 1, 2, 3, 4] * 2
+    assert frame.cause.tolist() == ["wall"] * 5 + [""] * 5
+    assert np.array_equal(np.stack(frame.state[:5]), make_episode(1).state)
+
+
+def test_info_and_extra_are_plain_json(tmp_path):
+    with EpisodeWriter(tmp_path, make_info(), {"command": "train cart", "gain": 0.1}):
+        pass
+    content = json.loads((tmp_path / "info.json").read_text())
+    assert content["info"]["scenario"] == "cart"
+    assert read_info(tmp_path) == (make_info(), {"command": "train cart", "gain": 0.1})
+
+
+def test_extra_that_json_cannot_hold_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError, match="JSON types"):
+        EpisodeWriter(tmp_path, make_info(), {"when": object()})
+    assert names_in(tmp_path) == []
+
+
+def test_a_shard_is_written_after_every_flush_episodes(tmp_path):
+    writer = EpisodeWriter(tmp_path, make_info(), flush_episodes=2)
+    for index, shards in enumerate([0, 1, 1, 2]):
+        writer.append(make_episode(index))
+        assert len(names_in(tmp_path)) == 1 + shards
+    writer.close()
+    assert completed(tmp_path) == {0, 1, 2, 3}
+
+
+def test_a_shard_is_written_when_the_oldest_pending_episode_is_old_enough(tmp_path, monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(dataset.time, "monotonic", lambda: now_s)
+    with EpisodeWriter(tmp_path, make_info(), flush_seconds=10.0) as writer:
+        now_s = 150.0
+        writer.append(make_episode(0))
+        now_s = 159.0
+        writer.append(make_episode(1))
+        assert completed(tmp_path) == set()
+        now_s = 160.0
+        writer.append(make_episode(2))
+        assert completed(tmp_path) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("interruption", [RuntimeError, KeyboardInterrupt])
+def test_finished_episodes_are_on_disk_after_an_interruption(tmp_path, interruption):
+    with pytest.raises(interruption):
+        with EpisodeWriter(tmp_path, make_info()) as writer:
+            writer.append(make_episode(0))
+            raise interruption
+    assert completed(tmp_path) == {0}
+
+
+def test_a_failed_write_leaves_no_file_and_the_episodes_pending(tmp_path, monkeypatch):
+    import pyarrow.parquet as pq
+
+    def fill_the_disk(table, where, **options):
+        where.write_bytes(b"PAR1")
+        raise OSError("no space left")
+
+    writer = EpisodeWriter(tmp_path, make_info())
+    writer.append(make_episode(0))
+    with monkeypatch.context() as patch:
+        patch.setattr(pq, "write_table", fill_the_disk)
+        with pytest.raises(OSError, match="no space left"):
+            writer.flush()
+    assert names_in(tmp_path) == ["info.json"]
+    writer.close()
+    assert completed(tmp_path) == {0}
+
+
+def test_a_run_goes_on_where_it_ended(tmp_path):
+    write(tmp_path / "whole", range(6))
+    write(tmp_path / "resumed", [0, 2, 3])
+    write(tmp_path / "resumed", sorted(set(range(6)) - completed(tmp_path / "resumed")))
+    whole, resumed = load_episodes(tmp_path / "whole"), load_episodes(tmp_path / "resumed")
+    assert len(whole) == len(resumed) == 6
+    for a, b in zip(whole, resumed, strict=True):
+        assert_same_bits(a, b)
+
+
+def test_a_removed_shard_is_not_overwritten_but_followed(tmp_path):
+    write(tmp_path, range(3), flush_episodes=1)
+    (tmp_path / "episodes-00001.parquet").unlink()
+    write(tmp_path, [1])
+    assert names_in(tmp_path)[-2:] == ["episodes-00003.parquet", "info.json"]
+    assert completed(tmp_path) == {0, 1, 2}
+
+
+def test_nothing_is_completed_where_nothing_was_written(tmp_path):
+    assert completed(tmp_path / "nowhere") == set()
+    with EpisodeWriter(tmp_path, make_info()):
+        assert completed(tmp_path) == set()
+    assert len(load_episodes(tmp_path)) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "here"),
+    [
+        ("scenario_hash", "ab" * 32, "cd" * 32),
+        ("seed", 7, 8),
+        ("variation", "nominal", "actual"),
+        ("horizon", 2, 3),
+        ("state_names", ["x", "v", "a"], ["x", "v", "j"]),
+    ],
+)
+def test_another_set_is_refused_with_both_sides_named(tmp_path, name, there, here):
+    write(tmp_path, [0])
+    with pytest.raises(ValueError) as caught:
+        EpisodeWriter(tmp_path, make_info(**{name: here}))
+    assert f"{name}: there {there!r}, here {here!r}" in str(caught.value)
+
+
+def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_path, caplog):
+    write(tmp_path, [0])
+    with caplog.at_level(logging.WARNING, logger="drake_safety"):
+        with EpisodeWriter(tmp_path, make_info(versions={"numpy": "3.0.0"})) as writer:
+            writer.append(make_episode(1))
+    assert "3.0.0" in caplog.text
+    assert read_info(tmp_path)[0].versions == {"numpy": "2.4.6"}
+
+
+def test_names_given_as_a_tuple_are_the_same_set(tmp_path):
+    write(tmp_path, [0])
+    with EpisodeWriter(tmp_path, make_info(state_names=("x", "v", "a"))) as writer:
+        writer.append(make_episode(1))
+    assert completed(tmp_path) == {0, 1}
+
+
+def test_an_index_is_accepted_once(tmp_path):
+    write(tmp_path, [0])
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        writer.append(make_episode(1))
+        for index in [0, 1]:
+            with pytest.raises(ValueError, match=f"episode {index} is already in"):
+                writer.append(make_episode(index))
+
+
+def test_equal_episodes_in_two_shards_are_taken_once(tmp_path):
+    write(tmp_path, [0, 1], flush_episodes=1)
+    shard = tmp_path / "episodes-00000.parquet"
+    (tmp_path / "episodes-00002.parquet").write_bytes(shard.read_bytes())
+    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+
+
+def test_different_episodes_of_one_index_are_refused_with_both_shards_named(tmp_path):
+    write(tmp_path / "a", [0])
+    with EpisodeWriter(tmp_path / "b", make_info()) as writer:
+        writer.append(make_episode(0, num_rows=4))
+    other = (tmp_path / "b" / "episodes-00000.parquet").read_bytes()
+    (tmp_path / "a" / "episodes-00001.parquet").write_bytes(other)
+    with pytest.raises(ValueError, match=r"episodes-00000\.parquet and in episodes-00001\.parquet"):
+        load_episodes(tmp_path / "a")
+
+
+@pytest.mark.parametrize("read", [completed, load_episodes])
+@pytest.mark.parametrize("kept", [0, 10, 0.5, 0.99])
+def test_a_truncated_shard_is_named(tmp_path, read, kept):
+    write(tmp_path, range(4))
+    shard = tmp_path / "episodes-00000.parquet"
+    content = shard.read_bytes()
+    shard.write_bytes(content[: int(kept * len(content)) if isinstance(kept, float) else kept])
+    with pytest.raises(ValueError, match=r"shard .*episodes-00000\.parquet is truncated"):
+        read(tmp_path)
+
+
+def test_a_flipped_bit_in_a_shard_is_named(tmp_path):
+    write(tmp_path, range(4))
+    shard = tmp_path / "episodes-00000.parquet"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 3] ^= 0x10
+    shard.write_bytes(content)
+    with pytest.raises(ValueError, match=r"episodes-00000\.parquet is truncated or damaged"):
+        load_episodes(tmp_path)
+
+
+def test_leftover_temporary_files_are_ignored(tmp_path):
+    write(tmp_path, [0])
+    (tmp_path / ".episodes-00001.parquet.123.tmp").write_bytes(b"PAR1 half")
+    assert completed(tmp_path) == {0}
+    write(tmp_path, [1])
+    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+
+
+def test_shards_without_an_info_are_refused(tmp_path):
+    write(tmp_path, [0])
+    (tmp_path / "info.json").unlink()
+    for read in [completed, load_episodes, lambda path: EpisodeWriter(path, make_info())]:
+        with pytest.raises(ValueError, match=r"no info\.json"):
+            read(tmp_path)
+    assert names_in(tmp_path) == ["episodes-00000.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "schema version None; expected 1"),
+        ('{"schema_version": 99}', "schema version 99; expected 1"),
+        ('{"schema_version": 1, "info": {"scenario": "cart"}, "extra": {}}', "does not describe"),
+    ],
+)
+def test_a_foreign_info_is_refused(tmp_path, content, message):
+    (tmp_path / "info.json").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_info(tmp_path)
+
+
+def test_a_foreign_parquet_file_is_refused(tmp_path):
+    write(tmp_path, [0])
+    pd.DataFrame({"a": [1]}).to_parquet(tmp_path / "episodes-00001.parquet")
+    with pytest.raises(ValueError, match="expected columns"):
+        completed(tmp_path)
+    with pytest.raises(ValueError, match=r"columns \['a'\]; expected \['episode', 'step'"):
+        load_episodes(tmp_path)
+
+
+def test_a_shard_of_a_set_with_other_sizes_is_refused(tmp_path):
+    write(tmp_path / "a", [0])
+    info = make_info(state_names=["x", "v"])
+    with EpisodeWriter(tmp_path / "b", info) as writer:
+        writer.append(make_episode(1, info))
+    other = (tmp_path / "b" / "episodes-00000.parquet").read_bytes()
+    (tmp_path / "a" / "episodes-00001.parquet").write_bytes(other)
+    with pytest.raises(ValueError, match=r"state is .* expected lists of length 3"):
+        load_episodes(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"state": np.zeros((5, 2))}, r"state has shape \(5, 2\), expected \(5, 3\)"),
+        ({"margins": np.zeros((4, 2))}, r"margins has shape \(4, 2\), expected \(5, 2\)"),
+        ({"desired_preview": np.zeros((5, 1))}, r"desired_preview has shape \(5, 1\)"),
+        ({"cause": "moon"}, r"unknown cause 'moon'; the constraints are \['wall', 'speed'\]"),
+        ({"is_safe": True}, "is_safe is True but the cause is 'wall'"),
+    ],
+)
+def test_an_episode_that_does_not_fit_the_info_is_refused(tmp_path, changes, message):
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        with pytest.raises(ValueError, match=message):
+            writer.append(make_episode(1, **changes))
+    assert completed(tmp_path) == set()
+
+
+def test_a_closed_writer_takes_no_more(tmp_path):
+    writer = EpisodeWriter(tmp_path, make_info())
+    writer.close()
+    with pytest.raises(ValueError, match="is closed"):
+        writer.append(make_episode(0))
+
+
+def test_every_field_of_an_episode_is_a_column(tmp_path):
+    write(tmp_path, [0])
+    columns = set(pd.read_parquet(tmp_path / "episodes-00000.parquet").columns)
+    fields = {field.name for field in dataclasses.fields(Episode)} - {"index"}
+    assert columns == fields | {"episode", "step"}

@@ -1,0 +1,342 @@
+"""The house's rules, read from the source: each rule is a function that returns its offences."""
+
+import ast
+import re
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Each room and the rooms it may import besides itself. `models` and `diagrams` are the folders
+# beside the library. A scenario names its task by import path, so no room imports `diagrams`.
+ALLOWED = {
+    "learning": set(),
+    "control": set(),
+    "models": {"control"},
+    "systems": {"learning", "control"},
+    "simulation": {"systems", "learning", "control", "models"},
+    "evaluation": {"simulation", "systems", "learning", "control", "models"},
+    "diagrams": {"simulation", "systems", "control", "models"},
+    "cli": {"evaluation", "simulation", "systems", "learning", "control", "models"},
+}
+# An online run needs none of these, so importing the library must not either.
+HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
+ONLY_IN = {
+    "torch": "drake_safety/learning/embedding.py",
+    "tslearn": "drake_safety/learning/distance.py",
+    "dtaidistance": "drake_safety/learning/distance.py",
+}
+PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
+PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}
+PORT_WORDS = re.compile(r"LeafSystem|VectorSystem|Declare\w*Port|Export(In|Out)put")
+VAGUE_NAMES = {"utils", "util", "helpers", "helper", "manager", "managers", "data"}
+
+
+def source_files(*folders):
+    return sorted(
+        path
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        if "__pycache__" not in path.parts
+    )
+
+
+def relative(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+LIBRARY = source_files("drake_safety", "models", "diagrams")
+PYTHON = LIBRARY + source_files("tests", "benchmarks", "tutorials")
+
+
+def module_of(name):
+    """`drake_safety/learning/grid.py` → `drake_safety.learning.grid`; `models/x.py` likewise."""
+    parts = name.removesuffix(".py").split("/")
+    if parts[0] in ("models", "diagrams"):
+        parts.insert(0, "drake_safety")
+    return ".".join(parts)
+
+
+def room_of(module):
+    """The room of a dotted name inside the package, or None for the package itself."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else None
+
+
+def imports_of(source, name):
+    """Every import of a file: (dotted name, line, whether it runs when the file is imported)."""
+    found = []
+
+    def add(node, dotted, runs):
+        found.append((dotted, node.lineno, runs))
+
+    def visit(node, runs):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                add(node, alias.name, runs)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = module_of(name).removesuffix(".__init__").split(".")
+                climbs = node.level - name.endswith("/__init__.py")
+                kept = package[: len(package) - climbs]
+                base = ".".join([*kept, *([node.module] if node.module else [])])
+            for alias in node.names:
+                add(node, f"{base}.{alias.name}", runs)
+        elif isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called.split(".")[-1] in ("import_module", "__import__") and node.args:
+                if isinstance(node.args[0], ast.Constant):
+                    add(node, str(node.args[0].value), runs)
+        for child in ast.iter_child_nodes(node):
+            is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            is_typing = isinstance(node, ast.If) and ast.unparse(node.test).endswith(
+                "TYPE_CHECKING"
+            )
+            inside = is_function or (is_typing and child not in node.orelse)
+            visit(child, runs and not inside)
+
+    visit(ast.parse(source), True)
+    return found
+
+
+def upward_imports(source, name):
+    room = room_of(module_of(name))
+    offences = []
+    for dotted, line, _ in imports_of(source, name):
+        if dotted.split(".")[0] != "drake_safety" or room == "__init__":
+            continue
+        target = room_of(dotted)
+        if target is not None and target not in ALLOWED:
+            if target != "__version__":
+                offences.append(f"{name}:{line} imports {dotted}: import it from its own room")
+        elif target not in {None, room} | ALLOWED.get(room, set()):
+            offences.append(f"{name}:{line} in {room} imports {dotted}")
+        elif room == "models" and target == "control":
+            if not dotted.startswith("drake_safety.control.robot"):
+                offences.append(f"{name}:{line} in models imports {dotted}")
+    return offences
+
+
+def forbidden_imports(source, name):
+    room = room_of(module_of(name))
+    offences = []
+    for dotted, line, runs in imports_of(source, name):
+        top = dotted.split(".")[0]
+        if room == "learning" and top == "pydrake":
+            offences.append(f"{name}:{line} learning imports {dotted}")
+        if name != ONLY_IN.get(top, name):
+            offences.append(f"{name}:{line} imports {dotted}, which belongs in {ONLY_IN[top]}")
+        if top in HEAVY and runs:
+            offences.append(f"{name}:{line} imports {dotted} outside a function")
+    return offences
+
+
+def forbidden_anywhere(source, name):
+    offences = []
+    for dotted, line, _ in imports_of(source, name):
+        top = dotted.split(".")[0]
+        if top in PICKLING:
+            offences.append(f"{name}:{line} imports {dotted}")
+        if dotted.startswith("pydrake.all"):
+            offences.append(f"{name}:{line} imports pydrake.all")
+        if top in ("models", "diagrams"):
+            offences.append(f"{name}:{line} imports {dotted}: it is drake_safety.{dotted}")
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in PICKLING_CALLS or called.endswith(".to_pickle"):
+                offences.append(f"{name}:{node.lineno} calls {called}, which pickles")
+            for keyword in node.keywords:
+                allows = isinstance(keyword.value, ast.Constant) and keyword.value.value is True
+                if keyword.arg == "allow_pickle" and allows:
+                    offences.append(f"{name}:{node.lineno} allows pickle")
+    return offences
+
+
+def ports(source, name):
+    offences = []
+    for node in ast.walk(ast.parse(source)):
+        words = []
+        if isinstance(node, ast.Name):
+            words = [node.id]
+        elif isinstance(node, ast.Attribute):
+            words = [node.attr]
+        elif isinstance(node, ast.alias):
+            words = [node.name.split(".")[-1]]
+        for word in words:
+            if PORT_WORDS.fullmatch(word):
+                offences.append(f"{name}:{node.lineno} has ports: {word}")
+    return offences
+
+
+def words_of(text):
+    """Splits at whatever is no letter or digit and before capitals: `Spot2Arm` → spot2, arm."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])[0-9]*|[A-Z]?[a-z0-9]+", text)]
+
+
+def robot_names():
+    return sorted(path.parent.name for path in (ROOT / "models").glob("*/robot.yaml"))
+
+
+def named_robots(text, name, robots):
+    offences = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = words_of(line)
+        for robot in robots:
+            sought = words_of(robot)
+            starts = range(len(words) - len(sought) + 1)
+            if any(words[i : i + len(sought)] == sought for i in starts):
+                offences.append(f"{name}:{number} names the robot {robot}")
+    return offences
+
+
+def offences_in(rule, paths):
+    return [
+        offence
+        for path in paths
+        for offence in rule(path.read_text(encoding="utf-8"), relative(path))
+    ]
+
+
+def test_imports_only_go_down():
+    assert offences_in(upward_imports, LIBRARY) == []
+
+
+def test_learning_is_free_of_drake_and_heavy_imports_stay_inside_functions():
+    assert offences_in(forbidden_imports, LIBRARY) == []
+
+
+def test_control_has_no_ports():
+    assert offences_in(ports, source_files("drake_safety/control")) == []
+
+
+def test_nothing_pickles_or_imports_all_of_drake_or_the_folders_as_packages():
+    assert offences_in(forbidden_anywhere, PYTHON) == []
+
+
+def test_every_package_the_library_imports_is_a_declared_dependency():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.match(r"[\w-]+", line)[0].lower() for line in project["dependencies"]}
+    providers = packages_distributions()
+    imported = {
+        dotted.split(".")[0]
+        for path in LIBRARY
+        for dotted, _, _ in imports_of(path.read_text(encoding="utf-8"), relative(path))
+    }
+    third_party = imported - {"drake_safety", "__future__"} - sys.stdlib_module_names
+    assert {"numpy", "pydrake"} <= third_party
+    assert [
+        name
+        for name in sorted(third_party)
+        if not {provider.lower() for provider in providers.get(name, [name])} & declared
+    ] == []
+
+
+def test_no_robot_is_named_in_the_library_or_in_a_task():
+    robots = robot_names()
+    assert robots
+    files = [
+        path
+        for path in (ROOT / "drake_safety").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    ]
+    files += source_files("diagrams")
+    assert offences_in(lambda text, name: named_robots(text, name, robots), files) == []
+    assert [path for path in files if named_robots(path.name, path.name, robots)] == []
+
+
+def test_every_module_stands_in_a_room_and_says_what_it_is():
+    rooms = {room_of(module_of(relative(path))) for path in LIBRARY}
+    assert rooms <= {*ALLOWED, "__init__"}
+    assert [relative(path) for path in LIBRARY if path.stem in VAGUE_NAMES] == []
+
+
+def test_a_folder_of_a_robot_is_no_python_package():
+    assert list((ROOT / "models").glob("*/**/__init__.py")) == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "name", "source", "message"),
+    [
+        (upward_imports, "drake_safety/systems/a.py", "import drake_safety.cli", "imports"),
+        (upward_imports, "drake_safety/systems/a.py", "from ..simulation import x", "simulation"),
+        (upward_imports, "drake_safety/systems/a.py", "from .. import evaluation", "evaluation"),
+        (upward_imports, "drake_safety/systems/__init__.py", "from ..cli import x", "cli"),
+        (
+            upward_imports,
+            "drake_safety/learning/a.py",
+            "def f():\n    from drake_safety.control import robot",
+            "learning",
+        ),
+        (
+            upward_imports,
+            "drake_safety/simulation/a.py",
+            "import_module('drake_safety.diagrams.balancing')",
+            "diagrams",
+        ),
+        (upward_imports, "drake_safety/cli.py", "from drake_safety import Scenario", "own room"),
+        (upward_imports, "models/__init__.py", "from drake_safety.control.qp import x", "models"),
+        (upward_imports, "diagrams/a.py", "from drake_safety.evaluation import x", "diagrams"),
+        (forbidden_imports, "drake_safety/learning/a.py", "import pydrake.math", "learning"),
+        (
+            forbidden_imports,
+            "drake_safety/evaluation/a.py",
+            "def f():\n    import torch.nn",
+            "belongs in drake_safety/learning/embedding.py",
+        ),
+        (forbidden_imports, "drake_safety/evaluation/a.py", "import matplotlib", "outside"),
+        (
+            forbidden_imports,
+            "drake_safety/evaluation/a.py",
+            "class A:\n    from sklearn import svm",
+            "outside",
+        ),
+        (forbidden_anywhere, "tests/a.py", "from pydrake.all import x", "pydrake.all"),
+        (forbidden_anywhere, "tests/a.py", "import pickle", "pickle"),
+        (forbidden_anywhere, "tests/a.py", "from diagrams import balancing", "drake_safety.diag"),
+        (forbidden_anywhere, "tests/a.py", "np.load(f, allow_pickle=True)", "allows pickle"),
+        (forbidden_anywhere, "tests/a.py", "torch.save(net, path)", "pickles"),
+        (ports, "drake_safety/control/a.py", "class A(LeafSystem): pass", "LeafSystem"),
+        (ports, "drake_safety/control/a.py", "s.DeclareVectorInputPort('u', 1)", "Port"),
+        (ports, "drake_safety/control/a.py", "from p import LeafSystem as L", "LeafSystem"),
+    ],
+)
+def test_each_rule_catches_its_offence(rule, name, source, message):
+    offences = rule(source, name)
+    assert len(offences) == 1
+    assert message in offences[0]
+
+
+@pytest.mark.parametrize(
+    ("rule", "name", "source"),
+    [
+        (upward_imports, "drake_safety/cli.py", "from drake_safety.evaluation import report"),
+        (upward_imports, "drake_safety/systems/a.py", "from . import b\nfrom ..control import c"),
+        (upward_imports, "models/__init__.py", "from drake_safety.control.robot import x"),
+        (upward_imports, "drake_safety/cli.py", "from drake_safety import __version__"),
+        (
+            forbidden_imports,
+            "drake_safety/learning/embedding.py",
+            "if TYPE_CHECKING:\n    import torch\ndef f():\n    import torch",
+        ),
+        (forbidden_anywhere, "tests/a.py", "np.load(path, allow_pickle=False)"),
+        (forbidden_anywhere, "tests/a.py", "import drake_safety.models"),
+    ],
+)
+def test_no_rule_forbids_what_is_allowed(rule, name, source):
+    assert rule(source, name) == []
+
+
+@pytest.mark.parametrize("text", ["an Arm7 walks", "arm7_balancing", "class Arm7Loop:", "ARM7"])
+def test_a_robot_is_recognised_in_every_spelling(text):
+    assert named_robots(text, "a.py", ["arm7"]) == ["a.py:1 names the robot arm7"]
+
+
+def test_a_name_of_two_words_is_recognised_and_a_part_of_a_word_is_not():
+    assert named_robots("a SpotArm", "a.py", ["spot_arm"])
+    assert not named_robots("data1 charm", "a.py", ["a1", "arm"])

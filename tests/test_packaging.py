@@ -1,0 +1,163 @@
+"""What a stranger gets: sdist → wheel → a clean environment, used from `/`."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# Where the source tree's folders stand once installed.
+INSTALLED_AT = {
+    "drake_safety": "drake_safety",
+    "models": "drake_safety/models",
+    "diagrams": "drake_safety/diagrams",
+}
+
+pytestmark = pytest.mark.slow
+
+
+def run(*command, cwd):
+    """Runs a command as a stranger would: nothing of this process's Python settings is passed."""
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("PYTHON")
+    }
+    done = subprocess.run(
+        [str(word) for word in command], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{command} failed:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def files_under(folder):
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def call_backend(hook, source, out):
+    """Builds with the setuptools of this environment, as `python -m build` would, offline."""
+    out.mkdir()
+    code = f"import sys; from setuptools import build_meta as b; b.{hook}(sys.argv[1])"
+    run(sys.executable, "-c", code, out, cwd=source)
+    (built,) = out.iterdir()
+    return built
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory):
+    work = tmp_path_factory.mktemp("packaging")
+    checkout = work / "checkout"
+    # A copy: building in place would leave egg-info and build folders in the checkout.
+    kept_out = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs")
+    shutil.copytree(ROOT, checkout, ignore=kept_out)
+    return call_backend("build_sdist", checkout, work / "sdist")
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist, tmp_path_factory):
+    work = tmp_path_factory.mktemp("wheel")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(work, filter="data")
+    (source,) = work.iterdir()
+    return call_backend("build_wheel", source, work / "wheel")
+
+
+@pytest.fixture(scope="module")
+def clean_environment(wheel, tmp_path_factory):
+    """An environment with the wheel; the dependencies are this environment's, read in place."""
+    folder = tmp_path_factory.mktemp("clean") / "environment"
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
+    python = folder / "bin" / "python"
+    install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
+    run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
+    site_packages = run(
+        python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd="/"
+    )
+    # Only a path: a .pth file inside that folder, an editable install's say, is not followed.
+    dependencies = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (Path(site_packages.strip()) / "dependencies.pth").write_text("\n".join(dependencies) + "\n")
+    return folder
+
+
+def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"pyproject.toml", "LICENSE", "README.md", "constraints.txt", "Makefile"} <= names
+    assert {f"tests/{name}" for name in files_under(ROOT / "tests")} <= names
+
+
+def test_every_file_of_the_library_models_and_diagrams_is_in_the_wheel_and_no_other(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+    metadata = {name for name in names if ".dist-info/" in name}
+    expected = {
+        f"{installed}/{name}"
+        for folder, installed in INSTALLED_AT.items()
+        for name in files_under(ROOT / folder)
+    }
+    assert names - metadata == expected
+    assert any(name.endswith("/licenses/LICENSE") for name in metadata)
+
+
+def test_the_wheel_takes_no_top_level_name_but_its_own(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {"drake_safety"}
+
+
+def test_no_dependency_names_an_index_or_an_address():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    listed = project["dependencies"] + project["optional-dependencies"]["dev"]
+    pinned = [
+        line
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
+    assert not [line for line in listed + pinned if "://" in line or line.startswith("-")]
+    assert not [line for line in pinned if line.count("==") != 1]
+
+
+def test_the_installed_package_imports_from_the_root_folder(clean_environment):
+    code = (
+        "import drake_safety, drake_safety.models, drake_safety.diagrams as d\n"
+        "print(drake_safety.__file__, drake_safety.models.__file__, d.__file__, sep='\\n')\n"
+        "print(*drake_safety.__path__, drake_safety.__version__, sep='\\n')"
+    )
+    printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").splitlines()
+    *files, path, version = printed
+    # No trace of the checkout: __path__ has the one entry inside the environment.
+    assert all(Path(name).is_relative_to(clean_environment) for name in [*files, path])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert version == project["version"]
+
+
+def test_inside_a_checkout_the_library_and_the_models_are_both_the_checkouts(clean_environment):
+    code = "import drake_safety as s, drake_safety.models as m; print(s.__file__, m.__file__)"
+    # `python -c` puts the working folder first on the path, before the installed wheel.
+    files = run(clean_environment / "bin" / "python", "-c", code, cwd=ROOT).split()
+    assert files == [str(ROOT / "drake_safety/__init__.py"), str(ROOT / "models/__init__.py")]
+
+
+def test_the_installed_command_lists_every_scenario(clean_environment):
+    scenarios = sorted(path.stem for path in (ROOT / "diagrams").glob("*.yaml"))
+    assert scenarios
+    printed = run(clean_environment / "bin" / "drake-safety", "scenarios", cwd="/")
+    assert [name for name in scenarios if name not in printed] == []
+
+
+def test_the_installed_robots_are_the_checkouts(clean_environment):
+    code = (
+        "from drake_safety.models import load_robot, robot_names\n"
+        "for name in robot_names(): load_robot(name); print(name)"
+    )
+    printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").split()
+    assert printed == sorted(path.parent.name for path in (ROOT / "models").glob("*/robot.yaml"))
