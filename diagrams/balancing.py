@@ -444,6 +444,10 @@ class Balancing(ClosedLoop):
                 RandomGenerator(int(rng.integers(2**31))),
             )
 
+    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
+        """A random ball; see :meth:`ClosedLoop.sample_throw`."""
+        return self.scenario.parameters.push.sample(rng, time_s)
+
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
         """Sets the ball in flight; see :meth:`ClosedLoop.throw_ball`."""
         if self.ball is None:

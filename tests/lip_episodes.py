@@ -1,8 +1,8 @@
 """Stand-in data: a linear inverted pendulum that tracks a reference, as episodes.
 
-The point mass stands on a rectangular support; a capture-point controller with a saturated centre of
-pressure moves it to a target, a second-order law its height. It is unsafe to leave the support or the
-height band.
+The point mass stands on a rectangular support; a capture-point controller with a saturated centre
+of pressure moves it to a target, a second-order law its height. It is unsafe to leave the support
+or the height band.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def make_episodes(
     num_features: int = 5,
     noise: float = 0.0,
 ) -> Episodes:
-    """Rolls out `num_episodes` pendulums; columns beyond the physical ones are mixtures of those."""
+    """Rolls out `num_episodes` pendulums; further columns are mixtures."""
     draws = [
         np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,))).normal(
             size=(NUM_STEPS + 2, 24)
@@ -110,4 +110,5 @@ def _margins(state: np.ndarray) -> np.ndarray:
 
 def _features(state: np.ndarray, desired: np.ndarray) -> np.ndarray:
     capture = SUPPORT - np.abs(state[:, :2] + state[:, 3:5] / _OMEGA)
-    return np.column_stack([_margins(state), capture, np.linalg.norm(desired - state[:, :3], axis=1)])
+    error = np.linalg.norm(desired - state[:, :3], axis=1)
+    return np.column_stack([_margins(state), capture, error])

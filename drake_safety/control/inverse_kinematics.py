@@ -52,11 +52,20 @@ def solve_inverse_kinematics(
             break
         # Columns of joints that move no foot are zero: the damping leaves those joints alone.
         J = kinematics.contact_jacobian(q)[:, NUM_BASE_VELOCITIES:]
-        gram = J.T @ J
-        gram.flat[:: len(joints) + 1] += _DAMPING
-        step = np.linalg.solve(gram, J.T @ error)
-        largest = max(step.max(), -step.min())
-        if largest > _MAX_STEP_RAD:
-            step *= _MAX_STEP_RAD / largest
-        joints = np.minimum(np.maximum(joints + step, lowest), highest)
+        step = _damped_step(J, error)
+        moved = np.minimum(np.maximum(joints + step, lowest), highest)
+        is_blocked = (moved == joints) & (step != 0)
+        if is_blocked.any():
+            # Joints pushed against a limit give no help: the others must do without them.
+            J[:, is_blocked] = 0.0
+            moved = np.minimum(np.maximum(joints + _damped_step(J, error), lowest), highest)
+        joints = moved
     return joints
+
+
+def _damped_step(J: np.ndarray, error: np.ndarray) -> np.ndarray:
+    gram = J.T @ J
+    gram.flat[:: len(gram) + 1] += _DAMPING
+    step = np.linalg.solve(gram, J.T @ error)
+    largest = max(step.max(), -step.min())
+    return step * (_MAX_STEP_RAD / largest) if largest > _MAX_STEP_RAD else step

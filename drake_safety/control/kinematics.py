@@ -30,7 +30,7 @@ class RobotKinematics:
 
     Args:
         robot: The robot.
-        variation: Mass and damping that the controller believes in.
+        variation: Mass that the controller believes in.
 
     Raises:
         ValueError: The robot's base is not the only floating body, or a foot names an unknown
@@ -69,18 +69,15 @@ class RobotKinematics:
         self.velocity_limits = np.array([j.velocity_upper_limit() for j in joints])
         self.base = base
         self.world_frame = self.plant.world_frame()
-        column = {name: i for i, name in enumerate(self.joint_names)}
         self.foot_names = list(robot.feet)
         self.foot_frames = []
         self.foot_points = []
-        self.foot_columns = []
-        self.foot_radii = []
+        radii = []
         for foot in robot.feet.values():
             self.foot_frames.append(self.plant.GetFrameByName(foot.body))
             self.foot_points.append(np.asfortranarray(np.array(foot.contact_points).T))
-            self.foot_columns.append(np.array([column[name] for name in foot.joints], dtype=int))
-            self.foot_radii += [foot.radius_m] * len(foot.contact_points)
-        self.foot_radii = np.array(self.foot_radii)
+            radii += [foot.radius_m] * len(foot.contact_points)
+        self.foot_radii = np.array(radii)
         self.num_contacts = len(self.foot_radii)
         posture = posture_positions(self.plant, robot)
         self.posture = np.array([posture[name] for name in self.joint_names])
@@ -109,9 +106,15 @@ class RobotKinematics:
         quaternion = X_WB.rotation().ToQuaternion().wxyz()
         return np.concatenate([quaternion, X_WB.translation(), joints])
 
+    def _set_positions(self, q: np.ndarray) -> None:
+        # A position that is not finite would end the process inside the plant.
+        if not q.dot(q) < math.inf:
+            raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
+        self.plant.SetPositions(self.context, q)
+
     def contact_positions(self, q: np.ndarray) -> np.ndarray:
         """World positions of the contact spheres' centres, (n_c, 3) [m]."""
-        self.plant.SetPositions(self.context, q)
+        self._set_positions(q)
         return np.concatenate(
             [
                 self.plant.CalcPointsPositions(self.context, frame, points, self.world_frame).T
@@ -121,7 +124,7 @@ class RobotKinematics:
 
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
         """Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
-        self.plant.SetPositions(self.context, q)
+        self._set_positions(q)
         return np.concatenate(
             [
                 self.plant.CalcJacobianTranslationalVelocity(
@@ -153,7 +156,7 @@ class RobotKinematics:
             Torques (n_j,) [N·m].
         """
         J = self.contact_jacobian(q) if J is None else J
-        self.plant.SetPositions(self.context, q)
+        self._set_positions(q)
         g = self.plant.CalcGravityGeneralizedForces(self.context)
         if not is_stance.all():
             if not is_stance.any():
@@ -169,7 +172,7 @@ class RobotKinematics:
 
     def center_of_mass(self, q: np.ndarray) -> np.ndarray:
         """Centre of mass in the world, (3,) [m]."""
-        self.plant.SetPositions(self.context, q)
+        self._set_positions(q)
         return self.plant.CalcCenterOfMassPositionInWorld(self.context)
 
 

@@ -49,8 +49,11 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
         v: Velocities (n_v,).
 
     Returns:
-        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`.
+        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; NaN throughout
+        when a position or velocity is not finite.
     """
+    if not q.dot(q) + v.dot(v) < math.inf:
+        return np.full(12 + 2 * kinematics.num_joints, np.nan)
     x, y, yaw = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
     R_SW = RotationMatrix.MakeZRotation(-yaw)
     R = R_SW.matrix()

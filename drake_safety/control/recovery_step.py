@@ -16,9 +16,9 @@ class RecoveryStepParameters:
     """Duration of a swing; the other feet carry the robot meanwhile [s]."""
     lift_m: float = 0.06
     """Height of the swing curve's top [m]."""
-    velocity_gain_s: float = 0.03
+    velocity_gain_s: float = 0.07
     """Raibert's gain: how much further than the neutral point per speed [s]."""
-    max_reach_m: float = 0.22
+    max_reach_m: float = 0.18
     """A foothold is at most this far from its hip's ground projection [m]."""
     min_lateral_m: float = 0.09
     """A foothold is at least this far from the base's midline, on its own side [m]."""
@@ -26,9 +26,9 @@ class RecoveryStepParameters:
     """Swings before the robot may stop."""
     max_steps: int = 20
     """Swings after which it stops in any case."""
-    settle_speed_m_s: float = 0.2
+    settle_speed_m_s: float = 0.5
     """Base speed under which it may stop [m/s]."""
-    settle_margin_m: float = 0.04
+    settle_margin_m: float = 0.05
     """Distance of the capture point inside the support polygon at which it may stop [m]."""
     return_duration_s: float = 0.5
     """Time in which the base returns over its feet before balancing goes on [s]."""

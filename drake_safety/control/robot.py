@@ -1,10 +1,13 @@
 """A robot as data: the schema of ``robot.yaml``, and how it enters a MultibodyPlant."""
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
+import yaml
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import (
     AddContactMaterial,
@@ -22,6 +25,9 @@ from pydrake.multibody.tree import (
     SpatialInertia,
 )
 from pydrake.systems.framework import Context
+
+
+_Value = TypeVar("_Value")
 
 
 @dataclass(kw_only=True)
@@ -125,6 +131,62 @@ class PlantVariation:
 _FRICTION_DAMPING = 200.0  # [N·m·s/rad]: stiction creeps at tau_c / 200, below 0.003 rad/s.
 
 
+def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
+    """Reads a YAML mapping into a dataclass of dataclasses, every one of them validated.
+
+    Drake's loader assigns a file's values to an object made of defaults, so that
+    ``__post_init__`` never sees them: it runs again here, innermost dataclass first.
+
+    Args:
+        schema: The dataclass.
+        raw: What the YAML holds.
+        who: Whose data it is, for messages.
+
+    Raises:
+        ValueError: An unknown key, a value of another type, or one that validation refuses.
+    """
+    for misfit in _misfits(schema, raw, ()):
+        raise ValueError(f"{who}: {misfit}")
+    try:
+        value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw))
+        _validate(value)
+    except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
+        raise ValueError(f"{who}: {error}") from error
+    return value
+
+
+def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
+    """What a schema of nested dataclasses does not know, with what it knows there."""
+    if is_dataclass(schema):
+        hints = get_type_hints(schema)
+        known = [entry.name for entry in fields(schema)]
+        if not isinstance(raw, dict):
+            where = f"'{'.'.join(path)}'" if path else "this"
+            yield f"{where} must be a mapping with keys of {known}; got {raw}"
+            return
+        for key, value in raw.items():
+            if key in known:
+                yield from _misfits(hints[key], value, (*path, key))
+            else:
+                yield f"unknown key '{'.'.join((*path, str(key)))}'; keys there are {known}"
+    elif isinstance(raw, dict):
+        for inner in get_args(schema):
+            if is_dataclass(inner):
+                for key, value in raw.items():
+                    yield from _misfits(inner, value, (*path, str(key)))
+
+
+def _validate(value: Any) -> None:
+    if isinstance(value, dict):
+        for item in value.values():
+            _validate(item)
+    elif is_dataclass(value):
+        for entry in fields(value):
+            _validate(getattr(value, entry.name))
+        if hasattr(value, "__post_init__"):
+            value.__post_init__()
+
+
 def load_robot_file(path: str | Path) -> RobotModel:
     """Reads a ``robot.yaml``.
 
@@ -141,9 +203,10 @@ def load_robot_file(path: str | Path) -> RobotModel:
     if not path.is_file():
         raise ValueError(f"robot file '{path}' does not exist")
     try:
-        robot = yaml_load_typed(schema=RobotModel, filename=str(path))
-    except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
-        raise ValueError(f"robot file '{path}' does not fit the schema: {error}") from error
+        raw = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"robot file '{path}' is not YAML: {error}") from error
+    robot = load_typed(RobotModel, raw, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)
     return robot
 
@@ -165,7 +228,9 @@ def add_to_package_map(package_map: PackageMap) -> None:
         package_map.AddPackageXml(str(models_package_xml()))
 
 
-def by_pattern(patterns: dict, name: str, what: str, robot_name: str):
+def by_pattern(
+    patterns: dict[str, _Value], name: str, what: str, robot_name: str
+) -> _Value | None:
     """The value of the only pattern that matches ``name`` in full; None when none does.
 
     Raises:

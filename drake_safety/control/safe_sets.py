@@ -170,8 +170,11 @@ class BalanceSafeSet:
             preview: Desired base positions in the stance frame, (H, 3) [m].
 
         Returns:
-            Features (n_f,), in the order of :attr:`feature_names` [m, rad].
+            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; NaN throughout when
+            an argument is not finite.
         """
+        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+            return np.full(len(self.feature_names), np.nan)
         kinematics, limits = self.kinematics, self.limits
         p_WC = kinematics.contact_positions(q)
         x, y, yaw = fit_stance(p_WC, kinematics.nominal_contacts)

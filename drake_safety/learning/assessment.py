@@ -1,7 +1,5 @@
 """The safety assessment function Gamma: how likely the closed loop stays safe from here on."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -37,8 +35,8 @@ _logger = logging.getLogger("drake_safety")
 class AssessmentParameters:
     """What a safety assessment is trained with; the defaults are the paper's Table I.
 
-    The paper's mode is fixed beyond Table I: one plain map with two layers of 128, trained on segments
-    that do not overlap. What is marked "sharpened" has no meaning there.
+    The paper's mode is fixed beyond Table I: one plain map with two layers of 128, trained on
+    segments that do not overlap. What is marked "sharpened" has no meaning there.
 
     Attributes:
         mode: "sharpened" or "paper".
@@ -132,7 +130,7 @@ class AssessmentParameters:
 
 @dataclass(kw_only=True, eq=False)
 class Assessments:
-    """What an assessment says of N inputs; of a single one all but the last axes are dropped.
+    """What an assessment says of N inputs.
 
     Attributes:
         safety_probability: Gamma = b_safe, (N,). At most 1 - mu: not a calibrated probability.
@@ -141,8 +139,8 @@ class Assessments:
         embedding: y by the first map, (N, 2); NaN for inputs that are not finite.
         cause_probability: b_unsafe split by the constraint that will be violated, (N, n_c).
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
-            margins], (N, n_c); NaN for inputs that are not finite, without a margin head, and always
-            in the paper's mode.
+            margins], (N, n_c); NaN for inputs that are not finite, without a margin head, and
+            always in the paper's mode.
         unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN where there is none.
     """
 
@@ -181,10 +179,10 @@ class SafetyAssessment:
       segments in the cells, (K, N, 2), (N,), (N,), which adaptation starts from.
 
     Departure ("sharpened" only): x gains the safe set's own signed margins along the plan
-    (`features`), the maps learn safety and future margins beside t-SNE's points from every start row,
-    Gamma interpolates between cell centres instead of jumping at cell edges, and it is the mean over a
-    few maps, each with its own grid. Read literally the method is weak on the robots; the "paper" mode
-    is that reading, to compare with.
+    (`features`), the maps learn safety and future margins beside t-SNE's points from every start
+    row, Gamma interpolates between cell centres instead of jumping at cell edges, and it is the
+    mean over a few maps, each with its own grid. Read literally the method is weak on the robots;
+    the "paper" mode is that reading, to compare with.
     """
 
     def __init__(self, parameters: AssessmentParameters | None = None):
@@ -192,7 +190,7 @@ class SafetyAssessment:
 
     def fit(
         self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
-    ) -> SafetyAssessment:
+    ) -> "SafetyAssessment":
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
@@ -301,7 +299,9 @@ class SafetyAssessment:
                 if progress is not None:
                     progress((member + fraction) / num_members)
 
-            seed = int(np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0])
+            seed = int(
+                np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
+            )
             members.append(train_map(data, settings, seed=seed, progress=report))
         num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
         return stack_members(members, num_margins=num_margins)
@@ -346,9 +346,10 @@ class SafetyAssessment:
             info = self.info_
             num_features = len(info.feature_names) if self.parameters.is_sharpened else 0
             raise ValueError(
-                f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, expected "
-                f"{len(info.state_names)} of the state, {info.horizon * len(info.output_names)} of the "
-                f"desired preview and {num_features} features"
+                f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, "
+                f"expected {len(info.state_names)} of the state, "
+                f"{info.horizon * len(info.output_names)} of the desired preview and "
+                f"{num_features} features"
             )
 
     def _beliefs(self, beliefs: np.ndarray | None) -> np.ndarray:
@@ -356,7 +357,8 @@ class SafetyAssessment:
             return self.beliefs_
         if beliefs.shape != self.beliefs_.shape:
             raise ValueError(
-                f"SafetyAssessment: beliefs have shape {beliefs.shape}, expected {self.beliefs_.shape}"
+                f"SafetyAssessment: beliefs have shape {beliefs.shape}, "
+                f"expected {self.beliefs_.shape}"
             )
         return beliefs
 
@@ -384,7 +386,9 @@ class SafetyAssessment:
         self._check_fitted()
         beliefs = self._beliefs(beliefs)
         x = self._inputs(state, desired_preview, features)
-        self._check_width(x.shape[-1])
+        if x.ndim != 2:
+            raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
+        self._check_width(x.shape[1])
         with np.errstate(over="ignore", invalid="ignore"):
             is_usable = np.einsum("ij,ij->i", x, x) < _INPUT_LIMIT
         x = np.where(is_usable[:, None], x, np.nan)
@@ -434,7 +438,7 @@ class SafetyAssessment:
         self._check_fitted()
         beliefs = self._beliefs(beliefs)
         is_sharpened = self.parameters.is_sharpened
-        parts = (state, desired_preview)
+        parts: tuple[np.ndarray, ...] = (state, desired_preview)
         if is_sharpened and features is not None:
             parts = (state, desired_preview, features)
         x = np.concatenate(parts)
@@ -443,38 +447,42 @@ class SafetyAssessment:
             self._check_width(x.shape[0])
         num_members, num_cells, num_columns = beliefs.shape
         if not x.dot(x) < _INPUT_LIMIT:
-            masses = belief_masses.empty((), num_columns - 3)
-            return self._assessment(
-                masses, np.full(2, np.nan), np.full(num_columns - 3, np.nan)
-            )
+            unknown = np.full(num_columns - 3, np.nan)
+            return self._assessment(None, np.full(2, np.nan), unknown, num_columns)
         output = embedding.evaluate_one(x.astype(np.float32))
         points = output[:, :2].tolist()
-        grid = self.grid_
+        if embedding.num_margins:
+            margins = np.add.reduce(output[:, 2:])
+            margins /= num_members
+        else:
+            margins = np.full(num_columns - 3, np.nan)
+        masses: np.ndarray | None = None
         if not is_sharpened:
-            cell = grid.locate_one(*points[0])
-            masses = belief_masses.empty((), num_columns - 3) if cell < 0 else beliefs[0, cell]
-            return self._assessment(masses, output[0], np.full(num_columns - 3, np.nan))
+            cell = self.grid_.locate_one(*points[0])
+            if cell != OUTSIDE:
+                masses = beliefs[0, cell]
+            return self._assessment(masses, output[0], margins, num_columns)
         rows: list[int] = []
         weights: list[float] = []
         for member, (first, second) in enumerate(points):
-            corners = grid.bilinear_one(first, second)
+            corners = self.grid_.bilinear_one(first, second)
             if corners is not None:
                 start = member * num_cells
                 rows += [start + cell for cell in corners[0]]
                 weights += corners[1]
         if rows:
-            masses = np.dot(weights, beliefs.reshape(-1, num_columns)[rows]) / num_members
+            masses = np.array(weights).dot(beliefs.reshape(-1, num_columns).take(rows, axis=0))
+            masses /= num_members
+            # A map that sends the input outside its grid knows nothing of it.
             masses[belief_masses.UNCERTAINTY] += 1.0 - len(rows) / (4 * num_members)
-        else:
-            masses = belief_masses.empty((), num_columns - 3)
-        if embedding.num_margins:
-            margins = output[:, 2:].sum(axis=0) / num_members
-        else:
-            margins = np.full(num_columns - 3, np.nan)
-        return self._assessment(masses, output[0], margins)
+        return self._assessment(masses, output[0], margins, num_columns)
 
     @staticmethod
-    def _assessment(masses: np.ndarray, point: np.ndarray, margins: np.ndarray) -> Assessment:
+    def _assessment(
+        masses: np.ndarray | None, point: np.ndarray, margins: np.ndarray, num_columns: int
+    ) -> Assessment:
+        if masses is None:
+            masses = belief_masses.empty((), num_columns - 3)
         safe, _, uncertainty = masses[:3].tolist()
         return Assessment(
             safety_probability=safe,
@@ -486,7 +494,7 @@ class SafetyAssessment:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one safetensors file, under a temporary name first, so that it is whole or absent."""
+        """Writes one safetensors file, first under a temporary name: it is whole or absent."""
         self._check_fitted()
         from safetensors.numpy import save
 
@@ -519,7 +527,7 @@ class SafetyAssessment:
             raise
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
+    def load(cls, path: str | os.PathLike[str]) -> "SafetyAssessment":
         """Reads what `save` wrote.
 
         Raises:
@@ -533,8 +541,8 @@ class SafetyAssessment:
             )
         if metadata.get("schema_version") != str(SCHEMA_VERSION):
             raise ValueError(
-                f"'{path}' has the schema version {metadata.get('schema_version')}, this version reads "
-                f"{SCHEMA_VERSION}: train the assessment again"
+                f"'{path}' has the schema version {metadata.get('schema_version')}, this version "
+                f"reads {SCHEMA_VERSION}: train the assessment again"
             )
         try:
             assessment = cls(AssessmentParameters(**json.loads(metadata["parameters"])))
@@ -554,7 +562,8 @@ class SafetyAssessment:
         num_inputs += len(info.feature_names) if parameters.is_sharpened else 0
         if self.embedding_.num_inputs != num_inputs:
             raise ValueError(
-                f"its maps take {self.embedding_.num_inputs} inputs, its names amount to {num_inputs}"
+                f"its maps take {self.embedding_.num_inputs} inputs, "
+                f"its names amount to {num_inputs}"
             )
         self.training_points_ = tensors["training_points"]
         self.training_score_ = tensors["training_score"]
@@ -578,8 +587,6 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         with safe_open(path, framework="numpy") as file:
             opened: Any = file
             metadata = dict(opened.metadata() or {})
-            return metadata, {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+            return metadata, {name: opened.get_tensor(name) for name in opened.keys()}
     except SafetensorError as error:
-        raise ValueError(
-            f"'{path}' is no safety assessment, or is truncated: {error}"
-        ) from error
+        raise ValueError(f"'{path}' is no safety assessment, or is truncated: {error}") from error

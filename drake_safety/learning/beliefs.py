@@ -1,7 +1,7 @@
 """Basic belief assignments over {safe, unsafe} and the fusion operator F.
 
-A belief is an array (..., 3 + n_c): the masses of safe, unsafe and uncertainty, which sum to one, then
-optionally n_c columns that split the unsafe mass by cause and sum to it.
+A belief is an array (..., 3 + n_c): the masses of safe, unsafe and uncertainty, which sum to one,
+then optionally n_c columns that split the unsafe mass by cause and sum to it.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def from_scores(
         Beliefs (N, 3 + n_c).
 
     Raises:
-        ValueError: A score or an uncertainty lies outside [0, 1], or causes are asked for and not given,
-            or an unsafe score has no cause.
+        ValueError: A score or an uncertainty lies outside [0, 1], or causes are asked for and not
+            given, or an unsafe score has no cause.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -51,7 +51,9 @@ def from_scores(
         if not np.all((values >= 0.0) & (values <= 1.0)):
             raise ValueError(f"from_scores: every {name} must lie in [0, 1], got {values}")
     if num_causes and cause is None:
-        raise ValueError(f"from_scores: {num_causes} causes are asked for, but `cause` is not given")
+        raise ValueError(
+            f"from_scores: {num_causes} causes are asked for, but `cause` is not given"
+        )
     beliefs = np.zeros((*score.shape, 3 + num_causes))
     # Eq. (bba_training_data)
     beliefs[..., SAFE] = (1.0 - uncertainty) * (1.0 - score)
@@ -60,7 +62,9 @@ def from_scores(
     if num_causes and cause is not None:
         has_cause = np.asarray(cause) >= 0
         if np.any(~has_cause & (score > 0.0)) or np.any(np.asarray(cause) >= num_causes):
-            raise ValueError(f"from_scores: every unsafe score needs a cause in 0..{num_causes - 1}")
+            raise ValueError(
+                f"from_scores: every unsafe score needs a cause in 0..{num_causes - 1}"
+            )
         rows = np.flatnonzero(has_cause)
         beliefs[rows, 3 + np.asarray(cause)[rows]] = beliefs[rows, UNSAFE]
     return beliefs
@@ -69,11 +73,12 @@ def from_scores(
 def fuse(beliefs: np.ndarray) -> np.ndarray:
     """F: the joint fusion of a set of beliefs.
 
-    Certain beliefs (mu = 0) outweigh all others and are averaged, vacuous ones (mu = 1) have no weight.
-    F gathers no evidence (equal mu stays mu) and is not associative: fuse a set at once.
+    Certain beliefs (mu = 0) outweigh all others and are averaged, vacuous ones (mu = 1) have no
+    weight. F gathers no evidence (equal mu stays mu) and is not associative: fuse a set at once.
 
     Departure: the printed products of uncertainties underflow from some 600 beliefs on. Divided by
-    their common product they become weights w = (1 - mu) / mu, which is the same value without loss.
+    their common product they become weights w = (1 - mu) / mu, which is the same value without
+    loss.
 
     Args:
         beliefs: A set of beliefs, (k, 3 + n_c).
@@ -105,15 +110,17 @@ def fuse_cells(
     beliefs = np.asarray(beliefs, dtype=float)
     cells = np.asarray(cells)
     if cells.shape != beliefs.shape[:1]:
-        raise ValueError(f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}")
+        raise ValueError(
+            f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
+        )
     is_inside = cells >= 0
     beliefs, cells = beliefs[is_inside], cells[is_inside]
     num_columns = beliefs.shape[1]
     uncertainty = beliefs[:, UNCERTAINTY]
     count = np.bincount(cells, minlength=num_cells)
 
-    # Within a cell the smallest mu scales all weights, so that a tiny mu cannot overflow; where it is
-    # zero only the certain beliefs keep a weight, the limit of w = (1 - mu) / mu.
+    # Within a cell the smallest mu scales all weights, so that a tiny mu cannot overflow; where it
+    # is zero only the certain beliefs keep a weight, the limit of w = (1 - mu) / mu.
     smallest = np.full(num_cells, np.inf)
     np.minimum.at(smallest, cells, uncertainty)
     is_certain = uncertainty == 0.0
@@ -122,7 +129,8 @@ def fuse_cells(
     total = np.bincount(cells, weights=weight, minlength=num_cells)
 
     fused = empty(num_cells, num_columns - 3)
-    # Eq. (compute_prior_estmate_bba): k_v >= k_min, as displayed; the prose says the opposite at equality.
+    # Eq. (compute_prior_estmate_bba): k_v >= k_min, as displayed; the prose says the opposite at
+    # equality.
     is_filled = (count >= min_count) & (total > 0.0)
     divisor = np.where(is_filled, total, 1.0)
     for column in range(num_columns):

@@ -1,10 +1,10 @@
 """The safety distance Omega between segments, as a graph of nearest neighbours.
 
-Only the nearest neighbours under Omega are ever kept. Two exact bounds make this cheap. The Euclidean
-distance of two error sequences, the shorter one held at its last value, is the cost of one admissible
-warping path and so bounds DTW from above; it gives each segment a radius within which its neighbours
-must lie. Sorted by that radius, a block of segments needs DTW only up to its own largest radius, and the
-C implementation abandons a pair as soon as it exceeds it.
+Only the nearest neighbours under Omega are ever kept. Two exact bounds make this cheap. The
+Euclidean distance of two error sequences, the shorter one held at its last value, is the cost of
+one admissible warping path and so bounds DTW from above; it gives each segment a radius within
+which its neighbours must lie. Sorted by that radius, a block of segments needs DTW only up to its
+own largest radius, and the C implementation abandons a pair as soon as it exceeds it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def neighbour_graph(
     """The exact nearest neighbours under the safety distance Omega.
 
     Args:
-        error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H, n_z).
+        error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H,
+            n_z).
         length: Samples of each that count, (N,).
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
@@ -100,8 +101,8 @@ def neighbour_graph(
     num_segments = len(error)
     if not 0 < num_neighbours < num_segments:
         raise ValueError(
-            f"neighbour_graph: {num_neighbours} neighbours are asked for among {num_segments} segments, "
-            "expected fewer neighbours than segments"
+            f"neighbour_graph: {num_neighbours} neighbours are asked for among {num_segments} "
+            "segments, expected fewer neighbours than segments"
         )
     if not np.all(np.isfinite(error)):
         raise ValueError("neighbour_graph: the errors hold values that are not finite")
@@ -151,7 +152,9 @@ def neighbour_graph(
 
 def _check_backend(backend: str) -> None:
     if backend not in BACKENDS:
-        raise ValueError(f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}")
+        raise ValueError(
+            f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}"
+        )
 
 
 def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
@@ -201,7 +204,7 @@ def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
 
 
 def _max_dtw(series: list[np.ndarray], held: np.ndarray) -> float:
-    """w_max over all pairs: DTW is computed only where the Euclidean bound exceeds the largest yet."""
+    """w_max over all pairs, with DTW only where the Euclidean bound exceeds the largest yet."""
     by_size = np.argsort(-np.linalg.norm(held - held.mean(axis=0), axis=1), kind="stable")
     held = held[by_size] - held.mean(axis=0)
     first = [series[i] for i in by_size[:64]]

@@ -115,7 +115,9 @@ class Embedding:
             if f"{name}.{kind}" not in self.weights
         ]
         if missing or self.num_layers == 0:
-            raise ValueError(f"Embedding: {missing or 'trunk layers'} missing in {list(self.weights)}")
+            raise ValueError(
+                f"Embedding: {missing or 'trunk layers'} missing in {list(self.weights)}"
+            )
         self._layers = [
             (self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :])
             for name in names
@@ -134,15 +136,18 @@ class Embedding:
             )
         self.has_safety_head = "safety.0.weight" in self.weights
         # All members share the input, so that one product serves their first layers.
-        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(self.num_inputs, -1)
-        self._first_bias = first_bias.reshape(-1).copy()
+        self._first = first.transpose(1, 0, 2).reshape(self.num_inputs, -1)
+        self._first_bias = first_bias.reshape(-1)
         self._stacked = (self.num_members, 1, width)
+        self._online = _pack([self._first, *(w for w, _ in self._layers[1:])])
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
         x = np.asarray(x, dtype=np.float32)
         if x.ndim != 2 or x.shape[1] != self.num_inputs:
-            raise ValueError(f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})")
+            raise ValueError(
+                f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})"
+            )
         shape = (self.num_members, len(x))
         output = EmbeddingOutput(
             np.empty((*shape, 2)),
@@ -175,24 +180,41 @@ class Embedding:
 
     def evaluate_one(self, x: np.ndarray) -> np.ndarray:
         """y and margins of one finite float32 input (n_x,) by every member, (K, 2 + n_c)."""
-        z = x.dot(self._first)
+        z = x.dot(self._online[0])
         z += self._first_bias
         np.maximum(z, 0.0, out=z)
         z = z.reshape(self._stacked)
-        layers = self._layers
-        for weight, bias in layers[1:-1]:
-            z = z @ weight
-            z += bias
+        last = self.num_layers
+        for index in range(1, last):
+            z = z @ self._online[index]
+            z += self._layers[index][1]
             np.maximum(z, 0.0, out=z)
-        weight, bias = layers[-1]
-        z = z @ weight
-        z += bias
+        z = z @ self._online[last]
+        z += self._layers[last][1]
         return z[:, 0]
 
     def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
         w = self.weights
         hidden = np.maximum(y[0] @ w["safety.0.weight"][member] + w["safety.0.bias"][member], 0.0)
         return (hidden @ w["safety.1.weight"][member] + w["safety.1.bias"][member])[:, 0]
+
+
+def _pack(arrays: list[np.ndarray]) -> list[np.ndarray]:
+    """Copies float32 arrays into one block that numpy places on huge pages.
+
+    The weights of an ensemble nearly fill a processor's L2 cache; spread over small pages they
+    evict each other, and a single input takes an eighth longer.
+    """
+    page = 2 * 1024 * 1024 // 4
+    block = np.zeros(sum(array.size + 16 for array in arrays) + 2 * page, dtype=np.float32)
+    start = (-block.ctypes.data // 4) % page
+    packed = []
+    for array in arrays:
+        view = block[start : start + array.size].reshape(array.shape)
+        view[...] = array
+        packed.append(view)
+        start += -(-array.size // 16) * 16
+    return packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,8 +274,8 @@ def train_map(
 ) -> dict[str, np.ndarray]:
     """Trains one map Psi; the same seed on the same machine gives the same weights.
 
-    Departure: the paper trains Psi on ||y - Psi(x)|| alone and leaves safety out. With a safety head on
-    y and a margin head on the trunk, the map separates what t-SNE places together but ends
+    Departure: the paper trains Psi on ||y - Psi(x)|| alone and leaves safety out. With a safety
+    head on y and a margin head on the trunk, the map separates what t-SNE places together but ends
     differently; held-out accuracy on the robots rises from weak to that of a direct classifier.
 
     Args:
@@ -301,7 +323,9 @@ def _train(
         target_weight = weight * has_target
         is_unsafe = torch.from_numpy(np.asarray(data.is_unsafe, dtype=np.float32))
         margins = torch.from_numpy(
-            (np.clip(data.margins, *settings.margin_range) / settings.margin_unit).astype(np.float32)
+            (np.clip(data.margins, *settings.margin_range) / settings.margin_unit).astype(
+                np.float32
+            )
         )
         num_batches = -(-len(x) // settings.batch_size)
         optimiser = torch.optim.AdamW(
@@ -356,7 +380,9 @@ def _build_network(
         if settings.dropout > 0.0:
             trunk.append(nn.Dropout(settings.dropout))
         width = size
-    net = nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)})
+    net = nn.ModuleDict(
+        {"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)}
+    )
     if has_safety:
         net["safety"] = nn.Sequential(
             nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1)

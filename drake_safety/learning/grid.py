@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Grid:
 
     @classmethod
     def from_points(cls, points: np.ndarray, resolution: int) -> Grid:
-        """The grid that holds points (N, 2) already centred, with a tenth of its half width to spare."""
+        """The grid that holds centred points (N, 2), with a tenth of their extent to spare."""
         extent = float(np.abs(points).max())
         return cls(resolution=resolution, cell_length=2.0 * _FILL * extent / resolution)
 
@@ -46,7 +47,7 @@ class Grid:
         """R * R."""
         return self.resolution**2
 
-    @property
+    @cached_property
     def half_width(self) -> float:
         """Largest coordinate of the grid."""
         return 0.5 * self.resolution * self.cell_length
@@ -89,13 +90,15 @@ class Grid:
             points: (..., 2).
 
         Returns:
-            Cells (..., 4) and their weights (..., 4), which sum to one; a point that lies outside the
-            grid has cells `OUTSIDE` and weights zero.
+            Cells (..., 4) and their weights (..., 4), which sum to one; a point that lies outside
+            the grid has cells `OUTSIDE` and weights zero.
         """
         points = np.asarray(points, dtype=float)
         is_inside = self.locate(points) != OUTSIDE
         position = (points + self.half_width) / self.cell_length - 0.5
-        position = np.clip(np.where(is_inside[..., None], position, 0.0), 0.0, self.resolution - 1.0)
+        position = np.clip(
+            np.where(is_inside[..., None], position, 0.0), 0.0, self.resolution - 1.0
+        )
         lower = np.minimum(position.astype(int), max(self.resolution - 2, 0))
         upper = np.minimum(lower + 1, self.resolution - 1)
         fraction = position - lower

@@ -23,7 +23,8 @@ class EpisodesInfo:
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
         step_s: Time between two rows of an episode, the assessment step [s].
         horizon: The safety assessment horizon H [steps].
-        constraint_names: The n_c safety constraints: the columns of `margins` and the possible causes.
+        constraint_names: The n_c safety constraints: the columns of `margins` and the possible
+            causes.
         state_names: Names of the n_s columns of `state`.
         output_names: Names of the n_z columns of `output`.
         feature_names: Names of the n_f columns of `features`.
@@ -44,9 +45,13 @@ class EpisodesInfo:
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
-            raise ValueError(f"episodes of '{self.scenario}': horizon is {self.horizon}, expected >= 1")
+            raise ValueError(
+                f"episodes of '{self.scenario}': horizon is {self.horizon}, expected >= 1"
+            )
         if not self.step_s > 0.0:
-            raise ValueError(f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0")
+            raise ValueError(
+                f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0"
+            )
 
 
 @dataclass(kw_only=True, eq=False)
@@ -97,8 +102,8 @@ class Episodes(Sequence[Episode]):
         """Checks every episode against `info`.
 
         Raises:
-            ValueError: An array has not the width or the number of rows that `info` and `time_s` imply,
-                or the cause is unknown or contradicts `is_safe`.
+            ValueError: An array has not the width or the number of rows that `info` and `time_s`
+                imply, or the cause is unknown or contradicts `is_safe`.
         """
         self.info = info
         self._episodes = list(episodes)
@@ -163,7 +168,9 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
         )
 
 
-def unsafety_score(remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float) -> np.ndarray:
+def unsafety_score(
+    remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float
+) -> np.ndarray:
     """How much each segment contributes to its episode's unsafe end: lambda, in [0, 1].
 
     Args:
@@ -194,8 +201,10 @@ class Segments:
         true_state: Starting state without observation noise, (N, n_s).
         desired_preview: Coming desired outputs, (N, H*n_z).
         features: Features at the start, (N, n_f).
-        future_margins: Smallest margin of each constraint from the start to the episode's end, (N, n_c).
-        error: Tracking errors z* - z [m], the last one repeated beyond the segment's length, (N, H, n_z).
+        future_margins: Smallest margin of each constraint from the start to the episode's end, (N,
+            n_c).
+        error: Tracking errors z* - z [m], the last one repeated beyond the segment's length, (N,
+            H, n_z).
         length: Number of samples of `error` that were recorded, (N,): H, or less where cut short.
     """
 
@@ -225,9 +234,9 @@ class Segments:
 def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
     """Cuts episodes into segments of the assessment horizon H.
 
-    A safe episode gives segments that fit whole into it. An unsafe one gives a segment from every start
-    before its end; those that reach beyond the end are cut short and keep the terminal sample.
-    Diverged episodes give none.
+    A safe episode gives segments that fit whole into it. An unsafe one gives a segment from every
+    start before its end; those that reach beyond the end are cut short and keep the terminal
+    sample. Diverged episodes give none.
 
     Args:
         episodes: The episodes; H is `episodes.info.horizon`.
@@ -274,7 +283,7 @@ def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
             pieces[name].append(values)
     if not pieces["score"]:
         raise ValueError(
-            f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives a segment of "
-            f"{horizon} steps ({episodes.num_diverged} diverged)"
+            f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives "
+            f"a segment of {horizon} steps ({episodes.num_diverged} diverged)"
         )
     return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})

@@ -101,8 +101,10 @@ class Ball:
             lead_s: Time of flight until the touch [s].
 
         Raises:
-            ValueError: The line misses the robot.
+            ValueError: The line misses the robot, or so long a flight would begin underground.
         """
+        if not lead_s >= 0:
+            raise ValueError(f"throw: lead_s must not be negative; got {lead_s}")
         inertia = SpatialInertia.SolidSphereWithMass(throw.mass_kg, self.radius_m)
         self._body.SetSpatialInertiaInBodyFrame(context, inertia)
         direction = np.array([math.cos(throw.direction_rad), math.sin(throw.direction_rad), 0.0])
@@ -110,7 +112,6 @@ class Ball:
         aim = self._plant.EvalBodyPoseInWorld(context, self._target).translation()
         aim = aim + throw.offset_m * sideways + [0.0, 0.0, throw.height_m]
         # Sphere tracing: the signed distance is a step that cannot overshoot.
-        query = self._plant.get_geometry_query_input_port().Eval(context)
         p = aim - 2.0 * direction
         for _ in range(100):
             self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
@@ -129,6 +130,13 @@ class Ball:
             raise ValueError(f"throw: the line of flight of {throw} misses the robot")
         velocity = throw.speed_m_s * direction - _GRAVITY * lead_s
         start = p - velocity * lead_s - 0.5 * _GRAVITY * lead_s**2
+        if start[2] < self.radius_m:
+            self.park(context)
+            longest_s = math.sqrt(2 * max(p[2] - self.radius_m, 0.0) / -_GRAVITY[2])
+            raise ValueError(
+                f"throw: a ball that arrives horizontally at {p[2]:.3f} m can fly for at most "
+                f"{longest_s:.3f} s; got lead_s = {lead_s}"
+            )
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(start))
         self._plant.SetFreeBodySpatialVelocity(
             context, self._body, SpatialVelocity(np.zeros(3), velocity)

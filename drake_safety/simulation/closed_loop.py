@@ -108,6 +108,24 @@ class ClosedLoop(Diagram):
         """
         raise NotImplementedError
 
+    def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
+        """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.
+
+        Args:
+            context: The diagram's Context.
+            rng: Source of every draw.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has no calm motion to throw a ball at")
+
+    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
+        """Samples a ball that touches at a given time; tasks with a ball override this.
+
+        Args:
+            rng: Source of every draw.
+            time_s: When it touches [s].
+        """
+        raise ValueError(f"task '{type(self).__name__}' has no ball to throw")
+
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
         """Sets a ball in flight towards the robot; tasks with a ball override this.
 

@@ -4,13 +4,13 @@ import hashlib
 import importlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import yaml
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.common.yaml import yaml_dump_typed
 
 import drake_safety
-from drake_safety.control.robot import PlantVariation
+from drake_safety.control.robot import PlantVariation, load_typed
 from drake_safety.learning.assessment import AssessmentParameters
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Scenario:
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
     """How Γ is learned."""
 
-    parameters = None  # Set by the loader: an instance of the task's Parameters.
+    parameters: ClassVar[Any] = None  # Set by the loader: an instance of the task's Parameters.
 
     def __post_init__(self) -> None:
         for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
@@ -51,7 +51,7 @@ class Scenario:
                 raise ValueError(
                     f"scenario '{self.name}': {name} must be positive; got {getattr(self, name)}"
                 )
-        if self.assessment.horizon * self.step_s > self.episode_duration_s:
+        if self.assessment.horizon > self.num_steps:
             raise ValueError(
                 f"scenario '{self.name}': the assessment horizon of {self.assessment.horizon} "
                 f"steps of {self.step_s} s exceeds the episode of {self.episode_duration_s} s"
@@ -120,6 +120,8 @@ class Scenario:
         """
         text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario))
         text["assessment"] = {"horizon": self.assessment.horizon}
+        # A robot of one's own is known by its files, wherever their folder lies.
+        text["robot"] = Path(self.robot).name
         body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode() + body.encode())
         for path in self.task_class().model_files(self):
@@ -129,32 +131,32 @@ class Scenario:
 
 def _import_task(task: str, scenario_name: str) -> "type[ClosedLoop]":
     module_name, _, class_name = task.partition(":")
-    if not class_name:
+    if not (module_name and class_name):
         raise ValueError(
             f"scenario '{scenario_name}': task must be 'package.module:Class'; got '{task}'"
         )
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        if error.name is None or not module_name.startswith(error.name):
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise ValueError(
             f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks "
             f"that come with the package are {task_names()}"
         ) from error
-    if not hasattr(module, class_name):
-        from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.closed_loop import ClosedLoop
 
-        known = [
-            name
-            for name, value in vars(module).items()
-            if isinstance(value, type) and issubclass(value, ClosedLoop) and value is not ClosedLoop
-        ]
+    known = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, ClosedLoop) and value is not ClosedLoop
+    }
+    if class_name not in known:
         raise ValueError(
             f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'; "
-            f"it has {known}"
+            f"it has {list(known)}"
         )
-    return getattr(module, class_name)
+    return known[class_name]
 
 
 def _scenario_folder() -> Path:
@@ -220,18 +222,9 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     if not isinstance(raw, dict) or not {"task", "robot"} <= raw.keys():
         raise ValueError(f"scenario '{name}' must be a mapping with the keys 'task' and 'robot'")
     parameters = raw.pop("parameters", None) or {}
-    scenario = _load_typed(Scenario, raw, f"scenario '{name}'")
-    scenario.name = name
+    scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
     schema = scenario.task_class().Parameters
-    scenario.parameters = _load_typed(schema, parameters, f"scenario '{name}', parameters")
+    scenario.parameters = load_typed(schema, parameters, f"scenario '{name}', parameters")
     return scenario
-
-
-def _load_typed(schema: type, raw: dict, who: str) -> Any:
-    try:
-        return yaml_load_typed(schema=schema, data=yaml.safe_dump(raw))
-    except Exception as error:  # Drake's loader raises several types for a misfit.
-        known = list(schema.__dataclass_fields__)
-        raise ValueError(f"{who}: {error}; keys are {known}") from error

@@ -65,7 +65,8 @@ class InverseKinematicsController(LeafSystem):
         )
         self.DeclareVectorInputPort("desired_output", 3)
         self.DeclareVectorInputPort("desired_foot_positions", 3 * kinematics.num_contacts)
-        self._feet_index = self.DeclareNumericParameter(BasicVector(3 * kinematics.num_contacts))
+        standing = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+        self._feet_index = self.DeclareNumericParameter(BasicVector(standing.ravel()))
         # State: joint set point without offset, then the published position and rate command.
         state = self.DeclareDiscreteState(3 * n_j)
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
@@ -103,11 +104,15 @@ class InverseKinematicsController(LeafSystem):
         torques = kinematics.gravity_torques(kinematics.positions_at(X_WB, joints), is_stance)
         return joints, torques
 
+    def _add_offset(self, joints: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        lowest, highest = self._kinematics.position_limits.T
+        return np.clip(joints + torques / self._stiffness, lowest, highest)
+
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         plant_state = self.GetInputPort("plant_state").Eval(context)
         guess = plant_state[7 : self._kinematics.num_positions]
         joints, torques = self._solve(context, guess)
-        command = joints + torques / self._stiffness
+        command = self._add_offset(joints, torques)
         discrete_state.set_value(np.concatenate([joints, command, np.zeros_like(joints)]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -117,7 +122,7 @@ class InverseKinematicsController(LeafSystem):
         limit = self._kinematics.velocity_limits
         rate = np.clip((joints - previous) / self._period_s, -limit, limit)
         discrete_state.set_value(
-            np.concatenate([joints, joints + torques / self._stiffness, rate])
+            np.concatenate([joints, self._add_offset(joints, torques), rate])
         )
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:

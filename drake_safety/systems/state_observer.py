@@ -54,7 +54,8 @@ class StateObserver(LeafSystem):
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
         state = self.GetInputPort("plant_state").Eval(context)
         noise_port = self.GetInputPort("noise")
-        if not self._is_exact and noise_port.HasValue(context):
+        is_finite = np.isfinite(state).all()
+        if is_finite and not self._is_exact and noise_port.HasValue(context):
             q, v = add_noise(
                 state[: self._n_q], state[self._n_q :], noise_port.Eval(context), self._noise
             )

@@ -61,7 +61,7 @@ class TrajectoryPlanner(LeafSystem):
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
     Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
     ``desired_preview`` is z*_{k:k+H}, row-major in time, in S: what the feet must do does not
-    depend on where they stand. After its end the plan holds its last value. The stance pose
+    depend on where they stand. Before its start and after its end the plan holds still. The stance pose
     [x, y, yaw] comes from the input if it is connected, else from the parameter.
 
     Args:
@@ -86,7 +86,7 @@ class TrajectoryPlanner(LeafSystem):
         self._offsets = step_s * np.arange(horizon)
         hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
         self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
-        self._stance_index = self.DeclareNumericParameter(BasicVector(3))
+        self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort(
             "desired_output", BasicVector(num_outputs), self._calc_output
@@ -142,8 +142,12 @@ class TrajectoryPlanner(LeafSystem):
         output.SetFromVector(to_world(self._stance_pose(context), z).ravel())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
-        _, derivative = context.get_abstract_parameter(self._plan_index).get_value()
-        rate = derivative.value(context.get_time()).reshape(-1, 3)
+        plan, derivative = context.get_abstract_parameter(self._plan_index).get_value()
+        time = context.get_time()
+        if plan.start_time() <= time <= plan.end_time():
+            rate = derivative.value(time).reshape(-1, 3)
+        else:
+            rate = np.zeros((self._num_outputs // 3, 3))
         yaw = self._stance_pose(context)[2]
         output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate).ravel())
 

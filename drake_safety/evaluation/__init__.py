@@ -1,0 +1,1 @@
+"""How good an assessment is: figures with intervals, direct classifiers beside it, and pictures."""

@@ -1,0 +1,183 @@
+"""Direct classifiers on the same inputs as the assessment: what a black box makes of the data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drake_safety.learning.segments import Episodes, Segments, split
+
+KINDS = ("gradient_boosting", "mlp")
+_VALIDATION_SHARE = 0.1
+_MLP_EPOCHS = 40
+_MLP_PATIENCE = 8
+
+
+class DirectClassifier:
+    """Predicts from x whether an episode ends unsafely, with no embedding or beliefs in between.
+
+    It learns from the segments that the assessment learns from (every start row, label: the
+    episode's end), and stops when a tenth of the *episodes*, held out, no longer improves. It
+    runs on one thread, so that the same seed gives the same bits.
+
+    Args:
+        kind: "gradient_boosting" (scikit-learn's HistGradientBoostingClassifier) or "mlp" (its
+            MLPClassifier on standardised inputs).
+        uses_features: Whether x has the features, as in the assessment's sharpened mode.
+        seed: Seeds the held-out episodes and the training.
+
+    Raises:
+        ValueError: Unknown kind.
+    """
+
+    def __init__(self, kind: str, *, uses_features: bool = True, seed: int = 0):
+        if kind not in KINDS:
+            raise ValueError(f"DirectClassifier: unknown kind '{kind}'; the kinds are {list(KINDS)}")
+        self.kind = kind
+        self.uses_features = uses_features
+        self.seed = seed
+
+    def fit(self, episodes: Episodes) -> DirectClassifier:
+        """Learns from episodes.
+
+        Returns:
+            Itself.
+
+        Raises:
+            ValueError: There are fewer than two safe or two unsafe episodes to learn from.
+        """
+        from threadpoolctl import threadpool_limits
+
+        segments = split(episodes, stride=1, discount=1.0)
+        x = self._inputs(segments.state, segments.desired_preview, segments.features)
+        is_held_out = self._held_out(segments)
+        self.num_inputs_ = x.shape[1]
+        with threadpool_limits(1):
+            train = self._boost if self.kind == "gradient_boosting" else self._train_mlp
+            train(
+                x[~is_held_out],
+                segments.is_unsafe[~is_held_out],
+                x[is_held_out],
+                segments.is_unsafe[is_held_out],
+            )
+        return self
+
+    def predict_unsafe(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Probability of an unsafe end.
+
+        Args:
+            state: States as the assessor sees them, (N, n_s).
+            desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
+            features: Features, (N, n_f).
+
+        Returns:
+            The probabilities, (N,); NaN for an input that is not finite.
+
+        Raises:
+            ValueError: It has not been fitted, or to inputs of another width.
+        """
+        if not hasattr(self, "model_"):
+            raise ValueError(f"DirectClassifier '{self.kind}': it has not been fitted yet")
+        x = self._inputs(state, desired_preview, features)
+        if x.shape[1] != self.num_inputs_:
+            raise ValueError(
+                f"DirectClassifier '{self.kind}': the input has {x.shape[1]} columns, it was fitted "
+                f"to {self.num_inputs_}"
+            )
+        probability = np.full(len(x), np.nan)
+        is_finite = np.isfinite(x).all(axis=1)
+        if is_finite.any():
+            known = x[is_finite]
+            if self.kind == "mlp":
+                known = self._standardised(known)
+            from threadpoolctl import threadpool_limits
+
+            with threadpool_limits(1):
+                probability[is_finite] = self.model_.predict_proba(known)[:, 1]
+        return probability
+
+    def _inputs(
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
+    ) -> np.ndarray:
+        parts = [state, desired_preview]
+        if self.uses_features and features is not None:
+            parts.append(features)
+        return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
+
+    def _held_out(self, segments: Segments) -> np.ndarray:
+        """Mask of the segments of the episodes that decide when to stop, (N,)."""
+        rng = np.random.default_rng(self.seed)
+        chosen = []
+        for name, is_class in (("safe", ~segments.is_unsafe), ("unsafe", segments.is_unsafe)):
+            members = np.unique(segments.episode[is_class])
+            if len(members) < 2:
+                raise ValueError(
+                    f"DirectClassifier '{self.kind}': {len(members)} {name} episodes, expected at "
+                    "least 2"
+                )
+            count = max(1, round(_VALIDATION_SHARE * len(members)))
+            chosen.append(rng.choice(members, size=count, replace=False))
+        return np.isin(segments.episode, np.concatenate(chosen))
+
+    def _boost(
+        self, x: np.ndarray, label: np.ndarray, x_held_out: np.ndarray, label_held_out: np.ndarray
+    ) -> None:
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        model = HistGradientBoostingClassifier(
+            learning_rate=0.1,
+            max_iter=400,
+            min_samples_leaf=40,
+            l2_regularization=1.0,
+            max_features=0.5,
+            early_stopping=True,
+            n_iter_no_change=20,
+            random_state=self.seed,
+        )
+        self.model_: Any = model.fit(x, label, X_val=x_held_out, y_val=label_held_out)
+
+    def _train_mlp(
+        self, x: np.ndarray, label: np.ndarray, x_held_out: np.ndarray, label_held_out: np.ndarray
+    ) -> None:
+        from sklearn.neural_network import MLPClassifier
+
+        spread = x.std(axis=0, dtype=float)
+        self.mean_ = x.mean(axis=0, dtype=float)
+        # A column that never changes carries nothing, and must not blow up elsewhere.
+        self.scale_ = np.where(spread > 1e-9, spread, 1.0)
+        x, x_held_out = self._standardised(x), self._standardised(x_held_out)
+        model = MLPClassifier(
+            hidden_layer_sizes=(128, 128),
+            alpha=1e-3,
+            batch_size=min(256, len(x)),
+            learning_rate_init=1e-3,
+            random_state=self.seed,
+        )
+        best, best_loss, waited = None, np.inf, 0
+        for _ in range(_MLP_EPOCHS):
+            model.partial_fit(x, label, classes=[False, True])
+            loss = _log_loss(model.predict_proba(x_held_out)[:, 1], label_held_out)
+            waited += 1
+            if loss < best_loss:
+                best_loss, waited = loss, 0
+                best = [w.copy() for w in (*model.coefs_, *model.intercepts_)]
+            if waited == _MLP_PATIENCE:
+                break
+        if best is not None:
+            num_layers = len(model.coefs_)
+            model.coefs_, model.intercepts_ = best[:num_layers], best[num_layers:]
+        self.model_ = model
+
+    def _standardised(self, x: np.ndarray) -> np.ndarray:
+        return ((x - self.mean_) / self.scale_).astype(np.float32)
+
+
+def _log_loss(probability: np.ndarray, label: np.ndarray) -> float:
+    of_truth = np.where(label, probability, 1.0 - probability)
+    return float(-np.log(np.maximum(of_truth, 1e-12)).mean())

@@ -1,0 +1,278 @@
+"""Throws: balls thrown at a balancing robot, logged once, judged and recovered from by anyone.
+
+What happens before a recovery starts does not depend on there being one. A throw is therefore
+logged without recovery; any Γ or classifier is evaluated on the log; and only the recovery itself
+is simulated again, from the same seed, with the trigger at the instant that was found.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.rollouts import Progress, Recorder, episode_rng, parallel_map, worker_loop
+from drake_safety.simulation.scenario import Scenario
+
+_FLIGHT_S = 0.1  # From the ball's appearance to its touch.
+_LATEST_S, _EARLIEST_S = 1.2, 0.4  # When it touches.
+_AFTER_S = 2.5  # What follows the touch.
+_PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
+
+
+@dataclass(kw_only=True, eq=False)
+class ThrowLog:
+    """One throw: rows every ``log_period_s``, and what came of it.
+
+    Attributes:
+        index: Number of the throw in its set.
+        throw: Mass, speed, direction; ``throw.time_s`` is the touch [s].
+        time_s: (N,).
+        state: (N, n_s), as the assessor sees it.
+        desired_preview: (N, H n_z).
+        features: (N, n_f).
+        margins: (N, n_c), of the true state.
+        plant_state: (N, n_q + n_v) of the robot alone.
+        trigger_time_s: When recovery was triggered; NaN without.
+        fall_time_s: When the robot fell; infinite if it did not.
+        leave_time_s: When it left the safe set; infinite if it did not.
+        recovery_active: (N,), whether a recovery step was under way.
+        violations: Counts of what must not happen: see :class:`Limits`.
+    """
+
+    index: int
+    throw: Throw
+    time_s: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    margins: np.ndarray
+    plant_state: np.ndarray
+    trigger_time_s: float
+    fall_time_s: float
+    leave_time_s: float
+    recovery_active: np.ndarray
+    violations: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot fell."""
+        return math.isfinite(self.fall_time_s)
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the robot left its safe set."""
+        return math.isfinite(self.leave_time_s)
+
+
+class Limits:
+    """Counts what a simulated success must not rest on, at every row of a log.
+
+    - ``legs_collide``: two bodies of the robot that are not neighbours penetrate each other;
+    - ``joint_position``: a joint more than 0.02 rad beyond a stop;
+    - ``joint_velocity``: a joint faster than its limit;
+    - ``joint_effort``: the actuation of a joint above its limit.
+
+    Args:
+        loop: A closed loop with a ``plant``, a ``robot_instance`` and ``kinematics``.
+    """
+
+    _POSITION_SLACK_RAD = 0.02
+    _PENETRATION_M = 2e-3
+
+    def __init__(self, loop: Any):
+        self._loop = loop
+        plant = loop.plant
+        self._bodies = set(plant.GetBodyIndices(loop.robot_instance))
+        self._limits = loop.kinematics.position_limits
+        self._velocity_limits = loop.kinematics.velocity_limits
+        # The plant reports the net actuation of the joint for each of its actuators.
+        actuators = [
+            plant.get_joint_actuator(i)
+            for i in plant.GetJointActuatorIndices(loop.robot_instance)
+        ]
+        joint_limits: dict[str, float] = {}
+        for actuator in actuators:
+            name = actuator.joint().name()
+            joint_limits[name] = joint_limits.get(name, 0.0) + actuator.effort_limit()
+        self._effort_limits = np.array([joint_limits[a.joint().name()] for a in actuators])
+        self.counts = dict.fromkeys(
+            ("legs_collide", "joint_position", "joint_velocity", "joint_effort"), 0
+        )
+
+    def count(self, context: Context) -> None:
+        """Looks at one instant.
+
+        Args:
+            context: The loop's root Context.
+        """
+        plant, instance = self._loop.plant, self._loop.robot_instance
+        plant_context = plant.GetMyContextFromRoot(context)
+        contacts = plant.get_contact_results_output_port().Eval(plant_context)
+        for i in range(contacts.num_point_pair_contacts()):
+            info = contacts.point_pair_contact_info(i)
+            if (
+                info.bodyA_index() in self._bodies
+                and info.bodyB_index() in self._bodies
+                and info.point_pair().depth > self._PENETRATION_M
+            ):
+                self.counts["legs_collide"] += 1
+                break
+        q = plant.GetPositions(plant_context, instance)[7:]
+        v = plant.GetVelocities(plant_context, instance)[6:]
+        beyond = np.maximum(self._limits[:, 0] - q, q - self._limits[:, 1]).max()
+        self.counts["joint_position"] += bool(beyond > self._POSITION_SLACK_RAD)
+        self.counts["joint_velocity"] += bool(np.any(np.abs(v) > self._velocity_limits))
+        effort = plant.get_net_actuation_output_port(instance).Eval(plant_context)
+        self.counts["joint_effort"] += bool(
+            np.any(np.abs(effort) > self._effort_limits + 1e-6)
+        )
+
+
+def run_throw(
+    loop: ClosedLoop,
+    index: int,
+    *,
+    seed: int,
+    trigger_time_s: float = math.nan,
+    throw: Throw | None = None,
+    log_period_s: float = 0.02,
+) -> ThrowLog:
+    """Throws one random ball at a robot in calm motion.
+
+    Args:
+        loop: A closed loop with a ball. With an input port ``safety_probability`` (recovery
+            without Γ) recovery is triggered at ``trigger_time_s``; with Γ it triggers itself.
+        index: Number of the throw: start, plan and ball follow from it and the seed.
+        seed: Seed of the set.
+        trigger_time_s: When to trigger; NaN for never.
+        throw: A ball in place of the random one.
+        log_period_s: Time between two rows [s].
+
+    Returns:
+        The log, which ends at a fall.
+    """
+    rng = episode_rng(seed, index)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_calm(context, rng)
+    touch_s = rng.uniform(_EARLIEST_S, _LATEST_S)
+    sampled = loop.sample_throw(rng, touch_s)
+    throw = throw or sampled
+    probability = None
+    if loop.HasInputPort("safety_probability"):
+        probability = loop.GetInputPort("safety_probability")
+        probability.FixValue(context, [1.0])
+    has_recovery = loop.HasOutputPort("recovery_active")
+    simulator.Initialize()
+    recorder = Recorder(loop, (*_PORTS, *(("recovery_active",) if has_recovery else ())))
+    limits = Limits(loop)
+    fall_column = loop.constraint_names.index(loop.fall_name)
+    fall_s = leave_s = math.inf
+    triggered_s = math.nan
+    num_rows = math.ceil((throw.time_s + _AFTER_S) / log_period_s)
+    release_s = throw.time_s - _FLIGHT_S
+    is_released = False
+    for row in range(num_rows + 1):
+        time = row * log_period_s
+        if not is_released and release_s <= time:
+            simulator.AdvanceTo(release_s)
+            loop.throw_ball(context, throw, _FLIGHT_S)
+            is_released = True
+        simulator.AdvanceTo(time)
+        recorder.record(context)
+        limits.count(context)
+        margins = loop.GetOutputPort("margins").Eval(context)
+        if margins.min() < 0:
+            leave_s = min(leave_s, time)
+        if margins[fall_column] < 0:
+            fall_s = time
+            break
+        if probability is not None and time >= trigger_time_s - 1e-9:
+            # One low value is enough: the trigger latches.
+            probability.FixValue(context, [0.0 if math.isnan(triggered_s) else 1.0])
+            triggered_s = time if math.isnan(triggered_s) else triggered_s
+    arrays = recorder.arrays()
+    active = arrays.pop("recovery_active", np.zeros((len(arrays["time_s"]), 1)))[:, 0]
+    if has_recovery and probability is None and active.any():
+        triggered_s = float(arrays["time_s"][int(np.argmax(active > 0))])
+    return ThrowLog(
+        index=index,
+        throw=throw,
+        **arrays,
+        trigger_time_s=triggered_s,
+        fall_time_s=fall_s,
+        leave_time_s=leave_s,
+        recovery_active=active,
+        violations=limits.counts,
+    )
+
+
+def run_throws(
+    scenario: Scenario,
+    indices: list[int],
+    *,
+    seed: int,
+    variation: str = "actual",
+    trigger_times_s: dict[int, float] | None = None,
+    num_workers: int | None = None,
+    progress: Progress | None = None,
+) -> list[ThrowLog]:
+    """Throws a set of balls, in worker processes.
+
+    Args:
+        scenario: The scenario.
+        indices: Which throws of the set.
+        seed: Seed of the set.
+        variation: Which plant.
+        trigger_times_s: Per throw, when recovery is triggered; by default there is none.
+        num_workers: Processes; as many as there are cores by default.
+        progress: Called with the number done and the number wanted.
+
+    Returns:
+        The logs, in the order of ``indices``.
+    """
+    options = {"ball": True, "recovery": trigger_times_s is not None}
+    times = trigger_times_s or {}
+    size = 4
+    batches = [indices[i : i + size] for i in range(0, len(indices), size)]
+    arguments = [
+        (scenario, variation, options, seed, [(i, times.get(i, math.nan)) for i in batch])
+        for batch in batches
+    ]
+    logs: list[ThrowLog] = []
+    for batch in parallel_map(_throw_batch, arguments, num_workers):
+        logs += batch
+        if progress is not None:
+            progress(len(logs), len(indices))
+    by_index = {log.index: log for log in logs}
+    return [by_index[index] for index in indices]
+
+
+def _throw_batch(
+    scenario: Scenario,
+    variation: str,
+    options: dict[str, Any],
+    seed: int,
+    items: list[tuple[int, float]],
+) -> list[ThrowLog]:
+    loop = worker_loop(scenario, variation, options)
+    return [run_throw(loop, index, seed=seed, trigger_time_s=time) for index, time in items]
+
+
+def trigger_time(log: ThrowLog, probability: np.ndarray, threshold: float) -> float:
+    """When a probability first falls below a threshold [s]; NaN if it never does.
+
+    Args:
+        log: The log of a throw without recovery.
+        probability: Safety probability of every row, (N,); NaN triggers.
+        threshold: Γ_thre.
+    """
+    below = ~(probability >= threshold)
+    return float(log.time_s[int(np.argmax(below))]) if below.any() else math.nan

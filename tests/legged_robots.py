@@ -1,0 +1,147 @@
+"""Legged robots for the tests: one that comes with the package, and two made up on the spot.
+
+The made-up ones share no link name, number of legs or foot shape with any robot of the package.
+"""
+
+import functools
+import math
+import tempfile
+from pathlib import Path
+
+import yaml
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.robot import RobotModel, load_robot_file
+from drake_safety.models import load_robot
+
+
+def _link(name, mass, size, centre, collisions=()):
+    """A box of a link; collisions are (centre, radius) spheres."""
+    a, b, c = size
+    x, y, z = centre
+    spheres = "".join(
+        f'<collision><origin xyz="{p[0]} {p[1]} {p[2]}"/><geometry><sphere radius="{r}"/>'
+        "</geometry></collision>"
+        for p, r in collisions
+    )
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{x} {y} {z}"/><mass value="{mass}"/>'
+        f'<inertia ixx="{mass * (b * b + c * c) / 12}" iyy="{mass * (a * a + c * c) / 12}" '
+        f'izz="{mass * (a * a + b * b) / 12}" ixy="0" ixz="0" iyz="0"/></inertial>{spheres}</link>'
+    )
+
+
+def _joint(name, parent, child, origin, axis, limits=(-2.5, 2.5), yaw=0.0):
+    x, y, z = origin
+    return (
+        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x} {y} {z}" rpy="0 0 {yaw}"/><axis xyz="{axis}"/>'
+        f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="40" velocity="20"/></joint>'
+    )
+
+
+def _write(folder, name, parts, robot):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.urdf").write_text(f'<robot name="{name}">{"".join(parts)}</robot>')
+    path = folder / "robot.yaml"
+    path.write_text(yaml.safe_dump({"name": name, "urdf": f"{name}.urdf", **robot}))
+    return path
+
+
+def write_hexapod(folder: Path) -> Path:
+    """Writes a spider of six three-joint legs without transmissions; returns its robot.yaml."""
+    parts = [_link("body", 6.0, (0.4, 0.4, 0.08), (0, 0, 0), [((0, 0, 0), 0.05)])]
+    feet = {}
+    for i in range(6):
+        angle = math.pi / 6 + i * math.pi / 3
+        hip = (0.2 * math.cos(angle), 0.2 * math.sin(angle), 0.0)
+        coxa, femur, tibia = (f"{part}_{i}" for part in ("coxa", "femur", "tibia"))
+        parts += [
+            _link(coxa, 0.2, (0.05, 0.05, 0.05), (0.02, 0, 0)),
+            _link(femur, 0.3, (0.15, 0.03, 0.03), (0.075, 0, 0)),
+            _link(tibia, 0.2, (0.2, 0.02, 0.02), (0.1, 0, 0), [((0.2, 0, 0), 0.02)]),
+            _joint(f"swing_{i}", "body", coxa, hip, "0 0 1", (-1, 1), angle),
+            _joint(f"lift_{i}", coxa, femur, (0.05, 0, 0), "0 1 0"),
+            _joint(f"knee_{i}", femur, tibia, (0.15, 0, 0), "0 1 0"),
+        ]
+        feet[f"foot_{i}"] = {
+            "body": tibia,
+            "contact_points": [[0.2, 0.0, 0.0]],
+            "radius_m": 0.02,
+            "joints": [f"swing_{i}", f"lift_{i}", f"knee_{i}"],
+        }
+    return _write(
+        folder,
+        "hexapod",
+        parts,
+        {
+            "base": "body",
+            "posture": {"lift_.*": -0.4, "knee_.*": 1.6},
+            "feet": feet,
+            "joint_gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
+            "effort_limits": {".*": 40.0},
+            "foot_friction": 0.9,
+        },
+    )
+
+
+def write_biped(folder: Path) -> Path:
+    """Writes two six-joint legs whose feet touch at four points each; returns its robot.yaml."""
+    parts = [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1))]
+    feet = {}
+    corners = [[x, y, -0.05] for x in (-0.06, 0.1) for y in (-0.04, 0.04)]
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        links = [f"{side}_{n}" for n in ("yaw", "roll", "thigh", "shin", "ankle", "sole")]
+        joints = [f"{side}_{n}" for n in ("hip_z", "hip_x", "hip_y", "knee", "ankle_y", "ankle_x")]
+        box = (0.05, 0.05, 0.05)
+        long = (0.06, 0.06, 0.3)
+        parts += [
+            _link(links[0], 0.3, box, (0, 0, 0)),
+            _link(links[1], 0.3, box, (0, 0, 0)),
+            _link(links[2], 2.0, long, (0, 0, -0.15)),
+            _link(links[3], 1.0, long, (0, 0, -0.15)),
+            _link(links[4], 0.2, box, (0, 0, 0)),
+            _link(links[5], 0.5, (0.2, 0.1, 0.03), (0, 0, -0.04), [(p, 0.005) for p in corners]),
+        ]
+        parents = ["pelvis", *links[:-1]]
+        origins = [(0, y, 0), (0, 0, 0), (0, 0, 0), (0, 0, -0.3), (0, 0, -0.3), (0, 0, 0)]
+        axes = ["0 0 1", "1 0 0", "0 1 0", "0 1 0", "0 1 0", "1 0 0"]
+        parts += [
+            _joint(*values) for values in zip(joints, parents, links, origins, axes, strict=True)
+        ]
+        feet[side] = {
+            "body": links[5],
+            "contact_points": corners,
+            "radius_m": 0.005,
+            "joints": joints,
+        }
+    return _write(
+        folder,
+        "biped",
+        parts,
+        {
+            "base": "pelvis",
+            "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
+            "feet": feet,
+            "joint_gains": {".*": {"stiffness": 400.0, "damping": 8.0}},
+            "effort_limits": {".*": 80.0},
+        },
+    )
+
+
+ROBOT_NAMES = ("laikago", "hexapod", "biped")
+
+
+@functools.cache
+def robot_model(name: str) -> RobotModel:
+    """A robot of the package by name, or one of the made-up ones."""
+    writers = {"hexapod": write_hexapod, "biped": write_biped}
+    if name not in writers:
+        return load_robot(name)
+    return load_robot_file(writers[name](Path(tempfile.mkdtemp(prefix=name))))
+
+
+@functools.cache
+def robot_kinematics(name: str) -> RobotKinematics:
+    """Its kinematics; they keep nothing between two calls, so tests may share them."""
+    return RobotKinematics(robot_model(name))

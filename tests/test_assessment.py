@@ -1,0 +1,279 @@
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from lip_episodes import make_episodes
+
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.segments import split
+
+QUICK = {
+    "perplexity": 15.0,
+    "epochs": 6,
+    "hidden_sizes": [48, 48],
+    "ensemble_size": 2,
+    "batch_size": 256,
+    "score_weight": 0.1,
+}
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes(260, noise=0.002)
+
+
+@pytest.fixture(scope="module")
+def held_out():
+    return split(make_episodes(150, seed=1, noise=0.002), stride=2, discount=0.99)
+
+
+@pytest.fixture(scope="module", params=["sharpened", "paper"])
+def assessment(request, episodes):
+    parameters = AssessmentParameters(mode=request.param, **QUICK)
+    return SafetyAssessment(parameters).fit(episodes)
+
+
+def inputs(segments, rows=slice(None)):
+    return segments.state[rows], segments.desired_preview[rows], segments.features[rows]
+
+
+def area_under_curve(score, is_positive):
+    positive, negative = score[is_positive], score[~is_positive]
+    difference = positive[:, None] - negative
+    return ((difference > 0.0) + 0.5 * (difference == 0.0)).mean()
+
+
+def test_held_out_episodes_are_told_apart(assessment, held_out):
+    result = assessment.predict(*inputs(held_out))
+    area = area_under_curve(result.safety_probability, ~held_out.is_unsafe)
+    assert area > (0.95 if assessment.parameters.is_sharpened else 0.75)
+
+
+def test_masses_sum_to_one_and_causes_to_the_unsafe_mass(assessment, held_out):
+    result = assessment.predict(*inputs(held_out))
+    np.testing.assert_allclose(result.belief.sum(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(result.cause_probability.sum(axis=1), result.belief[:, 1])
+    np.testing.assert_array_equal(result.safety_probability, result.belief[:, 0])
+    assert np.all(result.belief >= 0.0)
+    assert np.all(result.safety_probability <= 0.7 + 1e-9)
+
+
+def test_the_normalised_probability_is_the_safe_share_of_what_is_known(assessment, held_out):
+    result = assessment.predict(*inputs(held_out))
+    known = result.belief[:, :2].sum(axis=1)
+    np.testing.assert_allclose(result.normalized * known, result.belief[:, 0], atol=1e-9)
+    assert np.all((result.normalized >= 0.0) & (result.normalized <= 1.0 + 1e-9))
+
+
+def test_one_input_alone_is_assessed_as_among_many(assessment, held_out):
+    result = assessment.predict(*inputs(held_out))
+    for row in range(0, len(held_out), 97):
+        one = assessment.predict_one(*inputs(held_out, row))
+        for name in ("safety_probability", "normalized", "belief", "cause_probability"):
+            np.testing.assert_allclose(getattr(one, name), getattr(result, name)[row], atol=2e-4)
+        np.testing.assert_allclose(one.embedding, result.embedding[row], atol=2e-3)
+        np.testing.assert_allclose(one.predicted_margins, result.predicted_margins[row], atol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+def test_an_input_that_is_not_finite_gets_the_empty_belief(assessment, held_out, bad):
+    state, preview, features = (part.copy() for part in inputs(held_out, slice(0, 3)))
+    state[1, 2] = bad
+    result = assessment.predict(state, preview, features)
+    one = assessment.predict_one(state[1], preview[1], features[1])
+    for belief, gamma, normalized in (
+        (result.belief[1], result.safety_probability[1], result.normalized[1]),
+        (one.belief, one.safety_probability, one.normalized),
+    ):
+        np.testing.assert_array_equal(belief, EMPTY)
+        assert gamma == 0.0
+        assert normalized == 0.0
+    assert np.all(np.isfinite(result.belief))
+    assert result.belief[0, 2] < 1.0
+
+
+def test_other_beliefs_may_be_given_in_place_of_the_learned_ones(assessment, held_out):
+    beliefs = np.zeros_like(assessment.beliefs_)
+    beliefs[..., 1] = beliefs[..., 3] = 1.0
+    result = assessment.predict(*inputs(held_out, slice(0, 50)), beliefs=beliefs)
+    is_inside = result.belief[:, 2] < 1e-9
+    assert is_inside.mean() > 0.9
+    np.testing.assert_allclose(result.belief[is_inside, 1], 1.0)
+    np.testing.assert_allclose(result.cause_probability[is_inside, 0], 1.0)
+    one = assessment.predict_one(*inputs(held_out, 0), beliefs=beliefs)
+    np.testing.assert_allclose(one.belief, result.belief[0], atol=1e-9)
+    with pytest.raises(ValueError, match="beliefs have shape"):
+        assessment.predict(*inputs(held_out), beliefs=beliefs[:, 1:])
+
+
+def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessment):
+    cells = assessment.grid_.locate(assessment.training_points_[0])
+    filled, counts = np.unique(cells[cells >= 0], return_counts=True)
+    for cell, count in zip(filled, counts, strict=True):
+        belief = assessment.beliefs_[0, cell]
+        if count < assessment.parameters.min_count:
+            np.testing.assert_array_equal(belief[:3], EMPTY)
+        else:
+            # Equal uncertainties: F is the mean of the masses.
+            score = assessment.training_score_[cells == cell].mean()
+            np.testing.assert_allclose(belief[:3], [0.7 * (1 - score), 0.7 * score, 0.3])
+
+
+def test_predicted_margins_and_causes_name_what_will_be_violated(assessment, held_out):
+    result = assessment.predict(*inputs(held_out))
+    if not assessment.parameters.is_sharpened:
+        assert np.all(np.isnan(result.predicted_margins))
+        return
+    assert np.all(np.isfinite(result.predicted_margins))
+    error = np.abs(result.predicted_margins - np.clip(held_out.future_margins, -0.03, 0.10))
+    assert np.median(error) < 0.02
+    is_clear = held_out.is_unsafe & (result.belief[:, 1] > 0.4)
+    named = result.cause_probability.argmax(axis=1)
+    assert (named == held_out.cause)[is_clear].mean() > 0.9
+
+
+def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    loaded = SafetyAssessment.load(path)
+    assert loaded.parameters == assessment.parameters
+    assert loaded.info_ == assessment.info_
+    before, after = (a.predict(*inputs(held_out)) for a in (assessment, loaded))
+    for field in dataclasses.fields(before):
+        np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
+    np.testing.assert_array_equal(loaded.training_points_, assessment.training_points_)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_path, monkeypatch):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    content = path.read_bytes()
+
+    def full_disk(descriptor):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        assessment.save(path)
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_path):
+    from safetensors.numpy import load_file, save_file
+
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    content = path.read_bytes()
+    for size in (0, 5, 200, len(content) // 2, len(content) - 1):
+        (tmp_path / "short").write_bytes(content[:size])
+        with pytest.raises(ValueError, match="no safety assessment, or is truncated"):
+            SafetyAssessment.load(tmp_path / "short")
+    save_file({"x": np.zeros(3)}, tmp_path / "foreign")
+    with pytest.raises(ValueError, match="its schema is 'None'"):
+        SafetyAssessment.load(tmp_path / "foreign")
+    metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
+    save_file(load_file(path), tmp_path / "old", metadata)
+    with pytest.raises(ValueError, match="schema version 0, this version reads 1"):
+        SafetyAssessment.load(tmp_path / "old")
+    metadata["schema_version"] = "1"
+    save_file(load_file(path), tmp_path / "hollow", metadata)
+    with pytest.raises(ValueError, match="damaged safety assessment"):
+        SafetyAssessment.load(tmp_path / "hollow")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors"):
+        SafetyAssessment.load(tmp_path / "nowhere.safetensors")
+
+
+def test_the_same_seed_learns_the_same_assessment(episodes):
+    parameters = AssessmentParameters(**{**QUICK, "epochs": 1})
+    first, again = (SafetyAssessment(parameters).fit(episodes[:60]) for _ in range(2))
+    np.testing.assert_array_equal(first.beliefs_, again.beliefs_)
+    np.testing.assert_array_equal(first.training_points_, again.training_points_)
+
+
+def test_progress_runs_through_the_stages(episodes):
+    seen = []
+    SafetyAssessment(AssessmentParameters(**{**QUICK, "epochs": 1})).fit(
+        episodes[:60], lambda stage, fraction: seen.append((stage, fraction))
+    )
+    assert list(dict.fromkeys(stage for stage, _ in seen)) == [
+        "distances",
+        "t-SNE",
+        "training",
+        "beliefs",
+    ]
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in seen)
+
+
+def test_a_loaded_assessment_runs_with_numpy_alone(assessment, held_out, tmp_path):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    sizes = [part.shape[1] for part in inputs(held_out)]
+    code = f"""
+import sys, numpy as np
+from drake_safety.learning.assessment import SafetyAssessment
+assessment = SafetyAssessment.load({str(path)!r})
+parts = [np.zeros(size) for size in {sizes}]
+assessment.predict_one(*parts)
+assessment.predict(*[part[None] for part in parts])
+heavy = {{"torch", "openTSNE", "dtaidistance", "tslearn", "sklearn", "pydrake", "scipy", "numba"}}
+sys.exit(", ".join(heavy & set(sys.modules)))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+def test_inputs_of_another_width_are_refused_with_the_expected_one(assessment, held_out):
+    state, preview, features = inputs(held_out)
+    with pytest.raises(ValueError, match=r"of 'lip': the input has .* expected 6 of the state"):
+        assessment.predict(state[:, 1:], preview, features)
+    with pytest.raises(ValueError, match="expected 6 of the state"):
+        assessment.predict_one(state[0, 1:], preview[0], features[0])
+
+
+def test_episodes_of_another_horizon_and_too_few_episodes_are_refused(episodes):
+    with pytest.raises(ValueError, match="look 10 steps ahead"):
+        SafetyAssessment(AssessmentParameters(horizon=12)).fit(episodes)
+    with pytest.raises(ValueError, match="needs more than 90 segments"):
+        SafetyAssessment(AssessmentParameters()).fit(episodes[:2])
+
+
+def test_nothing_can_be_asked_before_something_is_learned():
+    with pytest.raises(ValueError, match="not been fitted"):
+        SafetyAssessment().predict(np.zeros((1, 6)), np.zeros((1, 30)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mode", "blunt"),
+        ("discount", 1.1),
+        ("initial_uncertainty", -0.1),
+        ("min_count", 0),
+        ("cell_length", 0.0),
+        ("dropout", 1.0),
+        ("hidden_sizes", []),
+        ("margin_range", [0.1, -0.1]),
+        ("discount", float("nan")),
+    ],
+)
+def test_parameters_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        AssessmentParameters(**{name: value})
+
+
+def test_the_defaults_are_the_papers_table():
+    parameters = AssessmentParameters()
+    assert parameters.discount == 0.99
+    assert parameters.horizon == 10
+    assert parameters.score_weight == 0.01
+    assert parameters.initial_uncertainty == 0.3
+    assert parameters.min_count == 5
+    assert (parameters.resolution, parameters.cell_length) == (14, 10.0)

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+from lip_episodes import make_episodes
+
+from drake_safety.learning import distance
+from drake_safety.learning.distance import dtw_matrix, neighbour_graph
+from drake_safety.learning.segments import split
+
+
+@pytest.fixture(scope="module")
+def segments():
+    return split(make_episodes(60), stride=4, discount=0.99)
+
+
+def graph_of(segments, **changes):
+    options = {"score_weight": 0.05, "num_neighbours": 15} | changes
+    return neighbour_graph(segments.error, segments.length, segments.score, **options)
+
+
+def test_dtw_of_two_short_sequences_is_the_value_worked_by_hand():
+    # (0, 1, 2) against (0, 2): 0-0, 1-0 or 1-2 at cost 1, 2-2
+    error = np.array([[[0.0], [1.0], [2.0]], [[0.0], [2.0], [99.0]]])
+    for backend in distance.BACKENDS:
+        matrix = dtw_matrix(error, np.array([3, 2]), backend=backend)
+        np.testing.assert_allclose(matrix, [[0.0, 1.0], [1.0, 0.0]])
+
+
+def test_dtw_is_symmetric_and_agrees_with_its_oracle(segments):
+    assert np.any(segments.length < segments.error.shape[1])
+    matrix = dtw_matrix(segments.error, segments.length)
+    np.testing.assert_array_equal(matrix, matrix.T)
+    np.testing.assert_array_equal(np.diag(matrix), 0.0)
+    oracle = dtw_matrix(segments.error, segments.length, backend="tslearn")
+    np.testing.assert_allclose(matrix, oracle, atol=1e-12)
+
+
+@pytest.mark.parametrize("block", [512, 37])
+@pytest.mark.parametrize("score_weight", [0.0, 0.01, 0.5])
+def test_the_graph_holds_exactly_the_nearest_neighbours(segments, block, score_weight, monkeypatch):
+    monkeypatch.setattr(distance, "_BLOCK", block)
+    graph = graph_of(segments, score_weight=score_weight)
+    oracle = graph_of(segments, score_weight=score_weight, backend="tslearn")
+    assert graph.max_dtw == pytest.approx(oracle.max_dtw, rel=1e-12)
+    np.testing.assert_allclose(graph.distances, oracle.distances, atol=1e-12)
+    matrix = dtw_matrix(segments.error, segments.length)
+    score = segments.score
+    omega = matrix / matrix.max() + score_weight * np.abs(score[:, None] - score)
+    found = np.take_along_axis(omega, graph.indices, axis=1)
+    np.testing.assert_allclose(found, graph.distances, atol=1e-12)
+
+
+def test_no_segment_is_its_own_neighbour_nor_twice_the_same(segments):
+    graph = graph_of(segments)
+    assert not np.any(graph.indices == np.arange(len(segments))[:, None])
+    assert all(len(set(row)) == 15 for row in graph.indices.tolist())
+    assert np.all(np.diff(graph.distances, axis=1) >= 0.0)
+
+
+def test_the_largest_dtw_is_found_though_the_euclidean_bound_misleads():
+    # Shifted copies of one pulse lie far apart in the Euclidean sense and at DTW zero.
+    pulses = np.array([np.eye(12)[i] for i in range(1, 11)])
+    error = np.vstack([pulses, np.full((1, 12), 0.4), np.zeros((200, 12))])[:, :, None]
+    length = np.full(len(error), 12)
+    score = np.zeros(len(error))
+    graph = neighbour_graph(error, length, score, score_weight=0.0, num_neighbours=3)
+    assert graph.max_dtw == pytest.approx(dtw_matrix(error, length).max(), rel=1e-12)
+
+
+def test_identical_segments_are_at_distance_zero_of_each_other():
+    error = np.zeros((20, 5, 2))
+    graph = neighbour_graph(error, np.full(20, 5), np.zeros(20), score_weight=0.1, num_neighbours=4)
+    assert graph.max_dtw == 0.0
+    np.testing.assert_array_equal(graph.distances, 0.0)
+
+
+def test_progress_grows_to_one(segments):
+    seen = []
+    graph_of(segments, progress=seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+def test_more_neighbours_than_segments_are_refused(segments):
+    with pytest.raises(ValueError, match="expected fewer neighbours than segments"):
+        graph_of(segments, num_neighbours=len(segments))
+
+
+def test_an_unknown_backend_is_refused_with_those_that_exist(segments):
+    with pytest.raises(ValueError, match=r"unknown backend 'fast'.*dtaidistance.*tslearn"):
+        graph_of(segments, backend="fast")
+
+
+def test_errors_that_are_not_finite_are_refused(segments):
+    error = segments.error.copy()
+    error[3, 2, 0] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        neighbour_graph(error, segments.length, segments.score, score_weight=0.0, num_neighbours=3)
+
+
+def test_a_dense_matrix_of_many_segments_is_refused():
+    with pytest.raises(ValueError, match="dense matrix"):
+        dtw_matrix(np.zeros((4001, 2, 1)), np.full(4001, 2))

@@ -1,0 +1,180 @@
+import numpy as np
+import pytest
+from lip_episodes import make_episodes
+
+from drake_safety.learning.distance import neighbour_graph
+from drake_safety.learning.embedding import (
+    Embedding,
+    MapData,
+    MapSettings,
+    stack_members,
+    train_map,
+    tsne,
+)
+from drake_safety.learning.segments import split
+
+SETTINGS = MapSettings(
+    hidden_sizes=(32, 32),
+    dropout=0.0,
+    epochs=30,
+    batch_size=64,
+    learning_rate=5e-3,
+    safety_weight=1.0,
+    margin_weight=1.0,
+    margin_unit=0.02,
+    margin_range=(-0.03, 0.10),
+)
+
+
+@pytest.fixture(scope="module")
+def graph():
+    segments = split(make_episodes(80), stride=5, discount=0.99)
+    return segments, neighbour_graph(
+        segments.error, segments.length, segments.score, score_weight=0.1, num_neighbours=30
+    )
+
+
+@pytest.fixture(scope="module")
+def data():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(600, 4)) * [1.0, 10.0, 0.1, 1.0] + [0.0, 5.0, 1.0, 0.0]
+    x[:, 3] = 2.0
+    target = np.column_stack([20.0 * x[:, 0], 2.0 * (x[:, 1] - 5.0)])
+    has_target = rng.uniform(size=600) < 0.5
+    return MapData(
+        x=x,
+        has_target=has_target,
+        target=target[has_target],
+        is_unsafe=x[:, 0] > 0.5,
+        margins=(0.02 * (0.5 - x[:, :1])),
+        sample_weight=np.ones(600),
+    )
+
+
+@pytest.fixture(scope="module")
+def embedding(data):
+    members = [train_map(data, SETTINGS, seed=seed) for seed in (0, 1)]
+    return stack_members(members, num_margins=1)
+
+
+def test_tsne_puts_neighbours_of_the_graph_near_each_other(graph):
+    segments, neighbours = graph
+    points = tsne(neighbours, perplexity=10, seed=0)
+    to_neighbours = np.linalg.norm(points[:, None] - points[neighbours.indices[:, :5]], axis=2)
+    rng = np.random.default_rng(0)
+    to_others = np.linalg.norm(points - points[rng.permutation(len(points))], axis=1)
+    assert points.shape == (len(segments), 2)
+    assert np.median(to_neighbours) < 0.2 * np.median(to_others)
+
+
+def test_tsne_gives_the_same_bits_for_the_same_seed(graph):
+    first, again, other = (tsne(graph[1], perplexity=10, seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_tsne_refuses_a_graph_with_too_few_neighbours(graph):
+    with pytest.raises(ValueError, match="perplexity 30 needs 90 neighbours"):
+        tsne(graph[1], perplexity=30, seed=0)
+
+
+def test_a_map_reproduces_its_targets_also_where_it_saw_none(data, embedding):
+    points = embedding.embed(data.x)
+    expected = np.column_stack([20.0 * data.x[:, 0], 2.0 * (data.x[:, 1] - 5.0)])
+    for member in points:
+        error = np.linalg.norm(member - expected, axis=1)
+        assert np.median(error[~data.has_target]) < 0.1 * expected.std()
+
+
+def test_a_map_predicts_safety_and_margins_in_their_own_unit(data, embedding):
+    output = embedding.evaluate(data.x)
+    is_clear = np.abs(data.x[:, 0] - 0.5) > 0.2
+    for logit, margins in zip(output.unsafe_logit, output.margins, strict=True):
+        agrees = (logit > 0.0) == data.is_unsafe
+        assert agrees[is_clear].mean() > 0.98
+        clipped = np.clip(data.margins[:, 0], *SETTINGS.margin_range)
+        assert np.median(np.abs(margins[:, 0] - clipped)) < 0.003
+
+
+def test_numpy_evaluates_what_torch_trained(data):
+    torch = pytest.importorskip("torch")
+    (embedding,) = [stack_members([train_map(data, SETTINGS, seed=5)], num_margins=1)]
+    weights = {name: torch.from_numpy(w[0].copy()) for name, w in embedding.weights.items()}
+    z = torch.from_numpy(data.x.astype(np.float32))
+    for layer in ("trunk.0", "trunk.1"):
+        z = torch.relu(z @ weights[f"{layer}.weight"] + weights[f"{layer}.bias"])
+    z = z @ weights["output.weight"] + weights["output.bias"]
+    np.testing.assert_allclose(embedding.embed(data.x)[0], z[:, :2].numpy(), atol=1e-3)
+
+
+def test_training_gives_the_same_weights_for_the_same_seed_and_leaves_torchs_state_alone(data):
+    import torch
+
+    state, num_threads = torch.get_rng_state(), torch.get_num_threads()
+    first, again = (train_map(data, SETTINGS, seed=7) for _ in range(2))
+    assert torch.equal(state, torch.get_rng_state())
+    assert num_threads == torch.get_num_threads()
+    for name in first:
+        np.testing.assert_array_equal(first[name], again[name])
+
+
+def test_a_sample_weight_draws_the_map_towards_its_samples(data):
+    contrary = np.arange(600) < 40
+    is_unsafe = np.where(contrary, ~data.is_unsafe, data.is_unsafe)
+    x = data.x.copy()
+    x[contrary, 2] += 2.0
+    shared = {"x": x, "has_target": data.has_target, "target": data.target, "is_unsafe": is_unsafe}
+    shared["margins"] = data.margins
+    settings = MapSettings(**{**vars(SETTINGS), "epochs": 4})
+    agreement = []
+    for weight in (0.01, 20.0):
+        sample_weight = np.where(contrary, weight, 1.0)
+        trained = train_map(MapData(**shared, sample_weight=sample_weight), settings, seed=0)
+        logit = stack_members([trained], num_margins=1).evaluate(x[contrary]).unsafe_logit[0]
+        agreement.append(((logit > 0.0) == is_unsafe[contrary]).mean())
+    assert agreement[1] > agreement[0]
+
+
+def test_one_input_alone_gives_what_it_gives_among_many(data, embedding):
+    output = embedding.evaluate(data.x)
+    for row in (0, 17, 599):
+        one = embedding.evaluate_one(data.x[row].astype(np.float32))
+        np.testing.assert_allclose(one[:, :2], output.embedding[:, row], rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(one[:, 2:], output.margins[:, row], rtol=1e-4, atol=1e-5)
+
+
+def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):
+    x = data.x[:4].copy()
+    x[1, 2], x[2, 0] = np.nan, np.inf
+    output = embedding.evaluate(x)
+    assert np.all(np.isnan(output.embedding[:, 1:3]))
+    assert np.all(np.isnan(output.unsafe_logit[:, 1:3]))
+    np.testing.assert_allclose(output.embedding[:, ::3], embedding.embed(data.x[:4])[:, ::3])
+
+
+def test_a_plain_map_has_no_safety_head_and_no_margins(data):
+    settings = MapSettings(
+        **{**vars(SETTINGS), "safety_weight": 0.0, "margin_weight": 0.0, "epochs": 1}
+    )
+    embedding = stack_members([train_map(data, settings, seed=0)], num_margins=0)
+    output = embedding.evaluate(data.x[:5])
+    assert np.all(np.isnan(output.unsafe_logit))
+    assert output.margins.shape == (1, 5, 0)
+
+
+def test_a_trained_embedding_cannot_be_written_to(embedding):
+    with pytest.raises(ValueError, match="read-only"):
+        embedding.weights["output.bias"][...] = 0.0
+
+
+def test_inputs_of_another_width_are_refused(embedding):
+    with pytest.raises(ValueError, match=r"inputs have shape \(2, 3\), expected \(N, 4\)"):
+        embedding.evaluate(np.zeros((2, 3)))
+
+
+def test_weights_that_do_not_fit_are_refused(embedding):
+    missing = {name: w for name, w in embedding.weights.items() if name != "output.bias"}
+    with pytest.raises(ValueError, match=r"output\.bias"):
+        Embedding(missing, num_margins=1)
+    with pytest.raises(ValueError, match="output layer has 3 columns, expected 5"):
+        Embedding(embedding.weights, num_margins=3)

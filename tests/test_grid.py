@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from drake_safety.learning.grid import OUTSIDE, Grid
+
+GRID = Grid(resolution=14, cell_length=10.0)
+
+
+def test_each_centre_lies_in_its_own_cell():
+    np.testing.assert_array_equal(GRID.locate(GRID.centres), np.arange(GRID.num_cells))
+
+
+def test_the_first_coordinate_counts_rows():
+    assert GRID.locate(np.array([-69.0, -69.0])) == 0
+    assert GRID.locate(np.array([-69.0, -59.0])) == 1
+    assert GRID.locate(np.array([-59.0, -69.0])) == 14
+
+
+@pytest.mark.parametrize("point", [(70.0, 0.0), (0.0, -70.1), (np.nan, 0.0), (np.inf, 0.0)])
+def test_a_point_beyond_the_edge_is_outside_and_not_in_the_last_cell(point):
+    assert GRID.locate(np.array(point)) == OUTSIDE
+    assert GRID.locate_one(*point) == OUTSIDE
+    assert GRID.bilinear_one(*point) is None
+    cells, weights = GRID.bilinear(np.array(point))
+    assert np.all(cells == OUTSIDE)
+    assert np.all(weights == 0.0)
+
+
+def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth():
+    points = np.random.default_rng(0).normal(3.0, 20.0, size=(500, 2))
+    scaled = GRID.scale(points)
+    np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-9)
+    assert 1.1 * np.abs(scaled).max() == pytest.approx(70.0)
+
+
+def test_a_grid_made_from_points_holds_them_all():
+    points = np.random.default_rng(0).normal(size=(500, 2))
+    grid = Grid.from_points(points, resolution=20)
+    assert np.all(grid.locate(points) != OUTSIDE)
+    assert grid.half_width == pytest.approx(1.1 * np.abs(points).max())
+
+
+def test_interpolation_reproduces_a_linear_function_between_the_outermost_centres():
+    values = GRID.centres @ [2.0, -3.0] + 5.0
+    points = np.random.default_rng(1).uniform(-65.0, 65.0, size=(200, 2))
+    cells, weights = GRID.bilinear(points)
+    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), points @ [2.0, -3.0] + 5.0)
+
+
+def test_at_a_centre_interpolation_gives_the_cell_itself():
+    cells, weights = GRID.bilinear(GRID.centres)
+    values = np.random.default_rng(2).uniform(size=GRID.num_cells)
+    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), values, atol=1e-12)
+
+
+def test_between_the_outermost_centres_and_the_edge_the_nearest_centres_count():
+    values = np.arange(GRID.num_cells, dtype=float)
+    cells, weights = GRID.bilinear(np.array([[-69.9, -69.9], [69.9, -65.0], [-69.0, -60.0]]))
+    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), [0.0, 13 * 14, 0.5])
+
+
+def test_one_point_alone_is_treated_as_among_many():
+    points = np.random.default_rng(3).uniform(-70.0, 69.99, size=(300, 2))
+    cells, weights = GRID.bilinear(points)
+    for i, point in enumerate(points.tolist()):
+        assert GRID.locate_one(*point) == GRID.locate(points[i])
+        one_cells, one_weights = GRID.bilinear_one(*point)
+        assert one_cells == cells[i].tolist()
+        np.testing.assert_allclose(one_weights, weights[i], atol=1e-12)
+
+
+def test_a_grid_of_one_cell_interpolates_to_that_cell():
+    grid = Grid(resolution=1, cell_length=2.0)
+    cells, weights = grid.bilinear(np.array([0.3, -0.7]))
+    assert set(cells.tolist()) == {0}
+    assert weights.sum() == pytest.approx(1.0)
+    assert set(grid.bilinear_one(0.3, -0.7)[0]) == {0}
+
+
+def test_points_that_coincide_cannot_be_scaled():
+    with pytest.raises(ValueError, match="extent is 0"):
+        GRID.scale(np.ones((5, 2)))
+
+
+def test_a_grid_needs_cells_of_a_size():
+    with pytest.raises(ValueError, match="resolution is 0"):
+        Grid(resolution=0, cell_length=1.0)
+    with pytest.raises(ValueError, match="cell_length is 0"):
+        Grid(resolution=3, cell_length=0.0)

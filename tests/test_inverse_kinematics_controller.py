@@ -1,0 +1,177 @@
+"""InverseKinematicsController: joint commands that carry a base over given feet."""
+
+import numpy as np
+import pytest
+from legged_robots import ROBOT_NAMES, robot_kinematics
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
+from drake_safety.systems.trajectory_planner import to_world
+
+PERIOD_S = 0.01
+STIFFNESS = 250.0
+
+
+def standing_feet(kinematics, stance_pose=(0.0, 0.0, 0.0)):
+    feet = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+    return to_world(np.array(stance_pose), feet)
+
+
+def base_over(kinematics, stance_pose=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
+    base = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
+    return to_world(np.array(stance_pose), base + shift)
+
+
+class Bench:
+    """A controller alone, with its inputs fixed."""
+
+    def __init__(self, name, stiffness=STIFFNESS, desired=None, **options):
+        self.kinematics = robot_kinematics(name)
+        n_j = self.kinematics.num_joints
+        self.controller = InverseKinematicsController(
+            self.kinematics, np.full(n_j, stiffness), **{"period_s": PERIOD_S} | options
+        )
+        self.simulator = Simulator(self.controller)
+        self.context = self.simulator.get_mutable_context()
+        X_WB = RigidTransform([0, 0, self.kinematics.standing_height])
+        q = self.kinematics.positions_at(X_WB, self.kinematics.posture)
+        self.fix("plant_state", np.concatenate([q, np.zeros(self.kinematics.num_velocities)]))
+        self.fix("desired_output", base_over(self.kinematics) if desired is None else desired)
+
+    def fix(self, name, value):
+        self.controller.GetInputPort(name).FixValue(self.context, np.ravel(value))
+
+    def command(self):
+        """The commanded joint positions and rates."""
+        value = self.controller.GetOutputPort("desired_joint_state").Eval(self.context)
+        return np.split(value, 2)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_its_ports_have_the_sizes_of_the_robot(name):
+    bench = Bench(name)
+    kinematics, port = bench.kinematics, bench.controller.GetInputPort
+    assert port("plant_state").size() == kinematics.num_positions + kinematics.num_velocities
+    assert port("desired_output").size() == 3
+    assert port("desired_foot_positions").size() == 3 * kinematics.num_contacts
+    output = bench.controller.GetOutputPort("desired_joint_state")
+    assert output.size() == 2 * kinematics.num_joints
+
+
+def test_no_input_feeds_through():
+    assert not Bench("laikago").controller.HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_command_of_standing_is_the_posture_and_the_static_offset(name):
+    bench = Bench(name)
+    bench.simulator.Initialize()
+    position, rate = bench.command()
+    kinematics = bench.kinematics
+    q = kinematics.positions_at(RigidTransform(base_over(kinematics)), kinematics.posture)
+    torque = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, bool))
+    np.testing.assert_allclose(position, kinematics.posture + torque / STIFFNESS, atol=1e-6)
+    np.testing.assert_array_equal(rate, np.zeros(kinematics.num_joints))
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("stance_pose", [(0.0, 0.0, 0.0), (3.0, -2.0, 2.5)])
+def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, stance_pose):
+    kinematics = robot_kinematics(name)
+    shift = (0.01, -0.01, -0.02)
+    desired = base_over(kinematics, stance_pose, shift)
+    bench = Bench(name, stiffness=1e9, desired=desired)  # So stiff that there is no offset.
+    feet = standing_feet(kinematics, stance_pose)
+    bench.controller.set_foot_positions(bench.context, feet)
+    bench.simulator.Initialize()
+    position, _ = bench.command()
+    X_WB = RigidTransform(RotationMatrix.MakeZRotation(stance_pose[2]), desired)
+    reached = kinematics.contact_positions(kinematics.positions_at(X_WB, position))
+    np.testing.assert_allclose(reached, feet, atol=1.1e-4)
+
+
+def test_a_connected_foot_input_overrides_the_parameter():
+    bench = Bench("laikago", stiffness=1e9)
+    feet = standing_feet(bench.kinematics) + np.array([0.0, 0.0, 0.04])
+    bench.fix("desired_foot_positions", feet)
+    bench.simulator.Initialize()
+    position, _ = bench.command()
+    X_WB = RigidTransform(base_over(bench.kinematics))
+    reached = bench.kinematics.contact_positions(bench.kinematics.positions_at(X_WB, position))
+    np.testing.assert_allclose(reached, feet, atol=1.1e-4)
+
+
+def test_a_lifted_foot_gets_no_share_of_the_weight():
+    on_ground, lifted = Bench("hexapod"), Bench("hexapod")
+    feet = standing_feet(lifted.kinematics)
+    feet[0, 2] += 0.02
+    lifted.fix("desired_foot_positions", feet)
+    stiff = Bench("hexapod", stiffness=1e9)
+    stiff.fix("desired_foot_positions", feet)
+    for bench in (on_ground, lifted, stiff):
+        bench.simulator.Initialize()
+    leg = [lifted.kinematics.joint_names.index(f"{name}_0") for name in ("lift", "knee")]
+    lifted_torque = STIFFNESS * (lifted.command()[0] - stiff.command()[0])[leg]
+    standing_torque = STIFFNESS * (on_ground.command()[0] - on_ground.kinematics.posture)[leg]
+    assert np.linalg.norm(lifted_torque) < 0.5 * np.linalg.norm(standing_torque)
+
+
+def test_commands_change_only_at_the_ticks():
+    bench = Bench("laikago", offset_s=0.002)
+    bench.simulator.Initialize()
+    first, _ = bench.command()
+    bench.fix("desired_output", base_over(bench.kinematics, shift=(0.0, 0.0, -0.001)))
+    bench.simulator.AdvanceTo(0.0019)
+    np.testing.assert_array_equal(bench.command()[0], first)
+    bench.simulator.AdvanceTo(0.003)
+    second, _ = bench.command()
+    assert not np.allclose(second, first, atol=1e-5)
+    bench.fix("desired_output", base_over(bench.kinematics, shift=(0.0, 0.0, -0.003)))
+    bench.simulator.AdvanceTo(0.0119)
+    np.testing.assert_array_equal(bench.command()[0], second)
+    bench.simulator.AdvanceTo(0.0121)
+    assert not np.allclose(bench.command()[0], second, atol=1e-5)
+
+
+def test_the_commanded_rate_is_the_set_points_change_over_a_period():
+    bench = Bench("laikago", stiffness=1e9)
+    bench.simulator.Initialize()
+    before, _ = bench.command()
+    bench.fix("desired_output", base_over(bench.kinematics, shift=(0.0, 0.0, -0.002)))
+    bench.simulator.AdvanceTo(0.001)
+    after, rate = bench.command()
+    np.testing.assert_allclose(rate, (after - before) / PERIOD_S, atol=1e-4)
+    assert np.abs(rate).max() > 0.1
+
+
+def test_a_set_point_at_rest_commands_rest():
+    bench = Bench("laikago")
+    bench.simulator.AdvanceTo(0.1)
+    np.testing.assert_allclose(bench.command()[1], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.5])
+def test_commands_stay_within_the_joints_limits(name, height):
+    kinematics = robot_kinematics(name)
+    desired = base_over(kinematics, shift=(0.3, 0.3, height))
+    bench = Bench(name, stiffness=20.0, desired=desired)
+    bench.simulator.AdvanceTo(0.05)
+    position, rate = bench.command()
+    lowest, highest = kinematics.position_limits.T
+    assert np.all((position >= lowest) & (position <= highest))
+    assert np.all(np.abs(rate) <= kinematics.velocity_limits)
+
+
+@pytest.mark.parametrize("stiffness", [np.zeros(12), np.ones(3), -np.ones(12)])
+def test_a_stiffness_that_is_not_positive_for_every_joint_is_refused(stiffness):
+    kinematics = robot_kinematics("laikago")
+    with pytest.raises(ValueError, match="stiffness must be 12 positive numbers, in the order of"):
+        InverseKinematicsController(kinematics, stiffness, period_s=PERIOD_S)
+
+
+def test_an_input_that_is_not_finite_is_an_error_not_a_crash():
+    bench = Bench("laikago", desired=np.array([np.nan, 0.0, 0.4]))
+    with pytest.raises((ValueError, RuntimeError)):
+        bench.simulator.Initialize()

@@ -1,0 +1,205 @@
+"""Kinematics: Jacobians are derivatives, ground forces carry the weight, the stance is planar."""
+
+import numpy as np
+import pytest
+import yaml
+from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model, write_hexapod
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
+from drake_safety.control.robot import PlantVariation, RobotModel, add_robot, load_robot_file
+
+G = 9.81
+
+
+@pytest.fixture(params=ROBOT_NAMES)
+def kinematics(request):
+    return robot_kinematics(request.param)
+
+
+def random_positions(kinematics, rng):
+    X_WB = RigidTransform(RollPitchYaw(rng.uniform(-0.5, 0.5, 3)), rng.normal(size=3))
+    joints = kinematics.posture + rng.uniform(-0.2, 0.2, kinematics.num_joints)
+    return kinematics.positions_at(X_WB, joints)
+
+
+def standing(kinematics):
+    X_WB = RigidTransform([0.0, 0.0, kinematics.standing_height])
+    return kinematics.positions_at(X_WB, kinematics.posture)
+
+
+def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinematics):
+    rng = np.random.default_rng(1)
+    q = random_positions(kinematics, rng)
+    J = kinematics.contact_jacobian(q)
+    for _ in range(4):
+        v = rng.normal(size=kinematics.num_velocities)
+        kinematics.contact_positions(q)  # Sets the Context whose map turns v into q̇.
+        qdot = kinematics.plant.MapVelocityToQDot(kinematics.context, v)
+        step = 1e-6
+        difference = kinematics.contact_positions(q + step * qdot)
+        difference -= kinematics.contact_positions(q - step * qdot)
+        np.testing.assert_allclose(J @ v, difference.ravel() / (2 * step), atol=1e-7)
+
+
+def test_standing_puts_the_lowest_sphere_on_the_ground(kinematics):
+    p_WC = kinematics.contact_positions(standing(kinematics))
+    assert np.min(p_WC[:, 2] - kinematics.foot_radii) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(p_WC[:, 2], kinematics.foot_radii, atol=1e-9)
+
+
+def test_contact_points_move_with_the_base(kinematics):
+    joints = kinematics.posture
+    X = RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), [1.0, -2.0, 0.5])
+    at_origin = kinematics.contact_positions(kinematics.positions_at(RigidTransform(), joints))
+    moved = kinematics.contact_positions(kinematics.positions_at(X, joints))
+    np.testing.assert_allclose(moved, (X @ at_origin.T).T, atol=1e-12)
+
+
+def test_no_answer_depends_on_an_earlier_call(kinematics):
+    rng = np.random.default_rng(3)
+    q, other = random_positions(kinematics, rng), random_positions(kinematics, rng)
+    first = kinematics.contact_positions(q)
+    kinematics.contact_jacobian(other)
+    np.testing.assert_array_equal(kinematics.contact_positions(q), first)
+
+
+def test_the_gravity_torques_and_ground_forces_carry_the_weight(kinematics):
+    """Inverse dynamics: zero acceleration needs exactly these torques and a total force m g."""
+    q = standing(kinematics)
+    is_stance = np.ones(kinematics.num_contacts, bool)
+    torques = kinematics.gravity_torques(q, is_stance)
+    J = kinematics.contact_jacobian(q)
+    plant, context = kinematics.plant, kinematics.context
+    plant.SetPositions(context, q)
+    residual = -plant.CalcGravityGeneralizedForces(context)
+    residual[6:] -= torques
+    forces, *_ = np.linalg.lstsq(J.T, residual, rcond=None)
+    np.testing.assert_allclose(J.T @ forces, residual, atol=2e-2 * kinematics.total_mass)
+    total = forces.reshape(-1, 3).sum(axis=0)
+    np.testing.assert_allclose(total, [0, 0, kinematics.total_mass * G], atol=0.3)
+
+
+def test_gravity_torques_do_not_depend_on_place_or_heading(kinematics):
+    is_stance = np.ones(kinematics.num_contacts, bool)
+    here = kinematics.gravity_torques(standing(kinematics), is_stance)
+    X_WB = RigidTransform(RotationMatrix.MakeZRotation(1.0), [3, -1, kinematics.standing_height])
+    q = kinematics.positions_at(X_WB, kinematics.posture)
+    # The small regularisation sees the world's origin: some hundredths of a newton metre.
+    np.testing.assert_allclose(kinematics.gravity_torques(q, is_stance), here, atol=0.05)
+
+
+def test_in_the_air_the_torques_hold_the_legs_only(kinematics):
+    q = standing(kinematics)
+    torques = kinematics.gravity_torques(q, np.zeros(kinematics.num_contacts, bool))
+    kinematics.plant.SetPositions(kinematics.context, q)
+    gravity = kinematics.plant.CalcGravityGeneralizedForces(kinematics.context)
+    np.testing.assert_array_equal(torques, -gravity[6:])
+
+
+def test_a_lifted_foot_pushes_nothing():
+    kinematics = robot_kinematics("hexapod")
+    q = standing(kinematics)
+    is_stance = np.ones(6, bool)
+    is_stance[2] = False
+    torques = kinematics.gravity_torques(q, is_stance)
+    kinematics.plant.SetPositions(kinematics.context, q)
+    gravity = kinematics.plant.CalcGravityGeneralizedForces(kinematics.context)
+    leg = [kinematics.joint_names.index(f"{name}_2") for name in ("swing", "lift", "knee")]
+    np.testing.assert_allclose(torques[leg], -gravity[6:][leg], atol=1e-12)
+
+
+def test_a_lighter_robot_needs_less_torque_in_proportion():
+    robot = robot_model("biped")
+    full, light = RobotKinematics(robot), RobotKinematics(robot, PlantVariation(mass_scale=0.8))
+    assert light.total_mass == pytest.approx(0.8 * full.total_mass)
+    q, is_stance = standing(full), np.ones(full.num_contacts, bool)
+    np.testing.assert_allclose(
+        light.gravity_torques(q, is_stance), 0.8 * full.gravity_torques(q, is_stance), atol=1e-9
+    )
+
+
+def test_the_centre_of_mass_is_the_mean_of_the_bodies(kinematics):
+    q = random_positions(kinematics, np.random.default_rng(4))
+    com = kinematics.center_of_mass(q)
+    plant, context = kinematics.plant, kinematics.context
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(kinematics.base.model_instance())]
+    moment = sum(
+        body.get_mass(context)
+        * (plant.EvalBodyPoseInWorld(context, body) @ body.CalcCenterOfMassInBodyFrame(context))
+        for body in bodies
+    )
+    np.testing.assert_allclose(com, moment / kinematics.total_mass, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("entry", [0, 4, 9])
+def test_positions_that_are_not_finite_are_refused_not_fatal(value, entry):
+    kinematics = robot_kinematics("laikago")
+    q = standing(kinematics)
+    q[entry] = value
+    for call in (kinematics.contact_positions, kinematics.contact_jacobian):
+        with pytest.raises(ValueError, match="robot 'laikago': positions must be finite"):
+            call(q)
+
+
+def test_the_stance_of_moved_nominal_contacts_is_the_motion(kinematics):
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        pose = np.array([*rng.normal(size=2), rng.uniform(-np.pi, np.pi)])
+        nominal = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+        moved = (planar_pose(pose) @ nominal.T).T
+        np.testing.assert_allclose(fit_stance(moved, kinematics.nominal_contacts), pose, atol=1e-9)
+
+
+def test_the_stance_moves_with_the_feet_however_they_stand():
+    rng = np.random.default_rng(6)
+    nominal = robot_kinematics("laikago").nominal_contacts
+    p = np.column_stack([nominal + 0.05 * rng.normal(size=nominal.shape), np.zeros(len(nominal))])
+    x, y, yaw = fit_stance(p, nominal)
+    motion = RigidTransform(RotationMatrix.MakeZRotation(0.7), [2.0, 1.0, 0.0])
+    expected = motion.multiply(np.array([x, y, 0.0]))
+    moved = fit_stance((motion @ p.T).T, nominal)
+    np.testing.assert_allclose(moved, [expected[0], expected[1], yaw + 0.7], atol=1e-12)
+
+
+def test_the_stance_is_the_least_squares_fit():
+    rng = np.random.default_rng(7)
+    nominal = robot_kinematics("hexapod").nominal_contacts
+    p = np.column_stack([nominal + 0.05 * rng.normal(size=nominal.shape), np.zeros(len(nominal))])
+
+    def cost(pose):
+        fitted = (planar_pose(pose) @ np.column_stack([nominal, np.zeros(len(nominal))]).T).T
+        return np.sum((fitted - p) ** 2)
+
+    best = fit_stance(p, nominal)
+    for _ in range(100):
+        assert cost(best) <= cost(best + 0.01 * rng.normal(size=3)) + 1e-15
+
+
+def test_yaw_is_the_angle_about_the_vertical():
+    assert yaw_of(RotationMatrix.MakeZRotation(2.5)) == pytest.approx(2.5)
+    assert yaw_of(RollPitchYaw(0.1, -0.2, -1.0).ToRotationMatrix()) == pytest.approx(-1.0)
+
+
+def test_a_base_that_does_not_float_is_refused(tmp_path):
+    path = write_hexapod(tmp_path)
+    text = yaml.safe_load(path.read_text())
+    text["base"] = "tibia_0"
+    path.write_text(yaml.safe_dump(text))
+    with pytest.raises(ValueError, match="base 'tibia_0' must be the floating body"):
+        RobotKinematics(load_robot_file(path))
+
+
+def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
+    robot: RobotModel = robot_model("biped")
+    kinematics = robot_kinematics("biped")
+    plant = MultibodyPlant(0.001)
+    add_robot(plant, robot_model("hexapod"))
+    instance = add_robot(plant, robot)
+    plant.Finalize()
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    joints = [joint for joint in joints if joint.num_velocities() == 1]
+    joints.sort(key=lambda joint: joint.velocity_start())
+    assert [joint.name() for joint in joints] == kinematics.joint_names

@@ -1,0 +1,148 @@
+"""The assessor's state is the same wherever the robot stands, and noise is what it claims."""
+
+import math
+
+import numpy as np
+import pytest
+from legged_robots import ROBOT_NAMES, robot_kinematics
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_safety.control.observation import (
+    add_noise,
+    quaternion_of,
+    rotation_vector,
+    stance_state,
+    state_names,
+)
+from drake_safety.control.robot import ObservationNoise
+
+
+def a_state(kinematics, seed=0):
+    rng = np.random.default_rng(seed)
+    X_WB = RigidTransform(RollPitchYaw(rng.uniform(-0.3, 0.3, 3)), rng.normal(size=3))
+    q = kinematics.positions_at(X_WB, kinematics.posture + 0.1 * rng.normal(size=kinematics.num_joints))
+    return X_WB, q, rng.normal(size=kinematics.num_velocities)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_state_is_the_same_wherever_the_robot_stands_and_faces(name):
+    kinematics = robot_kinematics(name)
+    X_WB, q, v = a_state(kinematics)
+    here = stance_state(kinematics, q, v)
+    for yaw in (0.5, 3.0, -2.0):
+        R = RotationMatrix.MakeZRotation(yaw)
+        moved = RigidTransform(R, [4.0, -7.0, 0.0]) @ X_WB
+        v_moved = np.concatenate([R.matrix() @ v[:3], R.matrix() @ v[3:6], v[6:]])
+        q_moved = kinematics.positions_at(moved, q[7:])
+        np.testing.assert_allclose(stance_state(kinematics, q_moved, v_moved), here, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_state_of_standing_is_the_posture_over_the_feet(name):
+    kinematics = robot_kinematics(name)
+    X_WB = RigidTransform(RotationMatrix.MakeZRotation(1.0), [5, 6, kinematics.standing_height])
+    q = kinematics.positions_at(X_WB, kinematics.posture)
+    state = stance_state(kinematics, q, np.zeros(kinematics.num_velocities))
+    expected = np.zeros(12 + 2 * kinematics.num_joints)
+    expected[:2] = kinematics.nominal_base_offset
+    expected[2] = kinematics.standing_height
+    expected[12 : 12 + kinematics.num_joints] = kinematics.posture
+    np.testing.assert_allclose(state, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_every_entry_has_a_name_of_its_own(name):
+    kinematics = robot_kinematics(name)
+    _, q, v = a_state(kinematics)
+    names = state_names(kinematics)
+    assert len(names) == len(set(names)) == len(stance_state(kinematics, q, v))
+    joint = kinematics.joint_names[3]
+    state = stance_state(kinematics, q, v)
+    assert state[names.index(joint)] == q[7 + 3]
+    assert state[names.index(f"{joint}_rate")] == v[6 + 3]
+
+
+def test_the_height_is_the_height_over_the_ground_not_over_the_feet():
+    kinematics = robot_kinematics("laikago")
+    _, q, v = a_state(kinematics)
+    assert stance_state(kinematics, q, v)[2] == q[6]
+
+
+def test_both_quaternions_of_a_rotation_give_one_state():
+    kinematics = robot_kinematics("hexapod")
+    for seed in range(5):
+        _, q, v = a_state(kinematics, seed)
+        other = q.copy()
+        other[:4] *= -1
+        np.testing.assert_allclose(
+            stance_state(kinematics, q, v), stance_state(kinematics, other, v), atol=1e-12
+        )
+
+
+def test_a_quaternion_that_has_drifted_from_unit_length_is_normalised():
+    kinematics = robot_kinematics("hexapod")
+    _, q, _ = a_state(kinematics)
+    q[:4] *= 1.01
+    assert np.linalg.norm(quaternion_of(q).wxyz()) == pytest.approx(1)
+
+
+def test_the_rotation_vector_is_axis_times_angle_and_at_most_half_a_turn():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        angle = rng.uniform(0, 2 * math.pi)
+        R = RotationMatrix(quaternion_of(np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])))
+        r = rotation_vector(R)
+        assert np.linalg.norm(r) <= math.pi + 1e-12
+        expected = angle * axis if angle <= math.pi else -(2 * math.pi - angle) * axis
+        np.testing.assert_allclose(r, expected, atol=1e-7)
+
+
+def test_the_rotation_vector_is_continuous_through_no_rotation():
+    small = [rotation_vector(RotationMatrix.MakeXRotation(a))[0] for a in (-1e-4, 0.0, 1e-4)]
+    np.testing.assert_allclose(small, [-1e-4, 0.0, 1e-4], atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_state_that_is_not_finite_is_not_a_number_throughout(value):
+    kinematics = robot_kinematics("laikago")
+    for entry in (0, 5, 12):
+        _, q, v = a_state(kinematics)
+        q[entry] = value
+        assert np.isnan(stance_state(kinematics, q, v)).all()
+    _, q, v = a_state(kinematics)
+    v[2] = value
+    state = stance_state(kinematics, q, v)
+    assert np.isnan(state).all()
+    assert len(state) == len(state_names(kinematics))
+
+
+def test_no_noise_changes_nothing():
+    kinematics = robot_kinematics("biped")
+    _, q, v = a_state(kinematics)
+    draws = np.random.default_rng(1).normal(size=2 * len(v))
+    q_noisy, v_noisy = add_noise(q, v, draws, ObservationNoise())
+    np.testing.assert_allclose(q_noisy, q, atol=1e-15)
+    np.testing.assert_array_equal(v_noisy, v)
+
+
+def test_noise_has_the_standard_deviations_it_was_given():
+    kinematics = robot_kinematics("laikago")
+    _, q, v = a_state(kinematics)
+    noise = ObservationNoise(position=0.004, velocity=0.016)
+    rng = np.random.default_rng(2)
+    R = RotationMatrix(quaternion_of(q))
+    rotations, positions, velocities = [], [], []
+    for _ in range(2000):
+        q_noisy, v_noisy = add_noise(q, v, rng.normal(size=2 * len(v)), noise)
+        assert np.linalg.norm(q_noisy[:4]) == pytest.approx(1)
+        rotations.append(rotation_vector(RotationMatrix(quaternion_of(q_noisy)) @ R.inverse()))
+        positions.append(q_noisy[4:] - q[4:])
+        velocities.append(v_noisy - v)
+    # The standard deviation of 2000 draws errs by 1.6 %.
+    for samples, std in ((rotations, 0.004), (positions, 0.004), (velocities, 0.016)):
+        np.testing.assert_allclose(np.std(samples, axis=0), std, rtol=0.08)
+        assert abs(np.mean(samples)) < 0.1 * std
+    correlation = np.corrcoef(np.hstack([rotations, positions, velocities]).T)
+    assert np.max(np.abs(correlation - np.eye(len(correlation)))) < 0.12

@@ -1,0 +1,156 @@
+"""Footholds and swing curves: Raibert's neutral point, within reach, on the foot's own side."""
+
+import math
+
+import numpy as np
+import pytest
+from legged_robots import ROBOT_NAMES, robot_kinematics
+
+from drake_safety.control.recovery_step import (
+    RecoveryStepParameters,
+    capture_point,
+    first_group,
+    foothold,
+    gait_groups,
+    swing_position,
+)
+
+PARAMETERS = RecoveryStepParameters()
+FRONT_LEFT = np.array([0.2, 0.13])
+
+
+def feet_of(name):
+    kinematics = robot_kinematics(name)
+    return np.array([kinematics.nominal_contacts[s].mean(axis=0) for s in kinematics.foot_slices])
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_every_foot_swings_in_exactly_one_of_two_groups(name):
+    feet = feet_of(name)
+    groups = gait_groups(feet)
+    assert len(groups) == 2
+    assert sorted(groups[0] + groups[1]) == list(range(len(feet)))
+
+
+@pytest.mark.parametrize("name", ["laikago", "hexapod"])
+def test_neighbours_around_the_body_never_swing_together(name):
+    feet = feet_of(name)
+    around = np.argsort(np.arctan2(feet[:, 1], feet[:, 0]))
+    first, _ = gait_groups(feet)
+    is_first = [foot in first for foot in around]
+    assert all(a != b for a, b in zip(is_first, is_first[1:] + is_first[:1], strict=True))
+
+
+def test_four_feet_swing_in_diagonal_pairs():
+    feet = np.array([[1, -1], [1, 1], [-1, -1], [-1, 1]], float)
+    assert sorted(gait_groups(feet)) == [[0, 3], [1, 2]]
+
+
+def test_a_still_pendulum_is_captured_where_it_is_and_a_moving_one_ahead():
+    p = np.array([0.1, 0.2, 9.81])
+    np.testing.assert_allclose(capture_point(p, np.zeros(3)), [0.1, 0.2])
+    np.testing.assert_allclose(capture_point(p, np.array([2.0, -1.0, 5.0])), [2.1, -0.8])
+
+
+def test_a_pendulum_on_the_ground_has_a_finite_capture_point():
+    assert np.isfinite(capture_point(np.array([0, 0, -1.0]), np.ones(3))).all()
+
+
+def test_the_pair_away_from_the_capture_point_swings_first():
+    feet = np.array([[1, -1], [1, 1], [-1, -1], [-1, 1]], float)
+    groups = [[0, 3], [1, 2]]
+    # On the line between feet 1 and 2: they carry, feet 0 and 3 swing.
+    assert first_group(groups, feet, np.array([0.5, 0.5])) == 0
+    assert first_group(groups, feet, np.array([0.5, -0.5])) == 1
+
+
+def test_a_robot_at_rest_puts_its_feet_where_they_are_when_standing():
+    p = np.array([1.0, 2.0, 0.4])
+    place = foothold(p, np.zeros(3), 0.0, FRONT_LEFT, 0.1, PARAMETERS)
+    np.testing.assert_allclose(place, p[:2] + FRONT_LEFT)
+
+
+def test_a_slow_robot_steps_to_raiberts_neutral_point():
+    v, remaining_s = np.array([0.4, 0.1, 0.0]), 0.05
+    place = foothold(np.zeros(3), v, 0.0, FRONT_LEFT, remaining_s, PARAMETERS)
+    time = remaining_s + 0.5 * PARAMETERS.step_duration_s + PARAMETERS.velocity_gain_s
+    np.testing.assert_allclose(place, FRONT_LEFT + time * v[:2])
+
+
+def rotated(yaw, vector):
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s], [s, c]]) @ vector
+
+
+@pytest.mark.parametrize("yaw", [0.5, 3.0, -1.5])
+def test_footholds_turn_with_the_robot(yaw):
+    v = np.array([1.0, -2.0, 0.0])
+    place = foothold(np.zeros(3), v, 0.0, FRONT_LEFT, 0.1, PARAMETERS)
+    v_turned = np.append(rotated(yaw, v[:2]), 0.0)
+    turned = foothold(np.zeros(3), v_turned, yaw, FRONT_LEFT, 0.1, PARAMETERS)
+    np.testing.assert_allclose(turned, rotated(yaw, place), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_foothold_stays_in_reach_and_on_its_own_side(seed):
+    rng = np.random.default_rng(seed)
+    p, yaw, remaining_s = rng.normal(size=3), rng.uniform(-3, 3), rng.uniform(0, 0.12)
+    v = 5.0 * rng.normal(size=3)
+    for hip in (FRONT_LEFT, FRONT_LEFT * [1, -1]):
+        place = foothold(p, v, yaw, hip, remaining_s, PARAMETERS)
+        at_touchdown = p[:2] + remaining_s * v[:2]
+        local = rotated(-yaw, place - at_touchdown)
+        assert np.linalg.norm(local - hip) <= PARAMETERS.max_reach_m + 1e-12
+        assert local[1] * np.sign(hip[1]) >= PARAMETERS.min_lateral_m - 1e-12
+
+
+def test_a_robot_narrower_than_the_least_distance_keeps_its_own_width():
+    narrow = np.array([0.1, 0.05])
+    place = foothold(np.zeros(3), np.array([0.0, -3.0, 0.0]), 0.0, narrow, 0.0, PARAMETERS)
+    assert place[1] == pytest.approx(0.05)
+
+
+def test_planning_a_foothold_leaves_its_arguments_alone():
+    hip, v = FRONT_LEFT.copy(), np.array([0.0, -9.0, 0.0])
+    foothold(np.zeros(3), v, 0.3, hip, 0.1, PARAMETERS)
+    np.testing.assert_array_equal(hip, FRONT_LEFT)
+
+
+START, TARGET = np.array([0.0, 0.0, 0.02]), np.array([0.3, -0.1, 0.02])
+
+
+def test_a_swing_leaves_its_start_passes_over_the_middle_and_ends_on_target():
+    np.testing.assert_allclose(swing_position(START, TARGET, 0.0, 0.06), START)
+    np.testing.assert_allclose(swing_position(START, TARGET, 1.0, 0.06), TARGET, atol=1e-12)
+    np.testing.assert_allclose(
+        swing_position(START, TARGET, 0.5, 0.06), 0.5 * (START + TARGET) + [0, 0, 0.06]
+    )
+
+
+def test_a_swing_starts_and_ends_at_rest_and_never_below_the_ground():
+    step = 1e-5
+    for phase in (0.0, 1.0 - step):
+        change = swing_position(START, TARGET, phase + step, 0.06)
+        change -= swing_position(START, TARGET, phase, 0.06)
+        assert np.linalg.norm(change) / step < 1e-3
+    heights = [swing_position(START, TARGET, s, 0.06)[2] for s in np.linspace(0, 1, 50)]
+    assert min(heights) >= 0.02 - 1e-12
+
+
+def test_a_phase_outside_the_swing_holds_the_ends():
+    np.testing.assert_allclose(swing_position(START, TARGET, -0.5, 0.06), START)
+    np.testing.assert_allclose(swing_position(START, TARGET, 1.5, 0.06), TARGET, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "change", [{"step_duration_s": 0.0}, {"lift_m": -1.0}, {"max_reach_m": float("nan")}]
+)
+def test_a_parameter_that_must_be_positive_is_named(change):
+    (name,) = change
+    with pytest.raises(ValueError, match=f"recovery step: {name} must be positive"):
+        RecoveryStepParameters(**change)
+
+
+def test_contradictory_numbers_of_steps_are_refused():
+    with pytest.raises(ValueError, match="min_steps <= max_steps is required; got 5, 3"):
+        RecoveryStepParameters(min_steps=5, max_steps=3)

@@ -1,0 +1,308 @@
+"""Safe sets: signed margins agree with brute force, with hand-worked cases and with geometry."""
+
+import math
+
+import numpy as np
+import pytest
+from legged_robots import ROBOT_NAMES, robot_kinematics
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_safety.control.safe_sets import (
+    BalanceLimits,
+    BalanceSafeSet,
+    convex_hull,
+    signed_distance_to_polygon,
+)
+
+SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+NAMES = list(BalanceSafeSet.names)
+
+
+def in_triangle(p, a, b, c):
+    def side(u, w):
+        return (w[0] - u[0]) * (p[1] - u[1]) - (w[1] - u[1]) * (p[0] - u[0])
+
+    signs = [side(a, b), side(b, c), side(c, a)]
+    return all(s >= 0 for s in signs) or all(s <= 0 for s in signs)
+
+
+def brute_force_distance(point, points, samples=2001):
+    """Signed distance to a hull without any hull.
+
+    A point is inside when some triangle of the points holds it; the hull's edges are the pairs
+    that have all other points on one side.
+    """
+    n = len(points)
+    inside = any(
+        in_triangle(point, points[i], points[j], points[k])
+        for i in range(n)
+        for j in range(i)
+        for k in range(j)
+    )
+    s = np.linspace(0, 1, samples)[:, None]
+    nearest = math.inf
+    for i in range(n):
+        for j in range(n):
+            a, b = points[i], points[j]
+            cross = (b - a)[0] * (points - a)[:, 1] - (b - a)[1] * (points - a)[:, 0]
+            if i != j and np.all(cross >= -1e-12):
+                edge = a + s * (b - a)
+                nearest = min(nearest, np.linalg.norm(edge - point, axis=1).min())
+    return nearest if inside else -nearest
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_distance_to_the_hull_agrees_with_brute_force(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(rng.integers(3, 9), 2))
+    corners = convex_hull(points)
+    for point in rng.normal(size=(10, 2)):
+        expected = brute_force_distance(point, points)
+        assert signed_distance_to_polygon(point, corners) == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_hull_turns_left_at_every_corner_and_holds_every_point():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        points = rng.normal(size=(12, 2))
+        corners = np.array(convex_hull(points))
+        edges = np.roll(corners, -1, axis=0) - corners
+        following = np.roll(edges, -1, axis=0)
+        assert np.all(edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0)
+        assert all(signed_distance_to_polygon(p, list(map(tuple, corners))) > -1e-12 for p in points)
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [((0.5, 0.5), 0.5), ((0.5, 0.9), 0.1), ((0.5, 1.2), -0.2), ((2.0, 2.0), -math.sqrt(2))]
+    + [((0.0, 0.5), 0.0), ((1.0, 1.0), 0.0)],
+)
+def test_distances_to_the_unit_square(point, distance):
+    assert signed_distance_to_polygon(np.array(point), SQUARE) == pytest.approx(distance)
+
+
+def test_points_on_a_line_make_a_segment_that_holds_nothing():
+    corners = convex_hull(np.array([[0.0, 0], [2, 0], [1, 0], [0.5, 0]]))
+    assert sorted(corners) == [(0, 0), (2, 0)]
+    assert signed_distance_to_polygon(np.array([1.0, 0.3]), corners) == pytest.approx(-0.3)
+    assert signed_distance_to_polygon(np.array([1.0, 0.0]), corners) == 0
+    assert signed_distance_to_polygon(np.array([3.0, 0.0]), corners) == pytest.approx(-1)
+
+
+def test_one_point_is_a_hull_of_its_own_and_no_point_is_infinitely_far():
+    for points in ([[1.0, 1.0]], [[1.0, 1.0]] * 4):
+        corners = convex_hull(np.array(points))
+        assert signed_distance_to_polygon(np.array([1.0, 3.0]), corners) == pytest.approx(-2)
+    assert signed_distance_to_polygon(np.zeros(2), []) == -math.inf
+
+
+def test_repeated_points_change_no_hull():
+    doubled = convex_hull(np.array(SQUARE + SQUARE + [(0.5, 0.0)]))
+    assert doubled == convex_hull(np.array(SQUARE))
+
+
+def safe_set_of(name, **limits):
+    kinematics = robot_kinematics(name)
+    height = kinematics.standing_height
+    limits = {"height_m": [0.7 * height, 1.3 * height], "fall_height_m": 0.4 * height} | limits
+    return kinematics, BalanceSafeSet(kinematics, BalanceLimits(**limits))
+
+
+def state(kinematics, shift=(0, 0, 0), rotation=(0, 0, 0), joints=None):
+    p = np.array([0.0, 0.0, kinematics.standing_height]) + shift
+    joints = kinematics.posture if joints is None else joints
+    q = kinematics.positions_at(RigidTransform(RollPitchYaw(rotation), p), joints)
+    return q, np.zeros(kinematics.num_velocities)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_standing_is_safe_and_each_margin_is_what_geometry_says(name):
+    kinematics, safe_set = safe_set_of(name)
+    q, v = state(kinematics)
+    support, height, fall = safe_set.margins(q, v)
+    feet = kinematics.contact_positions(q)[:, :2]
+    assert support == pytest.approx(brute_force_distance(q[4:6], feet), abs=1e-3)
+    standing = kinematics.standing_height
+    assert height == pytest.approx(0.3 * standing)
+    tilt_reserve = standing * (1 - math.cos(safe_set.limits.fall_tilt_rad))
+    assert fall == pytest.approx(min(0.6 * standing, tilt_reserve))
+    assert min(support, height, fall) > 0
+
+
+def test_the_half_width_of_the_stance_is_the_margin_of_the_middle():
+    kinematics, safe_set = safe_set_of("laikago")
+    q, v = state(kinematics)
+    centre = kinematics.contact_positions(q)[:, :2].mean(axis=0)
+    # FACTS: hips at 0.0875 + 0.037 m from the middle.
+    shift = (*(centre - q[4:6]), 0.0)
+    q[4:7] += shift
+    q_feet = kinematics.contact_positions(q)[:, :2]
+    margin = safe_set.margins(q, v)[NAMES.index("support_polygon")]
+    assert margin == pytest.approx(brute_force_distance(q[4:6], q_feet), abs=1e-3)
+    assert abs(q_feet[:, 1] - q_feet[:, 1].mean()) == pytest.approx(0.1245, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_margins_do_not_depend_on_where_the_robot_stands(name):
+    kinematics, safe_set = safe_set_of(name)
+    q, v = state(kinematics, rotation=(0.1, -0.1, 0.0))
+    X_WB = RigidTransform(RollPitchYaw(0.1, -0.1, 0.0), q[4:7])
+    moved = RigidTransform(RotationMatrix.MakeZRotation(2.0), [3.0, -4.0, 0.0]) @ X_WB
+    q_moved = kinematics.positions_at(moved, kinematics.posture)
+    np.testing.assert_allclose(safe_set.margins(q_moved, v), safe_set.margins(q, v), atol=1e-9)
+
+
+@pytest.mark.parametrize(("shift", "sign"), [(-0.31, -1), (-0.29, 1), (0.29, 1), (0.31, -1)])
+def test_the_height_margin_changes_sign_at_the_bands_ends(shift, sign):
+    kinematics, safe_set = safe_set_of("hexapod")
+    q, v = state(kinematics, (0, 0, shift * kinematics.standing_height))
+    margin = safe_set.margins(q, v)[NAMES.index("height")]
+    assert sign * margin == pytest.approx(0.01 * kinematics.standing_height)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0.6, 0.8, 0)])
+def test_the_fall_margin_vanishes_at_the_falling_tilt_about_any_axis(axis):
+    kinematics, safe_set = safe_set_of("laikago")
+    for tilt, sign in ((0.79, 1), (0.81, -1)):
+        q, v = state(kinematics)
+        q[:4] = [math.cos(tilt / 2), *(math.sin(tilt / 2) * np.array(axis))]
+        fall = safe_set.margins(q, v)[NAMES.index("fall")]
+        assert np.sign(fall) == sign
+        assert abs(fall) < 0.01
+
+
+def test_a_yaw_is_no_tilt():
+    kinematics, safe_set = safe_set_of("laikago")
+    upright, v = state(kinematics)
+    turned, _ = state(kinematics, rotation=(0, 0, 3.0))
+    fall = NAMES.index("fall")
+    assert safe_set.margins(turned, v)[fall] == pytest.approx(safe_set.margins(upright, v)[fall])
+
+
+def test_both_quaternions_of_a_rotation_have_the_same_margins_and_features():
+    kinematics, safe_set = safe_set_of("biped")
+    q, v = state(kinematics, rotation=(0.2, -0.3, 1.0))
+    other = q.copy()
+    other[:4] *= -1
+    preview = np.ones((4, 3))
+    np.testing.assert_allclose(safe_set.margins(q, v), safe_set.margins(other, v), atol=1e-12)
+    np.testing.assert_allclose(
+        safe_set.features(q, v, preview), safe_set.features(other, v, preview), atol=1e-12
+    )
+
+
+def test_a_foot_in_the_air_leaves_the_support_polygon():
+    kinematics, safe_set = safe_set_of("laikago")
+    q, v = state(kinematics)
+    lifted = kinematics.posture.copy()
+    lifted[:3] += [0.0, 0.3, -0.6]
+    q_lifted, _ = state(kinematics, joints=lifted)
+    p_WC = kinematics.contact_positions(q_lifted)
+    on_ground = p_WC[:, 2] - kinematics.foot_radii < 0.03
+    assert on_ground.sum() == 3
+    support = safe_set.margins(q_lifted, v)[0]
+    expected = brute_force_distance(q[4:6], p_WC[on_ground, :2])
+    assert support == pytest.approx(expected, abs=1e-3)
+    assert support < safe_set.margins(q, v)[0]
+
+
+def test_without_any_foot_on_the_ground_nothing_supports_the_base():
+    kinematics, safe_set = safe_set_of("hexapod")
+    q, v = state(kinematics, (0, 0, 1.0))
+    margins = safe_set.margins(q, v)
+    assert margins[0] < 0
+    assert np.isfinite(margins).all()
+
+
+def feature(safe_set, values, name):
+    return values[safe_set.feature_names.index(name)]
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_features_have_names_are_finite_and_do_not_depend_on_the_place(name):
+    kinematics, safe_set = safe_set_of(name)
+    preview = np.tile([0.01, 0.02, kinematics.standing_height], (5, 1))
+    X_WB = RigidTransform(RollPitchYaw(0.05, 0.1, 0.0), [0, 0, kinematics.standing_height])
+    v = np.random.default_rng(0).normal(size=kinematics.num_velocities)
+    here = safe_set.features(kinematics.positions_at(X_WB, kinematics.posture), v, preview)
+    assert here.shape == (len(safe_set.feature_names),)
+    assert len(set(safe_set.feature_names)) == len(safe_set.feature_names)
+    R = RotationMatrix.MakeZRotation(-2.5)
+    moved = RigidTransform(R, [3.0, -4.0, 0.0]) @ X_WB
+    v_moved = v.copy()
+    v_moved[:3], v_moved[3:6] = R.matrix() @ v[:3], R.matrix() @ v[3:6]
+    q_moved = kinematics.positions_at(moved, kinematics.posture)
+    np.testing.assert_allclose(safe_set.features(q_moved, v_moved, preview), here, atol=1e-9)
+
+
+def test_directional_margins_are_distances_to_the_sides_the_robot_would_tip_over():
+    kinematics, safe_set = safe_set_of("laikago")
+    q, v = state(kinematics)
+    preview = np.zeros((3, 3))
+    values = safe_set.features(q, v, preview)
+    feet = kinematics.nominal_contacts
+    base = kinematics.nominal_base_offset
+    assert feature(safe_set, values, "base_margin_0deg") == pytest.approx(
+        feet[:, 0].max() - base[0]
+    )
+    assert feature(safe_set, values, "base_margin_270deg") == pytest.approx(
+        base[1] - feet[:, 1].min()
+    )
+    # The goal is the preview's last point: the stance frame's origin.
+    assert feature(safe_set, values, "goal_margin_90deg") == pytest.approx(feet[:, 1].max())
+
+
+def test_a_velocity_moves_the_capture_point_by_the_pendulums_time_constant():
+    kinematics, safe_set = safe_set_of("laikago")
+    q, v = state(kinematics)
+    preview = np.zeros((3, 3))
+    still = safe_set.features(q, v, preview)
+    v[3] = 0.5
+    pushed = safe_set.features(q, v, preview)
+    change = pushed - still
+    name = "capture_point_margin_0deg"
+    shift = 0.5 * math.sqrt(q[6] / 9.81)
+    assert feature(safe_set, change, name) == pytest.approx(-shift)
+    assert feature(safe_set, change, "base_margin_0deg") == 0
+
+
+def test_height_and_tracking_features_are_the_hand_worked_differences():
+    kinematics, safe_set = safe_set_of("laikago", height_m=[0.3, 0.5])
+    q, v = state(kinematics)
+    base = np.append(kinematics.nominal_base_offset, q[6])
+    preview = np.tile(base + [0.01, -0.02, 0.03], (3, 1))
+    values = safe_set.features(q, v, preview)
+    assert feature(safe_set, values, "height_over_lowest") == pytest.approx(q[6] - 0.3)
+    assert feature(safe_set, values, "height_under_highest") == pytest.approx(0.5 - q[6])
+    error = [feature(safe_set, values, f"tracking_error_{axis}") for axis in "xyz"]
+    np.testing.assert_allclose(error, [0.01, -0.02, 0.03], atol=1e-9)
+    turned, _ = state(kinematics, rotation=(0, 0, 0.4))
+    twisted = kinematics.positions_at(
+        RigidTransform(RotationMatrix.MakeZRotation(0.4), turned[4:7]), kinematics.posture
+    )
+    assert feature(safe_set, safe_set.features(twisted, v, preview), "yaw_error") == pytest.approx(
+        0, abs=1e-9
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", ["position", "velocity", "preview"])
+def test_features_of_what_is_not_finite_are_not_a_number(value, where):
+    kinematics, safe_set = safe_set_of("laikago")
+    q, v = state(kinematics)
+    preview = np.zeros((3, 3))
+    {"position": q, "velocity": v, "preview": preview[1]}[where][1] = value
+    assert np.isnan(safe_set.features(q, v, preview)).all()
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"height_m": [0.5, 0.3]}, r"lowest < highest; got \[0.5, 0.3\]"),
+        ({"height_m": [0.5]}, "height_m must be"),
+        ({"fall_height_m": 0.4}, "fall_height_m must not exceed the lowest safe height 0.3"),
+    ],
+)
+def test_contradictory_limits_are_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        BalanceLimits(**limits)

@@ -1,0 +1,94 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from lip_episodes import HORIZON, make_episodes
+
+from drake_safety.learning.segments import Episodes, split, unsafety_score
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes(40)
+
+
+def test_the_score_is_discounted_by_the_steps_left_and_zero_when_safe():
+    score = unsafety_score(np.array([0, 1, 2, 2]), np.array([True, True, True, False]), 0.9)
+    np.testing.assert_allclose(score, [1.0, 0.9, 0.81, 0.0])
+
+
+def test_a_safe_episode_gives_only_segments_that_fit_and_an_unsafe_one_every_start(episodes):
+    segments = split(episodes, stride=1, discount=0.99)
+    for position, episode in enumerate(episodes):
+        rows = segments.start_row[segments.episode == position]
+        num_starts = episode.num_steps - HORIZON + 1 if episode.is_safe else episode.num_steps
+        np.testing.assert_array_equal(rows, np.arange(max(num_starts, 0)))
+
+
+def test_a_segment_holds_the_errors_from_its_start_and_its_last_one_when_cut_short(episodes):
+    segments = split(episodes, stride=3, discount=0.99)
+    assert np.any(segments.length < HORIZON)
+    for i in range(len(segments)):
+        episode = episodes[int(segments.episode[i])]
+        error = (episode.desired_output - episode.output)[segments.start_row[i] :][:HORIZON]
+        assert segments.length[i] == len(error)
+        np.testing.assert_array_equal(segments.error[i, : len(error)], error)
+        np.testing.assert_array_equal(
+            segments.error[i, len(error) :], error[-1:].repeat(HORIZON - len(error), axis=0)
+        )
+
+
+def test_the_future_margin_is_the_smallest_until_the_end(episodes):
+    segments = split(episodes, stride=7, discount=0.99)
+    for i in range(len(segments)):
+        margins = episodes[int(segments.episode[i])].margins[segments.start_row[i] :]
+        np.testing.assert_array_equal(segments.future_margins[i], margins.min(axis=0))
+
+
+def test_an_unsafe_segment_names_the_constraint_that_ended_it(episodes):
+    segments = split(episodes, stride=5, discount=0.99)
+    names = episodes.info.constraint_names
+    for position, cause, is_unsafe in zip(
+        segments.episode, segments.cause, segments.is_unsafe, strict=True
+    ):
+        episode = episodes[int(position)]
+        assert is_unsafe == (not episode.is_safe)
+        assert episode.cause == ("" if cause < 0 else names[cause])
+
+
+def test_rows_before_the_first_step_are_left_out(episodes):
+    late = [dataclasses.replace(episode, first_step=2) for episode in episodes]
+    segments = split(Episodes(episodes.info, late), stride=4, discount=0.99)
+    assert segments.start_row.min() == 2
+    np.testing.assert_array_equal(segments.is_first, segments.start_row == 2)
+
+
+def test_diverged_episodes_are_counted_and_give_no_segments(episodes):
+    failed = dataclasses.replace(episodes[0], is_safe=False, cause="diverged")
+    mixed = Episodes(episodes.info, [failed, *episodes[1:]])
+    assert mixed.num_diverged == 1
+    assert mixed.num_safe + mixed.num_unsafe + mixed.num_diverged == len(mixed)
+    assert 0 not in split(mixed, stride=1, discount=0.99).episode
+
+
+def test_a_slice_of_a_set_is_a_set_with_the_same_info(episodes):
+    part = episodes[3:5]
+    assert part.info is episodes.info
+    assert [episode.index for episode in part] == [3, 4]
+
+
+def test_an_episode_of_the_wrong_width_is_refused_by_name(episodes):
+    wrong = dataclasses.replace(episodes[7], state=episodes[7].state[:, :-1])
+    with pytest.raises(ValueError, match=r"episode 7 of 'lip': state has shape"):
+        Episodes(episodes.info, [wrong])
+
+
+def test_an_unknown_cause_is_refused_with_those_that_exist(episodes):
+    wrong = dataclasses.replace(episodes[7], is_safe=False, cause="shelf")
+    with pytest.raises(ValueError, match=r"unknown cause 'shelf'.*support.*height"):
+        Episodes(episodes.info, [wrong])
+
+
+def test_a_set_without_one_whole_segment_is_refused(episodes):
+    with pytest.raises(ValueError, match="none of the 0 episodes"):
+        split(episodes[:0], stride=1, discount=0.99)

@@ -1,0 +1,89 @@
+"""StateObserver: what is measured follows the plant state, with noise only where asked for."""
+
+import numpy as np
+import pytest
+from legged_robots import ROBOT_NAMES, robot_kinematics
+from pydrake.math import RigidTransform
+
+from drake_safety.control.observation import add_noise, stance_state
+from drake_safety.control.robot import ObservationNoise
+from drake_safety.systems.state_observer import StateObserver
+
+NOISE = ObservationNoise(position=0.01, velocity=0.05)
+OUTPUTS = ("measured_plant_state", "state", "output")
+
+
+def plant_state(kinematics):
+    X_WB = RigidTransform([0.3, -0.2, kinematics.standing_height])
+    q = kinematics.positions_at(X_WB, kinematics.posture)
+    return np.concatenate([q, np.linspace(-1, 1, kinematics.num_velocities)])
+
+
+def observed(kinematics, noise=None, draws=None, x=None):
+    observer = StateObserver(kinematics, noise)
+    context = observer.CreateDefaultContext()
+    x = plant_state(kinematics) if x is None else x
+    observer.GetInputPort("plant_state").FixValue(context, x)
+    if draws is not None:
+        observer.GetInputPort("noise").FixValue(context, draws)
+    return {name: observer.GetOutputPort(name).Eval(context) for name in OUTPUTS}
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_its_ports_have_the_sizes_of_the_robot(name):
+    kinematics = robot_kinematics(name)
+    observer = StateObserver(kinematics)
+    n_q, n_v = kinematics.num_positions, kinematics.num_velocities
+    assert observer.GetInputPort("plant_state").size() == n_q + n_v
+    assert observer.GetInputPort("noise").size() == 2 * n_v
+    assert observer.GetOutputPort("measured_plant_state").size() == n_q + n_v
+    assert observer.GetOutputPort("state").size() == len(observer.state_names)
+    assert observer.GetOutputPort("output").size() == len(observer.output_names) == 3
+
+
+def test_every_output_is_a_direct_function_of_the_plant_state():
+    observer = StateObserver(robot_kinematics("hexapod"))
+    source = observer.GetInputPort("plant_state").get_index()
+    for name in OUTPUTS:
+        assert observer.HasDirectFeedthrough(source, observer.GetOutputPort(name).get_index())
+    assert observer.CreateDefaultContext().is_stateless()
+
+
+def test_without_noise_the_measurement_is_the_truth():
+    kinematics = robot_kinematics("laikago")
+    x = plant_state(kinematics)
+    for values in (
+        observed(kinematics),
+        observed(kinematics, NOISE),  # Nothing is connected to the noise port.
+        observed(kinematics, ObservationNoise(), np.ones(2 * kinematics.num_velocities)),
+    ):
+        np.testing.assert_array_equal(values["measured_plant_state"], x)
+        np.testing.assert_array_equal(values["output"], [0.3, -0.2, kinematics.standing_height])
+        n_q = kinematics.num_positions
+        np.testing.assert_array_equal(
+            values["state"], stance_state(kinematics, x[:n_q], x[n_q:])
+        )
+
+
+def test_every_output_sees_the_same_noise():
+    kinematics = robot_kinematics("laikago")
+    draws = np.random.default_rng(0).normal(size=2 * kinematics.num_velocities)
+    values = observed(kinematics, NOISE, draws)
+    x, n_q = plant_state(kinematics), kinematics.num_positions
+    q, v = add_noise(x[:n_q], x[n_q:], draws, NOISE)
+    np.testing.assert_array_equal(values["measured_plant_state"], np.concatenate([q, v]))
+    np.testing.assert_array_equal(values["output"], q[4:7])
+    np.testing.assert_array_equal(values["state"], stance_state(kinematics, q, v))
+    assert np.all(values["output"] != x[4:7])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("entry", [0, 4, 10, -1])
+@pytest.mark.parametrize("noise", [None, NOISE])
+def test_a_plant_state_that_is_not_finite_is_reported_as_no_number(value, entry, noise):
+    kinematics = robot_kinematics("laikago")
+    x = plant_state(kinematics)
+    x[entry] = value
+    values = observed(kinematics, noise, np.ones(2 * kinematics.num_velocities), x)
+    assert np.isnan(values["state"]).all()
+    assert not np.isfinite(values["measured_plant_state"]).all()
