@@ -42,6 +42,9 @@ from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.state_observer import StateObserver
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
+_NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
+_LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
+
 
 @dataclass(kw_only=True)
 class StartSampling:
@@ -74,6 +77,8 @@ class PushSampling:
     height_m: float = 0.03
     target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
     """Half-widths of where the calm motion starts and ends, about the stance [m]."""
+    throws: list[Throw] = field(default_factory=list)
+    """The balls of a demonstration: `drake-safety run --push ball`."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
@@ -209,7 +214,12 @@ class Balancing(ClosedLoop):
         measured = observer.GetOutputPort("measured_plant_state")
 
         planner = builder.AddNamedSystem(
-            "trajectory_planner", TrajectoryPlanner(horizon=horizon, step_s=scenario.step_s)
+            "trajectory_planner", TrajectoryPlanner(
+                horizon=horizon,
+                step_s=scenario.step_s,
+                outlook_s=scenario.episode_duration_s,
+                num_outlook=_NUM_OUTLOOK,
+            ),
         )
         self._planner = planner
         desired_output = planner.GetOutputPort("desired_output")
@@ -275,13 +285,16 @@ class Balancing(ClosedLoop):
         )
         builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
         features = builder.AddNamedSystem(
-            "plan_features", PlanFeatures(safe_set, n_q, n_v, horizon=horizon)
+            "plan_features", PlanFeatures(safe_set, n_q, n_v, horizon=_NUM_OUTLOOK)
         )
         builder.Connect(
             assessor_observer.GetOutputPort("measured_plant_state"),
             features.GetInputPort("plant_state"),
         )
-        builder.Connect(desired_preview, features.GetInputPort("desired_preview"))
+        # The features see the whole plan: where it ends decides, and H steps do not reach it.
+        builder.Connect(
+            planner.GetOutputPort("desired_outlook"), features.GetInputPort("desired_preview")
+        )
 
         self.state_names = assessor_observer.state_names
         self.output_names = assessor_observer.output_names
@@ -307,9 +320,8 @@ class Balancing(ClosedLoop):
             builder.Connect(desired_preview, assessor.GetInputPort("desired_preview"))
             builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
             if recovery:
-                name = "normalized_" if parameters.recovery.is_normalized else ""
                 builder.Connect(
-                    assessor.GetOutputPort(f"{name}safety_probability"),
+                    assessor.GetOutputPort(self.trigger_port),
                     switch.GetInputPort("safety_probability"),
                 )
             for i in range(assessor.num_output_ports()):
@@ -327,6 +339,8 @@ class Balancing(ClosedLoop):
         builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
         builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
         builder.ExportOutput(plant_state, "plant_state")
+        if ball_instance is not None:
+            builder.ExportOutput(plant.get_state_output_port(ball_instance), "ball_state")
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self.finish(builder)
@@ -365,7 +379,8 @@ class Balancing(ClosedLoop):
         if not is_push:
             self._reset_offset(context, rng)
             return 0
-        self.reset_calm(context, rng)
+        # The ball hits at any moment of a calm motion, not only as it starts.
+        self._start_calm(context, rng, elapsed_s=rng.uniform(0.0, _LATEST_HIT_S))
         # The first row after the hit sees it between 0 and one assessment step ago.
         lead_s = rng.uniform(0.0, 1.0) * self.scenario.step_s
         self.throw_ball(context, parameters.push.sample(rng, lead_s), lead_s)
@@ -373,18 +388,31 @@ class Balancing(ClosedLoop):
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Starts a calm motion near the stance, as it is when a ball is thrown."""
+        self._start_calm(context, rng, elapsed_s=0.0)
+
+    def _start_calm(self, context: Context, rng: np.random.Generator, elapsed_s: float) -> None:
+        """Enters a calm motion ``elapsed_s`` after its start, as if it had been tracked well."""
         push = self.scenario.parameters.push
-        start_sampling = self.scenario.parameters.start
         kinematics = self.kinematics
         half = np.array([*push.target_offset_m, 0.0])
         nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
         start = nominal + rng.uniform(-half, half)
         goal = nominal + rng.uniform(-half, half)
+        duration_s = rng.uniform(*self.scenario.parameters.start.plan_duration_s)
+        plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
         contacts = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-        X_WB = RigidTransform(start)
+        X_WB = RigidTransform(plan.value(0.0).ravel())
         joints = solve_inverse_kinematics(kinematics, X_WB, contacts, kinematics.posture)
-        plan = interpolate(start, goal, rng.uniform(*start_sampling.plan_duration_s))
-        self._set(context, rng, X_WB, joints, np.zeros(kinematics.num_velocities), contacts, plan)
+        v = np.zeros(kinematics.num_velocities)
+        if elapsed_s < duration_s:
+            v[3:6] = plan.MakeDerivative().value(0.0).ravel()
+        self._rest_feet(X_WB, joints, v)
+        self._set(context, rng, X_WB, joints, v, contacts, plan)
+
+    def _rest_feet(self, X_WB: RigidTransform, joints: np.ndarray, v: np.ndarray) -> None:
+        """Sets the joint rates of ``v`` so that the feet are at rest: 0 = J_b v_b + J_leg dq."""
+        J = self.kinematics.contact_jacobian(self.kinematics.positions_at(X_WB, joints))
+        v[6:], *_ = np.linalg.lstsq(J[:, 6:], -J[:, :6] @ v[:6], rcond=1e-6)
 
     def _reset_offset(self, context: Context, rng: np.random.Generator) -> None:
         sampling = self.scenario.parameters.start
@@ -402,9 +430,7 @@ class Balancing(ClosedLoop):
         v = np.zeros(kinematics.num_velocities)
         v[:3] = rng.normal(size=3) * sampling.angular_velocity_std_rad_s
         v[3:6] = rng.normal(size=3) * sampling.velocity_std_m_s
-        # Feet are at rest on the ground: 0 = J_b v_b + J_leg dq.
-        J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
-        v[6:], *_ = np.linalg.lstsq(J[:, 6:], -J[:, :6] @ v[:6], rcond=1e-6)
+        self._rest_feet(X_WB, joints, v)
         joints = joints + rng.normal(size=kinematics.num_joints) * sampling.joint_std_rad
         goal = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * sampling.target_offset_m,
@@ -443,6 +469,12 @@ class Balancing(ClosedLoop):
                 source.GetMyMutableContextFromRoot(context),
                 RandomGenerator(int(rng.integers(2**31))),
             )
+
+    @property
+    def trigger_port(self) -> str:
+        """Name of the output port that recovery is triggered by."""
+        is_normalized = self.scenario.parameters.recovery.is_normalized
+        return "normalized_safety_probability" if is_normalized else "safety_probability"
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
         """A random ball; see :meth:`ClosedLoop.sample_throw`."""

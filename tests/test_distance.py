@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from lip_episodes import make_episodes
 
 from drake_safety.learning import distance
 from drake_safety.learning.distance import dtw_matrix, neighbour_graph
 from drake_safety.learning.segments import split
+from lip_episodes import make_episodes
 
 
 @pytest.fixture(scope="module")

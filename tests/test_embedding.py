@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from lip_episodes import make_episodes
 
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
@@ -12,6 +11,7 @@ from drake_safety.learning.embedding import (
     tsne,
 )
 from drake_safety.learning.segments import split
+from lip_episodes import make_episodes
 
 SETTINGS = MapSettings(
     hidden_sizes=(32, 32),

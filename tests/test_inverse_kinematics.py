@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 
 def standing_contacts(kinematics):
@@ -45,9 +45,7 @@ def test_from_the_last_ticks_answer_one_step_suffices():
     kinematics = robot_kinematics("laikago")
     p_WC = standing_contacts(kinematics)
     X_WB = base_pose(kinematics, shift=(0.003, -0.003, 0.003))  # 0.3 m/s for 10 ms.
-    joints = solve_inverse_kinematics(
-        kinematics, X_WB, p_WC, kinematics.posture, max_iterations=1
-    )
+    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture, max_iterations=1)
     reached = kinematics.contact_positions(kinematics.positions_at(X_WB, joints))
     np.testing.assert_allclose(reached, p_WC, atol=2e-4)
 

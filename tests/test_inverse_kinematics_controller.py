@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.trajectory_planner import to_world
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 PERIOD_S = 0.01
 STIFFNESS = 250.0

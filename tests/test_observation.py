@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_safety.control.observation import (
@@ -15,12 +14,14 @@ from drake_safety.control.observation import (
     state_names,
 )
 from drake_safety.control.robot import ObservationNoise
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 
 def a_state(kinematics, seed=0):
     rng = np.random.default_rng(seed)
     X_WB = RigidTransform(RollPitchYaw(rng.uniform(-0.3, 0.3, 3)), rng.normal(size=3))
-    q = kinematics.positions_at(X_WB, kinematics.posture + 0.1 * rng.normal(size=kinematics.num_joints))
+    joints = kinematics.posture + 0.1 * rng.normal(size=kinematics.num_joints)
+    q = kinematics.positions_at(X_WB, joints)
     return X_WB, q, rng.normal(size=kinematics.num_velocities)
 
 
@@ -92,8 +93,8 @@ def test_the_rotation_vector_is_axis_times_angle_and_at_most_half_a_turn():
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
         angle = rng.uniform(0, 2 * math.pi)
-        R = RotationMatrix(quaternion_of(np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])))
-        r = rotation_vector(R)
+        quaternion = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])
+        r = rotation_vector(RotationMatrix(quaternion_of(quaternion)))
         assert np.linalg.norm(r) <= math.pi + 1e-12
         expected = angle * axis if angle <= math.pi else -(2 * math.pi - angle) * axis
         np.testing.assert_allclose(r, expected, atol=1e-7)

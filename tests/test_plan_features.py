@@ -2,17 +2,17 @@
 
 import numpy as np
 import pytest
-from legged_robots import robot_kinematics
 from pydrake.math import RigidTransform
 
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.systems.plan_features import PlanFeatures
+from legged_robots import robot_kinematics
 
 
 class SumFeatures:
     """Features whose values tell which argument they came from."""
 
-    feature_names = ("q", "v", "first", "last")  # noqa: RUF012 - as a safe set has them
+    feature_names = ("q", "v", "first", "last")
 
     def features(self, q, v, preview):
         return np.array([q.sum(), v.sum(), preview[0].sum(), preview[-1].sum()])

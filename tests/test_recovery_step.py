@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 
 from drake_safety.control.recovery_step import (
     RecoveryStepParameters,
@@ -14,6 +13,7 @@ from drake_safety.control.recovery_step import (
     gait_groups,
     swing_position,
 )
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 PARAMETERS = RecoveryStepParameters()
 FRONT_LEFT = np.array([0.2, 0.13])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import yaml
-from legged_robots import ROBOT_NAMES, robot_model, write_biped, write_hexapod
 from pydrake.geometry import Role, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.analysis import Simulator
@@ -21,6 +20,7 @@ from drake_safety.control.robot import (
     servo_joints,
 )
 from drake_safety.models import load_robot, robot_names
+from legged_robots import ROBOT_NAMES, robot_model, write_biped, write_hexapod
 
 
 def edited(path, **changes):

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_safety.control.safe_sets import (
@@ -13,6 +12,7 @@ from drake_safety.control.safe_sets import (
     convex_hull,
     signed_distance_to_polygon,
 )
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
 NAMES = list(BalanceSafeSet.names)
@@ -69,7 +69,8 @@ def test_the_hull_turns_left_at_every_corner_and_holds_every_point():
         edges = np.roll(corners, -1, axis=0) - corners
         following = np.roll(edges, -1, axis=0)
         assert np.all(edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0)
-        assert all(signed_distance_to_polygon(p, list(map(tuple, corners))) > -1e-12 for p in points)
+        polygon = convex_hull(points)
+        assert all(signed_distance_to_polygon(p, polygon) > -1e-12 for p in points)
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from lip_episodes import HORIZON, make_episodes
 
 from drake_safety.learning.segments import Episodes, split, unsafety_score
+from lip_episodes import HORIZON, make_episodes
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from legged_robots import ROBOT_NAMES, robot_kinematics
 from pydrake.math import RigidTransform
 
 from drake_safety.control.observation import add_noise, stance_state
 from drake_safety.control.robot import ObservationNoise
 from drake_safety.systems.state_observer import StateObserver
+from legged_robots import ROBOT_NAMES, robot_kinematics
 
 NOISE = ObservationNoise(position=0.01, velocity=0.05)
 OUTPUTS = ("measured_plant_state", "state", "output")
@@ -60,9 +60,7 @@ def test_without_noise_the_measurement_is_the_truth():
         np.testing.assert_array_equal(values["measured_plant_state"], x)
         np.testing.assert_array_equal(values["output"], [0.3, -0.2, kinematics.standing_height])
         n_q = kinematics.num_positions
-        np.testing.assert_array_equal(
-            values["state"], stance_state(kinematics, x[:n_q], x[n_q:])
-        )
+        np.testing.assert_array_equal(values["state"], stance_state(kinematics, x[:n_q], x[n_q:]))
 
 
 def test_every_output_sees_the_same_noise():

@@ -26,7 +26,6 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
-
 _Value = TypeVar("_Value")
 
 
@@ -148,7 +147,7 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     for misfit in _misfits(schema, raw, ()):
         raise ValueError(f"{who}: {misfit}")
     try:
-        value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw))
+        value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw, sort_keys=False))
         _validate(value)
     except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
         raise ValueError(f"{who}: {error}") from error
@@ -169,16 +168,17 @@ def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
                 yield from _misfits(hints[key], value, (*path, key))
             else:
                 yield f"unknown key '{'.'.join((*path, str(key)))}'; keys there are {known}"
-    elif isinstance(raw, dict):
+    elif isinstance(raw, dict | list):
+        items = raw.items() if isinstance(raw, dict) else enumerate(raw)
         for inner in get_args(schema):
             if is_dataclass(inner):
-                for key, value in raw.items():
+                for key, value in items:
                     yield from _misfits(inner, value, (*path, str(key)))
 
 
 def _validate(value: Any) -> None:
-    if isinstance(value, dict):
-        for item in value.values():
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
             _validate(item)
     elif is_dataclass(value):
         for entry in fields(value):
@@ -228,9 +228,7 @@ def add_to_package_map(package_map: PackageMap) -> None:
         package_map.AddPackageXml(str(models_package_xml()))
 
 
-def by_pattern(
-    patterns: dict[str, _Value], name: str, what: str, robot_name: str
-) -> _Value | None:
+def by_pattern(patterns: dict[str, _Value], name: str, what: str, robot_name: str) -> _Value | None:
     """The value of the only pattern that matches ``name`` in full; None when none does.
 
     Raises:
@@ -274,9 +272,7 @@ def _set_friction(
                 for key, value in old.GetPropertiesInGroup(group).items():
                     if not new.HasProperty(group, key):
                         new.AddProperty(group, key, value.get_value())
-            scene_graph.AssignRole(
-                plant.get_source_id(), geometry_id, new, RoleAssign.kReplace
-            )
+            scene_graph.AssignRole(plant.get_source_id(), geometry_id, new, RoleAssign.kReplace)
 
 
 def add_robot(

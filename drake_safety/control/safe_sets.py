@@ -124,6 +124,7 @@ class BalanceSafeSet:
         points = ("base", "capture_point", "goal")
         self.feature_names = [f"{p}_margin_{d}" for p in points for d in directions]
         self.feature_names += [f"{p}_support_distance" for p in points]
+        self.feature_names += ["plan_support_distance", "plan_height_margin", "goal_height"]
         self.feature_names += [f"clearance_{i}" for i in range(kinematics.num_contacts)]
         self.feature_names += ["height_over_lowest", "height_under_highest", "yaw_error"]
         self.feature_names += [f"tracking_error_{axis}" for axis in "xyz"]
@@ -167,7 +168,8 @@ class BalanceSafeSet:
         Args:
             q: Positions (n_q,), measured.
             v: Velocities (n_v,), measured.
-            preview: Desired base positions in the stance frame, (H, 3) [m].
+            preview: Desired base positions from now to the goal, in the stance frame, (M, 3)
+                [m].
 
         Returns:
             Features (n_f,), in the order of :attr:`feature_names` [m, rad]; NaN throughout when
@@ -197,14 +199,19 @@ class BalanceSafeSet:
         base_yaw = math.atan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
         yaw_error = math.remainder(base_yaw - yaw, 2 * math.pi)
         lowest, highest = limits.height_m
+        heights = preview[:, 2].tolist()
         return np.concatenate(
             [
                 *(reach - p @ _DIRECTIONS for p in points),
                 [signed_distance_to_polygon(p, corners) for p in points],
+                [
+                    min(signed_distance_to_polygon(p, corners) for p in preview[:, :2]),
+                    min(min(heights) - lowest, highest - max(heights)),
+                    heights[-1],
+                ],
                 clearance,
                 [height - lowest, highest - height, yaw_error],
                 preview[0, :2] - base,
                 [preview[0, 2] - height],
             ]
         )
-

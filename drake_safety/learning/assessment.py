@@ -188,6 +188,11 @@ class SafetyAssessment:
     def __init__(self, parameters: AssessmentParameters | None = None):
         self.parameters = AssessmentParameters() if parameters is None else parameters
 
+    @property
+    def uses_features(self) -> bool:
+        """Whether x has the features: in the sharpened mode."""
+        return self.parameters.is_sharpened
+
     def fit(
         self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
     ) -> "SafetyAssessment":
@@ -446,7 +451,9 @@ class SafetyAssessment:
         if x.shape[0] != embedding.num_inputs:
             self._check_width(x.shape[0])
         num_members, num_cells, num_columns = beliefs.shape
-        if not x.dot(x) < _INPUT_LIMIT:
+        with np.errstate(over="ignore"):
+            is_usable = x.dot(x) < _INPUT_LIMIT
+        if not is_usable:
             unknown = np.full(num_columns - 3, np.nan)
             return self._assessment(None, np.full(2, np.nan), unknown, num_columns)
         output = embedding.evaluate_one(x.astype(np.float32))

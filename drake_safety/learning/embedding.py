@@ -28,7 +28,8 @@ def tsne(
 ) -> np.ndarray:
     """The t-SNE embedding of a neighbour graph, (N, 2); the same seed gives the same bits.
 
-    The distances enter as they are: openTSNE squares them itself.
+    The distances enter as they are: openTSNE squares them itself. It runs on one thread: with
+    several, the bits depend on their number, and on a busy machine they mostly wait.
 
     Raises:
         ValueError: The graph has fewer than three times `perplexity` neighbours a segment.
@@ -58,12 +59,12 @@ def tsne(
             knn_index=PrecomputedNeighbors(graph.indices, graph.distances),
             perplexity=perplexity,
             random_state=seed,
-            n_jobs=-1,
+            n_jobs=1,
         )
         embedding = openTSNE.TSNE(
             initialization="random",
             random_state=seed,
-            n_jobs=-1,
+            n_jobs=1,
             callbacks=report,
             callbacks_every_iters=50,
         ).fit(affinities=affinities)

@@ -4,7 +4,7 @@ import hashlib
 import importlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, cast
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed
@@ -43,7 +43,7 @@ class Scenario:
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
     """How Γ is learned."""
 
-    parameters: ClassVar[Any] = None  # Set by the loader: an instance of the task's Parameters.
+    parameters = cast(Any, None)  # Set by the loader: an instance of the task's Parameters.
 
     def __post_init__(self) -> None:
         for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
@@ -70,8 +70,7 @@ class Scenario:
         """
         if name not in self.variations:
             raise ValueError(
-                f"scenario '{self.name}' has no variation '{name}'; it has "
-                f"{list(self.variations)}"
+                f"scenario '{self.name}' has no variation '{name}'; it has {list(self.variations)}"
             )
         return self.variations[name]
 
@@ -102,9 +101,8 @@ class Scenario:
         Raises:
             ValueError: Unknown variation, or an assessment made for something else.
         """
-        return self.task_class()(
-            self, variation, assessment=assessment, meshcat=meshcat, **options
-        )
+        task: Any = self.task_class()  # Its constructor has options of its own.
+        return task(self, variation, assessment=assessment, meshcat=meshcat, **options)
 
     def to_yaml(self) -> str:
         """The scenario as canonical text, defaults included."""

@@ -8,6 +8,7 @@ is simulated again, from the same seed, with the trigger at the instant that was
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,7 +44,8 @@ class ThrowLog:
         fall_time_s: When the robot fell; infinite if it did not.
         leave_time_s: When it left the safe set; infinite if it did not.
         recovery_active: (N,), whether a recovery step was under way.
-        violations: Counts of what must not happen: see :class:`Limits`.
+        violations: Rows in which what must not happen did: see :class:`Limits`.
+        extra: Other ports that were asked for, (N, size) each.
     """
 
     index: int
@@ -59,6 +61,7 @@ class ThrowLog:
     leave_time_s: float
     recovery_active: np.ndarray
     violations: dict[str, int] = field(default_factory=dict)
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def has_fallen(self) -> bool:
@@ -84,7 +87,7 @@ class Limits:
     """
 
     _POSITION_SLACK_RAD = 0.02
-    _PENETRATION_M = 2e-3
+    _PENETRATION_M = 5e-3
 
     def __init__(self, loop: Any):
         self._loop = loop
@@ -135,16 +138,51 @@ class Limits:
         )
 
 
+def play_throws(
+    loop: ClosedLoop,
+    simulator: Simulator,
+    throws: Iterable[Throw],
+    *,
+    duration_s: float,
+    log_period_s: float,
+) -> Iterator[float]:
+    """Advances a simulation while balls are thrown, and stops at every row of a log.
+
+    Args:
+        loop: A closed loop with a ball.
+        simulator: Its initialised simulator.
+        throws: The balls; each appears shortly before ``time_s``, when it touches.
+        duration_s: When to end [s].
+        log_period_s: Time between two rows [s].
+
+    Yields:
+        The time of each row, from 0 on [s].
+    """
+    waiting = sorted(throws, key=lambda throw: throw.time_s)
+    for row in range(round(duration_s / log_period_s) + 1):
+        time = row * log_period_s
+        while waiting and waiting[0].time_s - _FLIGHT_S <= time:
+            throw = waiting.pop(0)
+            release_s = max(throw.time_s - _FLIGHT_S, 0.0)
+            simulator.AdvanceTo(release_s)
+            loop.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
+        simulator.AdvanceTo(time)
+        yield time
+
+
 def run_throw(
     loop: ClosedLoop,
     index: int,
     *,
     seed: int,
     trigger_time_s: float = math.nan,
-    throw: Throw | None = None,
+    throws: list[Throw] | None = None,
+    duration_s: float | None = None,
     log_period_s: float = 0.02,
+    ports: tuple[str, ...] = (),
+    realtime_rate: float = 0.0,
 ) -> ThrowLog:
-    """Throws one random ball at a robot in calm motion.
+    """Throws one random ball, or given ones, at a robot in calm motion.
 
     Args:
         loop: A closed loop with a ball. With an input port ``safety_probability`` (recovery
@@ -152,43 +190,42 @@ def run_throw(
         index: Number of the throw: start, plan and ball follow from it and the seed.
         seed: Seed of the set.
         trigger_time_s: When to trigger; NaN for never.
-        throw: A ball in place of the random one.
+        throws: Balls in place of the random one.
+        duration_s: When to end; by default 2.5 s after the first touch.
         log_period_s: Time between two rows [s].
+        ports: More output ports to log, into ``extra``.
+        realtime_rate: How fast to run at most, for watching; 0 for as fast as it goes.
 
     Returns:
         The log, which ends at a fall.
     """
     rng = episode_rng(seed, index)
     simulator = Simulator(loop)
+    simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
     loop.reset_calm(context, rng)
-    touch_s = rng.uniform(_EARLIEST_S, _LATEST_S)
-    sampled = loop.sample_throw(rng, touch_s)
-    throw = throw or sampled
+    sampled = loop.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
+    throws = [sampled] if throws is None else throws
+    if duration_s is None:
+        duration_s = throws[0].time_s + _AFTER_S
     probability = None
     if loop.HasInputPort("safety_probability"):
         probability = loop.GetInputPort("safety_probability")
         probability.FixValue(context, [1.0])
     has_recovery = loop.HasOutputPort("recovery_active")
     simulator.Initialize()
-    recorder = Recorder(loop, (*_PORTS, *(("recovery_active",) if has_recovery else ())))
+    recorder = Recorder(loop, (*_PORTS, *ports, *(("recovery_active",) if has_recovery else ())))
     limits = Limits(loop)
+    margins_port = loop.GetOutputPort("margins")
     fall_column = loop.constraint_names.index(loop.fall_name)
     fall_s = leave_s = math.inf
     triggered_s = math.nan
-    num_rows = math.ceil((throw.time_s + _AFTER_S) / log_period_s)
-    release_s = throw.time_s - _FLIGHT_S
-    is_released = False
-    for row in range(num_rows + 1):
-        time = row * log_period_s
-        if not is_released and release_s <= time:
-            simulator.AdvanceTo(release_s)
-            loop.throw_ball(context, throw, _FLIGHT_S)
-            is_released = True
-        simulator.AdvanceTo(time)
+    for time in play_throws(
+        loop, simulator, throws, duration_s=duration_s, log_period_s=log_period_s
+    ):
         recorder.record(context)
         limits.count(context)
-        margins = loop.GetOutputPort("margins").Eval(context)
+        margins = margins_port.Eval(context)
         if margins.min() < 0:
             leave_s = min(leave_s, time)
         if margins[fall_column] < 0:
@@ -202,15 +239,17 @@ def run_throw(
     active = arrays.pop("recovery_active", np.zeros((len(arrays["time_s"]), 1)))[:, 0]
     if has_recovery and probability is None and active.any():
         triggered_s = float(arrays["time_s"][int(np.argmax(active > 0))])
+    extra = {name: arrays.pop(name) for name in ports}
     return ThrowLog(
         index=index,
-        throw=throw,
+        throw=throws[0] if throws else sampled,
         **arrays,
         trigger_time_s=triggered_s,
         fall_time_s=fall_s,
         leave_time_s=leave_s,
         recovery_active=active,
         violations=limits.counts,
+        extra=extra,
     )
 
 

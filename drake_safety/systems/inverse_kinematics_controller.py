@@ -121,9 +121,7 @@ class InverseKinematicsController(LeafSystem):
         joints, torques = self._solve(context, previous)
         limit = self._kinematics.velocity_limits
         rate = np.clip((joints - previous) / self._period_s, -limit, limit)
-        discrete_state.set_value(
-            np.concatenate([joints, self._add_offset(joints, torques), rate])
-        )
+        discrete_state.set_value(np.concatenate([joints, self._add_offset(joints, torques), rate]))
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         n_j = self._kinematics.num_joints

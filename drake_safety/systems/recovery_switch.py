@@ -55,7 +55,8 @@ class RecoverySwitch(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         trigger = builder.AddNamedSystem(
-            "recovery_trigger", RecoveryTrigger(threshold=threshold, period_s=period_s, offset_s=offset_s)
+            "recovery_trigger",
+            RecoveryTrigger(threshold=threshold, period_s=period_s, offset_s=offset_s),
         )
         self.step_planner = builder.AddNamedSystem(
             "recovery_step_planner",

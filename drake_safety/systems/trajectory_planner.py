@@ -57,24 +57,36 @@ class TrajectoryPlanner(LeafSystem):
         - desired_output
         - desired_output_rate
         - desired_preview
+        - desired_outlook
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
     Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
     ``desired_preview`` is z*_{k:k+H}, row-major in time, in S: what the feet must do does not
-    depend on where they stand. Before its start and after its end the plan holds still. The stance pose
-    [x, y, yaw] comes from the input if it is connected, else from the parameter.
+    depend on where they stand. ``desired_outlook`` looks further at fewer instants: M samples
+    spread evenly from now to ``outlook_s`` ahead, in S. Before its start and after its end the plan holds still. The
+    stance pose [x, y, yaw] comes from the input if it is connected, else from the parameter.
 
     Args:
         horizon: H, samples of the preview.
         step_s: Time between them [s].
         num_outputs: n_z, a multiple of three.
+        outlook_s: How far the outlook reaches [s]; as far as the preview by default.
+        num_outlook: M, samples of the outlook.
 
     Raises:
-        ValueError: ``num_outputs`` is not a multiple of three, or horizon or step is not
-            positive.
+        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or the outlook's
+            samples are too few.
     """
 
-    def __init__(self, *, horizon: int, step_s: float, num_outputs: int = 3):
+    def __init__(
+        self,
+        *,
+        horizon: int,
+        step_s: float,
+        num_outputs: int = 3,
+        outlook_s: float | None = None,
+        num_outlook: int = 5,
+    ):
         super().__init__()
         if num_outputs % 3 or num_outputs <= 0:
             raise ValueError(f"planner: num_outputs must be a multiple of 3; got {num_outputs}")
@@ -82,15 +94,17 @@ class TrajectoryPlanner(LeafSystem):
             raise ValueError(
                 f"planner: horizon and step_s must be positive; got {horizon}, {step_s}"
             )
+        if num_outlook < 2:
+            raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
         self._num_outputs = num_outputs
         self._offsets = step_s * np.arange(horizon)
+        reach_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
+        self._outlook_offsets = np.linspace(0.0, reach_s, num_outlook)
         hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
         self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self.DeclareVectorInputPort("stance_pose", 3)
-        self.DeclareVectorOutputPort(
-            "desired_output", BasicVector(num_outputs), self._calc_output
-        )
+        self.DeclareVectorOutputPort("desired_output", BasicVector(num_outputs), self._calc_output)
         self.DeclareVectorOutputPort(
             "desired_output_rate", BasicVector(num_outputs), self._calc_rate
         )
@@ -98,6 +112,12 @@ class TrajectoryPlanner(LeafSystem):
             "desired_preview",
             BasicVector(horizon * num_outputs),
             self._calc_preview,
+            {self.time_ticket(), self.all_parameters_ticket()},
+        )
+        self.DeclareVectorOutputPort(
+            "desired_outlook",
+            BasicVector(num_outlook * num_outputs),
+            self._calc_outlook,
             {self.time_ticket(), self.all_parameters_ticket()},
         )
 
@@ -153,4 +173,8 @@ class TrajectoryPlanner(LeafSystem):
 
     def _calc_preview(self, context: Context, output: BasicVector) -> None:
         times = context.get_time() + self._offsets
+        output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))
+
+    def _calc_outlook(self, context: Context, output: BasicVector) -> None:
+        times = context.get_time() + self._outlook_offsets
         output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))

@@ -1,0 +1,522 @@
+"""The command ``drake-safety``: train, run and evaluate safety assessments."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.throws import ThrowLog
+
+app = typer.Typer(
+    help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+_MODES = ("sharpened", "paper")
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
+]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
+]
+AssessmentOption = Annotated[
+    Path, typer.Option("--assessment", help="Folder that `train` wrote.", file_okay=False)
+]
+
+
+class _Stages:
+    """Progress bars, one a stage, that show the time left."""
+
+    def __init__(self, progress: Progress):
+        self._progress = progress
+        self._tasks: dict[str, Any] = {}
+
+    def __call__(self, stage: str, done: float, total: float) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._progress.add_task(stage, total=total)
+        self._progress.update(self._tasks[stage], completed=done, total=total)
+
+
+@contextlib.contextmanager
+def _stages() -> Iterator[_Stages]:
+    columns = (
+        TextColumn("{task.description:<34}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield _Stages(progress)
+
+
+@app.command()
+def scenarios() -> None:
+    """List the scenarios that come with the package."""
+    from drake_safety.simulation.scenario import load_scenario, scenario_names
+
+    table = Table("scenario", "task", "robot", "plants", "horizon")
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        horizon_s = scenario.assessment.horizon * scenario.step_s
+        table.add_row(
+            name,
+            scenario.task.rpartition(":")[2],
+            scenario.robot,
+            ", ".join(scenario.variations),
+            f"{scenario.assessment.horizon} steps, {horizon_s:g} s",
+        )
+    console.print(table)
+
+
+@app.command()
+def train(
+    scenario: ScenarioArgument,
+    out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
+    episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=1)] = 2048,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = 0,
+    mode: Annotated[
+        str, typer.Option(help="'sharpened', 'paper' (literally the paper's), or 'both'.")
+    ] = "both",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the episodes that are in OUT.")
+    ] = False,
+    workers: WorkersOption = None,
+) -> None:
+    """Simulate the nominal closed loop and learn Γ from it.
+
+    Episodes are kept as they finish: a run that was stopped goes on with --resume.
+    """
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.dataset import completed
+    from drake_safety.simulation.rollouts import run_episodes
+    from drake_safety.simulation.scenario import load_scenario
+
+    if mode not in (*_MODES, "both"):
+        raise ValueError(f"train: mode must be one of {[*_MODES, 'both']}; got '{mode}'")
+    loaded = load_scenario(scenario)
+    folder = out / "episodes"
+    if folder.exists() and completed(folder) and not resume:
+        raise ValueError(
+            f"{folder} already holds {len(completed(folder))} episodes: pass --resume to go on "
+            "with them, or choose another --out"
+        )
+    with _stages() as stages:
+        data = run_episodes(
+            loaded,
+            episodes,
+            seed=seed,
+            num_workers=workers,
+            path=folder,
+            progress=lambda done, total: stages("nominal episodes", done, total),
+            extra={"command": _command(), "scenario_yaml": loaded.to_yaml()},
+        )
+        table = Table("mode", "segments", "unsafe episodes", "CPU time", "file")
+        for name in _MODES if mode == "both" else (mode,):
+            loaded.assessment.mode = name
+            started = time.process_time()
+            assessment = SafetyAssessment(loaded.assessment).fit(
+                data, lambda stage, share, name=name: stages(f"{name}: {stage}", 100 * share, 100)
+            )
+            path = assessment_file(out, name)
+            assessment.save(path)
+            table.add_row(
+                name,
+                f"{assessment.training_points_.shape[1]}",
+                f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)",
+                f"{time.process_time() - started:.0f} s",
+                str(path),
+            )
+    console.print(table)
+
+
+def assessment_file(folder: Path, mode: str) -> Path:
+    """Where ``train`` keeps the assessment of a mode."""
+    return folder / f"{mode}.safetensors"
+
+
+def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
+    """Loads what ``train`` wrote.
+
+    Raises:
+        ValueError: The folder does not hold it.
+    """
+    from drake_safety.learning.assessment import SafetyAssessment
+
+    path = assessment_file(folder, mode)
+    if not path.is_file():
+        there = sorted(file.stem for file in folder.glob("*.safetensors"))
+        raise ValueError(
+            f"{folder} holds no '{mode}' assessment; it holds {there}: run `drake-safety train` first"
+        )
+    return SafetyAssessment.load(path)
+
+
+@app.command()
+def run(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    push: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="'ball' throws the scenario's own balls; or your own, repeatable: "
+            "'time=1 mass=3 speed=9 direction=90' [s, kg, m/s, degrees from x]."
+        ),
+    ] = None,
+    variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
+    recovery: Annotated[
+        bool, typer.Option("--recovery/--no-recovery", help="Step when Γ falls.")
+    ] = True,
+    duration: Annotated[float, typer.Option(help="Seconds to simulate.", min=0.1)] = 5.0,
+    seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = 0,
+    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for recording and pictures; ASSESSMENT's by default.")
+    ] = None,
+    meshcat: Annotated[
+        bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
+    ] = False,
+) -> None:
+    """Simulate once with Γ in the loop: a recording, a timeline, and what happened when."""
+    from pydrake.geometry import Meshcat
+
+    from drake_safety.evaluation.figures import save, timeline_figure
+    from drake_safety.evaluation.stills import render_stills
+    from drake_safety.simulation.scenario import load_scenario
+    from drake_safety.simulation.throws import run_throw
+
+    loaded = load_scenario(scenario)
+    gamma = load_assessment(assessment, mode)
+    throws = _throws(loaded, push or [])
+    viewer = Meshcat()
+    loop = loaded.make_loop(
+        variation, assessment=gamma, meshcat=viewer, recovery=recovery, ball=True
+    )
+    if meshcat:
+        console.print(f"live at {viewer.web_url()}")
+        input("Press Enter when the browser shows the robot. ")
+    ports = ("normalized_safety_probability", "safety_probability", "belief", "cause_probability",
+             "predicted_margins", "ball_state")
+    viewer.StartRecording()
+    log = run_throw(
+        loop,
+        0,
+        seed=seed,
+        throws=throws,
+        duration_s=duration,
+        log_period_s=0.02,
+        ports=ports,
+        realtime_rate=1.0 if meshcat else 0.0,
+    )
+    viewer.StopRecording()
+    viewer.PublishRecording()
+    folder = (out or assessment) / "run"
+    folder.mkdir(parents=True, exist_ok=True)
+    recording = folder / "recording.html"
+    recording.write_text(viewer.StaticHtml(), encoding="utf-8")
+    probability = log.extra[loop.trigger_port][:, 0]
+    threshold = loaded.parameters.recovery.threshold
+    rises = np.flatnonzero(np.diff(log.recovery_active, prepend=0.0) > 0)
+    falls = np.flatnonzero(np.diff(log.recovery_active, append=0.0) < 0)
+    triggers = [float(log.time_s[i]) for i in rises]
+    spans = [
+        (float(log.time_s[i]), float(log.time_s[j])) for i, j in zip(rises, falls, strict=True)
+    ]
+    moments = still_times(log, throws, triggers)
+    stills = render_stills(loop, log, moments)
+    figure = timeline_figure(
+        log.time_s,
+        probability,
+        threshold,
+        throws=[throw.time_s for throw in throws],
+        triggers=triggers,
+        recoveries=spans,
+        belief=log.extra["belief"],
+        margins=log.margins,
+        margin_names=loop.constraint_names,
+        stills=list(zip(moments, stills, strict=True)),
+    )
+    pictures = save(figure, folder / "timeline")
+    _print_run(loop, log, throws, triggers, probability)
+    console.print("recording", str(recording))
+    for picture in pictures:
+        console.print("picture  ", str(picture))
+
+
+def still_times(log: ThrowLog, throws: list[Throw], triggers: list[float]) -> list[float]:
+    """Instants worth a picture: calm, each throw, each trigger, the step at work, the end."""
+    end = float(log.time_s[-1])
+    times = [0.0]
+    for throw in throws:
+        times += [throw.time_s - 0.02, throw.time_s + 0.16]
+    times += [time + 0.3 for time in triggers[:1]] + [end]
+    return sorted({round(min(max(t, 0.0), end) / 0.02) * 0.02 for t in times})
+
+
+def _print_run(
+    loop: Any, log: ThrowLog, throws: list[Throw], triggers: list[float], probability: np.ndarray
+) -> None:
+    table = Table("time [s]", "event", "Γ")
+
+    def gamma_at(time_s: float) -> str:
+        return f"{probability[min(int(round(time_s / 0.02)), len(probability) - 1)]:.2f}"
+
+    events = [
+        (
+            throw.time_s,
+            f"ball of {throw.mass_kg:g} kg at {throw.speed_m_s:g} m/s towards "
+            f"{np.degrees(throw.direction_rad):.0f}°",
+        )
+        for throw in throws
+    ]
+    for time_s in triggers:
+        row = int(round(time_s / 0.02))
+        causes = log.extra["cause_probability"][row]
+        cause = loop.constraint_names[int(np.argmax(causes))]
+        margin = log.extra["predicted_margins"][row][int(np.argmax(causes))]
+        events.append((time_s, f"recovery triggered; expected violation: {cause}, {100 * margin:+.1f} cm"))
+    if log.has_fallen:
+        events.append((log.fall_time_s, "the robot fell"))
+    else:
+        events.append((float(log.time_s[-1]), "standing"))
+    for time_s, event in sorted(events):
+        table.add_row(f"{time_s:.2f}", event, gamma_at(time_s))
+    console.print(table)
+
+
+def _throws(scenario: Scenario, push: list[str]) -> list[Throw]:
+    from drake_safety.simulation.balls import Throw
+
+    keys = {"time": "time_s", "mass": "mass_kg", "speed": "speed_m_s", "direction": "direction_rad",
+            "offset": "offset_m", "height": "height_m"}
+    throws: list[Throw] = []
+    for text in push:
+        if text == "ball":
+            throws += scenario.parameters.push.throws
+            continue
+        values = {}
+        for pair in shlex.split(text):
+            key, _, value = pair.partition("=")
+            if key not in keys:
+                raise ValueError(
+                    f"--push '{text}': unknown '{key}'; give 'ball', or any of "
+                    f"{[f'{key}=NUMBER' for key in keys]}"
+                )
+            try:
+                values[keys[key]] = float(value)
+            except ValueError:
+                raise ValueError(f"--push '{text}': '{value}' is not a number") from None
+        if "direction_rad" in values:
+            values["direction_rad"] = float(np.radians(values["direction_rad"]))
+        throws.append(Throw(**values))
+    return throws
+
+
+@app.command()
+def evaluate(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    throws: Annotated[int, typer.Option(help="Fresh balls at the actual plant.", min=0)] = 600,
+    calibration_throws: Annotated[
+        int, typer.Option(help="Other balls, to choose the classifiers' thresholds.", min=1)
+    ] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
+    ] = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers."""
+    from drake_safety.evaluation.figures import (
+        embedding_figure,
+        roc_figure,
+        save,
+        throws_figure,
+    )
+    from drake_safety.evaluation.study import (
+        TriggerRule,
+        assessment_scorer,
+        baseline_scorers,
+        evaluate_episodes,
+        evaluate_throws,
+    )
+    from drake_safety.simulation.dataset import load_episodes
+    from drake_safety.simulation.rollouts import run_episodes
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    folder = out or assessment
+    sharpened, paper = (load_assessment(assessment, mode) for mode in _MODES)
+    train_set = load_episodes(assessment / "episodes")
+    if seed in (train_set.info.seed, train_set.info.seed + 1):
+        raise ValueError(f"evaluate: seed {seed} is the training episodes' own; choose another")
+    with _stages() as stages:
+        test_set = run_episodes(
+            loaded,
+            episodes,
+            seed=seed,
+            num_workers=workers,
+            progress=lambda done, total: stages("fresh nominal episodes", done, total),
+        )
+        _check_same_simulation(train_set.info, test_set.info)
+        scorers = [
+            assessment_scorer("sharpened", sharpened, is_normalized=True),
+            assessment_scorer("paper", paper, is_normalized=True),
+            *baseline_scorers(train_set, stages),
+        ]
+        figures, scores, labels = evaluate_episodes(scorers, train_set, test_set)
+        pictures = [
+            *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
+            *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
+            *save(roc_figure(labels, scores), folder / "roc"),
+        ]
+        if throws:
+            recovery = loaded.parameters.recovery
+            literal = assessment_scorer("literal", sharpened, is_normalized=False)
+            paper_literal = assessment_scorer("paper_literal", paper, is_normalized=False)
+            chosen = scorers[0] if recovery.is_normalized else literal
+            rules = [
+                TriggerRule(name="sharpened", scorer=chosen, threshold=recovery.threshold),
+                TriggerRule(name="sharpened_literal_0.6", scorer=literal, threshold=0.6),
+                TriggerRule(name="paper_literal_0.6", scorer=paper_literal, threshold=0.6),
+                *(TriggerRule(name=s.name, scorer=s) for s in scorers[2:]),
+            ]
+            study = evaluate_throws(
+                loaded,
+                rules,
+                num_throws=throws,
+                num_calibration=calibration_throws,
+                seed=seed + 1,
+                calibration_seed=seed + 2,
+                num_workers=workers,
+                progress=stages,
+            )
+            figures |= study.figures
+            figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
+            pictures += save(
+                throws_figure(study.logs, study.recovered["sharpened"]), folder / "throws"
+            )
+    report = {
+        "command": _command(),
+        "scenario": loaded.name,
+        "scenario_hash": test_set.info.scenario_hash,
+        "seed": seed,
+        "training_seed": train_set.info.seed,
+        "training_episodes": len(train_set),
+        "versions": _versions(),
+        **{key: figure.to_json() for key, figure in figures.items()},
+    }
+    file = folder / "evaluation.json"
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    _print_episodes(figures, [scorer.name for scorer in scorers])
+    if throws:
+        _print_throws(figures, [rule.name for rule in rules])
+    console.print("figures ", str(file))
+    for picture in pictures:
+        console.print("picture ", str(picture))
+
+
+def _check_same_simulation(trained: Any, fresh: Any) -> None:
+    if trained.scenario_hash != fresh.scenario_hash:
+        raise ValueError(
+            f"evaluate: the assessment's episodes were made by scenario '{trained.scenario}' with "
+            f"hash {trained.scenario_hash[:12]}, but '{fresh.scenario}' now has hash "
+            f"{fresh.scenario_hash[:12]}: train again"
+        )
+
+
+def _interval(figure: Any, scale: float = 1.0, digits: int = 3) -> str:
+    value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
+    return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
+
+
+def _print_episodes(figures: dict[str, Any], names: list[str]) -> None:
+    for kind, title in (("segments", "per segment"), ("episodes", "per episode, at k = 0")):
+        columns = ("auc", "safe_recall", "unsafe_recall", "brier")
+        table = Table("scorer", *columns, title=f"Fresh nominal episodes, {title}")
+        for name in names:
+            table.add_row(name, *(_interval(figures[f"{kind}.{name}.{key}"]) for key in columns))
+        console.print(table)
+
+
+def _print_throws(figures: dict[str, Any], names: list[str]) -> None:
+    alone = figures["throws.falls_without_recovery"]
+    table = Table(
+        "trigger", "Γ_thre", "falls [%]", "false triggers [%]", "falls missed", "after impact [ms]",
+        "before the fall [s]",
+        title=f"{alone.n} fresh throws at the actual plant; balancing alone falls in "
+        f"{_interval(alone, 100, 1)} %",
+    )
+    for name in names:
+        get: Callable[[str], Any] = lambda key, name=name: figures[f"throws.{name}.{key}"]
+        missed = get("falls_missed")
+        table.add_row(
+            name,
+            f"{get('threshold').value:.2f}",
+            _interval(get("falls_with_recovery"), 100, 1),
+            _interval(get("false_triggers"), 100, 1),
+            f"{round(missed.value * missed.n) if missed.n else 0} of {missed.n}",
+            f"{1000 * get('trigger_after_impact_s').value:.0f}",
+            f"{get('trigger_before_fall_s').value:.2f}",
+        )
+    console.print(table)
+
+
+def _command() -> str:
+    return shlex.join(["drake-safety", *sys.argv[1:]])
+
+
+def _versions() -> dict[str, str]:
+    import importlib.metadata
+
+    names = ("drake_safety", "drake", "numpy", "scipy", "scikit-learn", "torch")
+    return {name: importlib.metadata.version(name) for name in names}
+
+
+def main() -> None:
+    """Runs the command; what a user did wrong is one line, not a traceback."""
+    handler = RichHandler(console=console, show_path=False)
+    logging.getLogger("drake_safety").addHandler(handler)
+    try:
+        app(standalone_mode=True)
+    except ValueError as error:
+        console.print(f"[bold red]error[/] {error}", highlight=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped; finished episodes are kept", highlight=False)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""Pictures of a closed loop's plant: what a camera that follows the robot would have seen.
+
+They are rendered offscreen from the loop's own geometry, so whatever a task put into its plant is
+seen, and nothing is added to its diagram: the renderer lives in a Context of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    Rgba,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.sensors import CameraInfo
+
+from drake_safety.models import load_robot
+
+if TYPE_CHECKING:
+    from drake_safety.simulation.closed_loop import ClosedLoop
+
+_RENDERER = "stills"
+_BACKGROUND = [0.80, 0.84, 0.88]
+_FIELD_OF_VIEW_RAD = math.radians(34.0)
+_SUPERSAMPLING = 2
+_ROOM = 0.95  # How much more than the robot's own extent fits into a picture.
+
+
+class StillCamera:
+    """A camera that looks at a closed loop's robot from a fixed direction and follows its base.
+
+    Args:
+        loop: A closed loop that has its MultibodyPlant as ``plant``.
+        positions: Positions of the plant that decide the distance and the light, e.g. the first of
+            a log, (n_q,).
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
+        azimuth_rad: Where the camera stands, as an angle from the world's x axis [rad].
+        elevation_rad: How far above the robot it stands [rad].
+
+    Raises:
+        ValueError: The positions have another size, or are not finite.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        positions: np.ndarray,
+        *,
+        width: int = 720,
+        height: int = 540,
+        azimuth_rad: float = math.radians(-42.0),
+        elevation_rad: float = math.radians(15.0),
+    ):
+        plant = self._plant = loop.plant
+        robot = load_robot(loop.scenario.robot)
+        self._instance = plant.GetModelInstanceByName(robot.name)
+        self._base = plant.GetBodyByName(robot.base, self._instance)
+        self._context = loop.CreateDefaultContext()
+        self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
+        self._pose(positions)
+
+        centre, radius = self._extent()
+        base = self._base.EvalPoseInWorld(self._plant_context).translation()
+        # Only the base's motion over the ground is followed, so that a fall is seen as one.
+        self._look_at_height = centre[2]
+        self._offset = (centre - base)[:2]
+        direction = np.array(
+            [
+                math.cos(elevation_rad) * math.cos(azimuth_rad),
+                math.cos(elevation_rad) * math.sin(azimuth_rad),
+                math.sin(elevation_rad),
+            ]
+        )
+        narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
+        self._eye = _ROOM * radius / math.sin(narrow) * direction
+        core = RenderCameraCore(
+            _RENDERER,
+            CameraInfo(width * _SUPERSAMPLING, height * _SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
+            ClippingRange(0.05, 30.0 * max(radius, 1.0)),
+            RigidTransform(),
+        )
+        self._camera = ColorRenderCamera(core)
+        scene_graph = _scene_graph(loop)
+        scene_graph.AddRenderer(
+            scene_graph.GetMyMutableContextFromRoot(self._context),
+            _RENDERER,
+            MakeRenderEngineVtk(_lighting(centre, radius)),
+        )
+        self._world = scene_graph.world_frame_id()
+
+    def render(self, positions: np.ndarray) -> np.ndarray:
+        """A picture of the plant at given positions.
+
+        Args:
+            positions: All of the plant's positions, a ball's among them, (n_q,).
+
+        Returns:
+            RGB, (height, width, 3), uint8.
+
+        Raises:
+            ValueError: The positions have another size, or are not finite.
+        """
+        self._pose(positions)
+        base = self._base.EvalPoseInWorld(self._plant_context).translation()
+        target = np.append(base[:2] + self._offset, self._look_at_height)
+        query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
+        image = query.RenderColorImage(
+            self._camera, self._world, _look_at(target + self._eye, target)
+        )
+        pixels = np.asarray(image.data[..., :3], dtype=np.uint16)
+        rows, columns = pixels.shape[0] // _SUPERSAMPLING, pixels.shape[1] // _SUPERSAMPLING
+        blocks = pixels.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3)
+        return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    def _pose(self, positions: np.ndarray) -> None:
+        positions = np.asarray(positions, dtype=float)
+        num_positions = self._plant.num_positions()
+        if positions.shape != (num_positions,):
+            raise ValueError(
+                f"stills: positions have shape {positions.shape}, expected ({num_positions},): "
+                f"{self._plant.GetPositionNames()}"
+            )
+        if not np.isfinite(positions).all():
+            raise ValueError("stills: the positions are not finite")
+        self._plant.SetPositions(self._plant_context, positions)
+
+    def _extent(self) -> tuple[np.ndarray, float]:
+        """Centre of the robot's visible geometry in the world (3,) and its radius about it [m]."""
+        plant, context = self._plant, self._plant_context
+        query = plant.get_geometry_query_input_port().Eval(context)
+        inspector = query.inspector()
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
+        corners = []
+        for index in plant.GetBodyIndices(self._instance):
+            frame = plant.GetBodyFrameIdOrThrow(index)
+            for geometry in inspector.GetGeometries(frame, Role.kPerception):
+                box = inspector.GetObbInGeometryFrame(geometry)
+                X_WG = query.GetPoseInWorld(geometry)
+                if box is None:
+                    corners.append(X_WG.translation()[:, None])
+                else:
+                    X_WB = X_WG @ box.pose()
+                    corners.append(X_WB.multiply(signs * np.reshape(box.half_width(), (3, 1))))
+        if not corners:
+            raise ValueError("stills: the robot has no visible geometry")
+        points = np.hstack(corners)
+        centre = 0.5 * (points.min(axis=1) + points.max(axis=1))
+        return centre, float(np.linalg.norm(points - centre[:, None], axis=0).max())
+
+
+def render_stills(
+    loop: ClosedLoop,
+    time_s: np.ndarray,
+    positions: np.ndarray,
+    still_times_s: Sequence[float],
+    *,
+    width: int = 720,
+    height: int = 540,
+) -> list[tuple[float, np.ndarray]]:
+    """Pictures of a logged simulation at chosen instants.
+
+    Args:
+        loop: The closed loop that was simulated, or one with the same plant.
+        time_s: Instants of the log [s], (N,), increasing.
+        positions: All of the plant's positions at these instants, (N, n_q).
+        still_times_s: When to take pictures [s]; the nearest logged instant is shown.
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
+
+    Returns:
+        (time [s] of the logged instant, RGB image (height, width, 3)), one a still.
+
+    Raises:
+        ValueError: Times and positions are not as many, or a still is outside the log.
+    """
+    time_s, positions = np.asarray(time_s, dtype=float), np.asarray(positions, dtype=float)
+    if time_s.ndim != 1 or time_s.size == 0 or len(positions) != time_s.size:
+        raise ValueError(
+            f"render_stills: times have shape {time_s.shape} and positions {positions.shape}, "
+            "expected (N,) and (N, n_q)"
+        )
+    outside = [t for t in still_times_s if not time_s[0] - 1e-9 <= t <= time_s[-1] + 1e-9]
+    if outside:
+        raise ValueError(
+            f"render_stills: {outside} s are outside the log of {time_s[0]}..{time_s[-1]} s"
+        )
+    camera = StillCamera(loop, positions[0], width=width, height=height)
+    rows = [int(np.abs(time_s - instant).argmin()) for instant in still_times_s]
+    return [(float(time_s[row]), camera.render(positions[row])) for row in rows]
+
+
+def _scene_graph(loop: ClosedLoop) -> SceneGraph:
+    for system in loop.GetSystems():
+        if isinstance(system, SceneGraph):
+            return system
+    raise ValueError(
+        f"stills: task '{type(loop).__name__}' has no SceneGraph; its systems are "
+        f"{[system.get_name() for system in loop.GetSystems()]}"
+    )
+
+
+def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:
+    """Pose of a camera at C that looks at T, its picture upright."""
+    forward = (p_WT - p_WC) / np.linalg.norm(p_WT - p_WC)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    R_WC = RotationMatrix(np.column_stack([right, np.cross(forward, right), forward]))
+    return RigidTransform(R_WC, p_WC)
+
+
+def _lighting(centre: np.ndarray, radius: float) -> RenderEngineVtkParams:
+    """One lamp that casts shadows and soft fill from all sides, in proportion to the robot."""
+
+    def lamp(x: float, y: float, z: float, intensity: float, kind: str = "point") -> LightParameter:
+        offset = np.array([x, y, z]) * radius
+        return LightParameter(
+            type=kind,
+            frame="world",
+            position=np.append(centre[:2], 0.0) + offset,
+            direction=-offset / np.linalg.norm(offset),
+            intensity=intensity,
+            cone_angle=55.0,
+            color=Rgba(1.0, 0.99, 0.97, 1.0),
+        )
+
+    return RenderEngineVtkParams(
+        default_clear_color=_BACKGROUND,
+        cast_shadows=True,
+        shadow_map_size=2048,
+        lights=[
+            lamp(2.0, -2.6, 6.8, 0.55, "spot"),
+            lamp(6.0, -8.0, 3.2, 0.42),
+            lamp(-6.0, 8.0, 3.2, 0.42),
+            lamp(6.0, 8.0, 5.0, 0.22),
+            lamp(-6.0, -8.0, 3.0, 0.22),
+            lamp(0.0, 0.0, 12.0, 0.12),
+        ],
+    )

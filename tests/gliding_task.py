@@ -1,0 +1,117 @@
+"""A task of one's own, outside the package: a mass that glides, with failures to order."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+
+from drake_safety.simulation.closed_loop import ClosedLoop, check_assessment
+
+CONTROL_PERIOD_S = 0.01
+
+
+@dataclass(kw_only=True)
+class GlidingParameters:
+    """What a gliding scenario may say."""
+
+    speed_m_s: float = 2.0
+    """Largest speed at the start."""
+    failure: str = ""
+    """How the simulation fails beyond x = 0.5: "raise", "nan", "inf" or not at all."""
+    fails_at_start: bool = False
+    """Whether it fails before the first row already."""
+
+    def __post_init__(self) -> None:
+        if self.failure not in ("", "raise", "nan", "inf"):
+            raise ValueError(f"gliding: unknown failure '{self.failure}'")
+
+
+class Mass(LeafSystem):
+    """x, v of a mass without forces."""
+
+    def __init__(self, parameters, horizon):
+        super().__init__()
+        self.parameters = parameters
+        self.DeclareDiscreteState(2)
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(CONTROL_PERIOD_S, 0.0, self._update)
+        position = self._position
+        ports = {
+            "state": (2, lambda context: context.get_discrete_state_vector().get_value()),
+            "true_state": (2, lambda context: context.get_discrete_state_vector().get_value()),
+            "output": (3, lambda context: [position(context), 0.0, 0.0]),
+            "desired_output": (3, lambda context: [0.0, 0.0, 0.0]),
+            "desired_preview": (3 * horizon, lambda context: np.zeros(3 * horizon)),
+            "features": (1, lambda context: [1.0 - position(context)]),
+            "margins": (2, self._margins),
+            "safe": (1, lambda context: [float(min(self._margins(context)) >= 0)]),
+        }
+        for name, (size, calc) in ports.items():
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(size),
+                lambda context, output, calc=calc: output.SetFromVector(calc(context)),
+            )
+
+    def _position(self, context):
+        return context.get_discrete_state_vector()[0]
+
+    def _margins(self, context):
+        return [1.0 - self._position(context), self._position(context) + 1.0]
+
+    def _start(self, context, discrete_state):
+        if self.parameters.fails_at_start:
+            raise RuntimeError("no start")
+
+    def _update(self, context, discrete_state):
+        x, v = context.get_discrete_state_vector().get_value()
+        x += CONTROL_PERIOD_S * v
+        if x > 0.5:
+            if self.parameters.failure == "raise":
+                raise RuntimeError("the solver failed")
+            if self.parameters.failure:
+                x = float(self.parameters.failure)
+        discrete_state.set_value([x, v])
+
+
+class Gliding(ClosedLoop):
+    """The whole task."""
+
+    Parameters = GlidingParameters
+
+    def __init__(self, scenario, variation="nominal", *, assessment=None, meshcat=None):
+        super().__init__(scenario, variation, assessment)
+        self.state_names = ["x", "v"]
+        self.output_names = ["x", "y", "z"]
+        self.feature_names = ["distance"]
+        self.constraint_names = ["right", "left"]
+        if assessment is not None:
+            check_assessment(
+                assessment,
+                scenario=scenario,
+                state_names=self.state_names,
+                output_names=self.output_names,
+                feature_names=self.feature_names,
+                constraint_names=self.constraint_names,
+            )
+        builder = DiagramBuilder()
+        self.mass = builder.AddSystem(Mass(scenario.parameters, scenario.assessment.horizon))
+        for i in range(self.mass.num_output_ports()):
+            port = self.mass.get_output_port(i)
+            builder.ExportOutput(port, port.get_name())
+        self.finish(builder)
+
+    def reset(self, context, rng):
+        x, v = rng.uniform(-0.3, 0.3), rng.uniform(-1, 1) * self.scenario.parameters.speed_m_s
+        mass_context = self.mass.GetMyMutableContextFromRoot(context)
+        mass_context.SetDiscreteState([x, v])
+        return int(rng.integers(2))
+
+
+SCENARIO = """
+task: gliding_task:Gliding
+robot: none
+episode_duration_s: 0.8
+step_s: 0.04
+variations: {nominal: {}, actual: {mass_scale: 1.2}}
+"""

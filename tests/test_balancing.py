@@ -1,0 +1,415 @@
+"""Balancing: any legged robot stands, sees what its variation says, and steps when it must."""
+
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.geometry import Role
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import load_scenario, run_episode
+from drake_safety.control.observation import stance_state
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.closed_loop import REQUIRED_PORTS
+from drake_safety.simulation.rollouts import Recorder
+from drake_safety.simulation.scenario import parse_scenario
+from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
+
+PACKAGED = "laikago"
+
+
+@functools.cache
+def scenario_of(robot, **changes):
+    """A scenario in which the robot starts standing and shall go on standing."""
+    height = robot_kinematics(robot).standing_height
+    path = Path(robot_model(robot).source_dir) / "robot.yaml"
+    start = {
+        "foot_offset_m": 0.0,
+        "base_offset_m": [0.0, 0.0],
+        "base_height_m": [height, height],
+        "tilt_rad": 0.0,
+        "velocity_std_m_s": [0.0, 0.0, 0.0],
+        "angular_velocity_std_rad_s": 0.0,
+        "joint_std_rad": 0.0,
+        "target_offset_m": [0.0, 0.0],
+        "target_height_m": [height, height],
+    }
+    safe_set = {"height_m": [0.7 * height, 1.3 * height], "fall_height_m": 0.4 * height}
+    text = {
+        "task": "drake_safety.diagrams.balancing:Balancing",
+        "robot": robot if robot == PACKAGED else str(path),
+        "variations": {
+            "nominal": {},
+            "light": {"mass_scale": 0.8},
+            "slippery": {"foot_friction": 0.123},
+            "rough": {"joint_friction_nm": 1.5},
+            "noisy": {"observation_noise": {"position": 0.004, "velocity": 0.016}},
+            "blurred": {"input_noise": {"position": 0.004, "velocity": 0.016}},
+        },
+        "parameters": {"start": start, "safe_set": safe_set, "push": {"share": 0.0}},
+    }
+    return parse_scenario(yaml.safe_dump(text), name=f"{robot}_standing", folder=Path("/"))
+
+
+@functools.cache
+def standing_loop(robot=PACKAGED, variation="nominal", **options):
+    return scenario_of(robot).make_loop(variation, **options)
+
+
+@functools.cache
+def episode_of(robot=PACKAGED, variation="nominal"):
+    return run_episode(standing_loop(robot, variation))
+
+
+def started(loop, seed=0):
+    """A simulator at the start of an episode, and its context."""
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, np.random.default_rng(seed))
+    simulator.Initialize()
+    return simulator, context
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_any_robot_with_feet_stands_for_two_seconds_within_five_millimetres(name):
+    episode = episode_of(name)
+    assert episode.is_safe
+    assert episode.time_s[-1] == pytest.approx(2.0)
+    error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
+    assert error.max() < 0.005
+
+
+def test_the_packaged_robot_stands_on_the_actual_plant_too():
+    scenario = load_scenario("laikago_balancing")
+    standing = scenario_of(PACKAGED)
+    scenario.parameters = standing.parameters
+    episode = run_episode(scenario.make_loop("actual"))
+    assert episode.is_safe
+    true_height = episode.true_state[:, 2]
+    assert np.abs(true_height - robot_kinematics(PACKAGED).standing_height).max() < 0.01
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_contract_is_kept_port_by_port(name):
+    loop = standing_loop(name)
+    horizon = loop.scenario.assessment.horizon
+    sizes = {
+        "state": len(loop.state_names),
+        "true_state": len(loop.state_names),
+        "output": len(loop.output_names),
+        "desired_output": len(loop.output_names),
+        "desired_preview": horizon * len(loop.output_names),
+        "features": len(loop.feature_names),
+        "margins": len(loop.constraint_names),
+        "safe": 1,
+    }
+    assert set(sizes) == set(REQUIRED_PORTS)
+    assert {port: loop.GetOutputPort(port).size() for port in sizes} == sizes
+    assert loop.fall_name in loop.constraint_names
+
+
+def test_without_an_assessment_or_recovery_nothing_is_promised_of_them():
+    loop = standing_loop()
+    assert not loop.HasOutputPort("recovery_active")
+    assert not loop.HasOutputPort("safety_probability")
+    assert loop.num_input_ports() == 0
+
+
+def test_a_robot_without_gains_is_refused(tmp_path):
+    folder = Path(robot_model("hexapod").source_dir)
+    (tmp_path / "hexapod.urdf").write_text((folder / "hexapod.urdf").read_text())
+    text = yaml.safe_load((folder / "robot.yaml").read_text())
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(text | {"joint_gains": {}}))
+    scenario = parse_scenario(
+        "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
+        "variations: {nominal: {}}",
+        name="weak",
+        folder=tmp_path,
+    )
+    with pytest.raises(ValueError, match="stiffness must be 18 positive numbers"):
+        scenario.make_loop()
+
+
+@pytest.mark.parametrize(("variation", "scale"), [("nominal", 1.0), ("light", 0.8)])
+def test_the_variations_mass_is_the_plants(variation, scale):
+    loop = standing_loop(variation=variation)
+    _, context = started(loop)
+    mass = loop.plant.CalcTotalMass(loop.plant.GetMyContextFromRoot(context), [loop.robot_instance])
+    assert mass == pytest.approx(scale * 25.433, abs=0.001)
+
+
+def test_the_controller_believes_in_the_nominal_mass_whatever_the_plants_is():
+    scenario = load_scenario("laikago_balancing")
+    actual, nominal = scenario.make_loop("actual"), scenario.make_loop("nominal")
+    assert actual.kinematics.total_mass == nominal.kinematics.total_mass
+    assert actual.kinematics.total_mass == pytest.approx(0.8 * 25.433, abs=0.001)
+
+
+def test_feet_and_ground_take_the_variations_friction():
+    loop = standing_loop(variation="slippery")
+    inspector = loop.GetSubsystemByName("scene_graph").model_inspector()
+    found = []
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        properties = inspector.GetProximityProperties(geometry)
+        friction = properties.GetProperty("material", "coulomb_friction").static_friction()
+        if friction == 0.123:
+            found.append(inspector.GetName(geometry))
+    assert len(found) == len(loop.robot.feet) + 1
+    assert any("ground" in name for name in found)
+
+
+@functools.cache
+def joint_motion(variation):
+    """Largest joint motion in the tenth of a second after a small shift of the set points."""
+    loop = standing_loop(variation=variation)
+    simulator, context = started(loop)
+    simulator.AdvanceTo(0.3)
+    plant_context = loop.plant.GetMyContextFromRoot(context)
+    before = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:].copy()
+    controller = loop.GetSubsystemByName("inverse_kinematics_controller")
+    feet = np.column_stack([loop.kinematics.nominal_contacts, loop.kinematics.foot_radii])
+    # Half a millimetre at the feet asks the servos for some 1.1 N·m.
+    controller.set_foot_positions(
+        controller.GetMyMutableContextFromRoot(context), feet - [0.0, 0.0, 0.0005]
+    )
+    simulator.AdvanceTo(0.4)
+    after = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:]
+    return np.abs(after - before).max()
+
+
+def test_dry_friction_holds_the_joints_against_small_commands():
+    assert joint_motion("rough") < 0.5 * joint_motion("nominal")
+
+
+def test_dry_friction_is_no_part_of_the_nominal_plant():
+    smooth, rough = standing_loop(), standing_loop(variation="rough")
+    count = smooth.plant.num_actuators(smooth.robot_instance)
+    assert rough.plant.num_actuators(rough.robot_instance) == 2 * count
+
+
+def test_every_servo_follows_its_own_joint():
+    """The set points of one joint move that joint and no other."""
+    for variation in ("nominal", "rough"):
+        loop = standing_loop("biped", variation)
+        simulator, context = started(loop)
+        simulator.AdvanceTo(0.5)
+        plant_context = loop.plant.GetMyContextFromRoot(context)
+        q = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:]
+        np.testing.assert_allclose(q, loop.kinematics.posture, atol=0.02)
+
+
+def test_noise_stands_only_where_it_was_configured():
+    quiet, noisy, blurred = (episode_of(variation=v) for v in ("nominal", "noisy", "blurred"))
+    np.testing.assert_array_equal(quiet.state, quiet.true_state)
+    # Noise on the assessor's input alone: the motion is the quiet one's, to the bit.
+    np.testing.assert_array_equal(blurred.true_state, quiet.true_state)
+    np.testing.assert_array_equal(blurred.output, quiet.output)
+    assert not np.array_equal(blurred.state, blurred.true_state)
+    # Noise on what is measured: output and state both show it.
+    assert np.abs(noisy.output[:, 2] - noisy.true_state[:, 2]).max() > 0.004
+
+
+@pytest.mark.parametrize("variation", ["noisy", "blurred"])
+def test_noise_has_its_standard_deviation(variation):
+    episode = episode_of(variation=variation)
+    error = episode.state - episode.true_state
+    n_j = robot_kinematics(PACKAGED).num_joints
+    assert np.std(error[:, 12 : 12 + n_j]) == pytest.approx(0.004, rel=0.15)
+    assert np.std(error[:, 12 + n_j :]) == pytest.approx(0.016, rel=0.15)
+
+
+def test_every_episode_has_noise_of_its_own():
+    errors = []
+    for index in (0, 1):
+        episode = run_episode(standing_loop(variation="blurred"), index)
+        errors.append((episode.state - episode.true_state)[:, 12:].ravel())
+    assert abs(np.corrcoef(errors)[0, 1]) < 0.1
+
+
+def test_the_state_is_that_of_the_plant():
+    loop = standing_loop()
+    simulator, context = started(loop)
+    simulator.AdvanceTo(0.2)
+    x = loop.GetOutputPort("plant_state").Eval(context)
+    n_q = loop.kinematics.num_positions
+    expected = stance_state(loop.kinematics, x[:n_q], x[n_q:])
+    np.testing.assert_array_equal(loop.GetOutputPort("true_state").Eval(context), expected)
+    np.testing.assert_array_equal(loop.GetOutputPort("output").Eval(context), x[4:7])
+
+
+@functools.cache
+def packaged_loop(variation="nominal", **options):
+    return load_scenario("laikago_balancing").make_loop(variation, **options)
+
+
+PORTS = ("state", "true_state", "desired_output", "features", "margins")
+
+
+@pytest.mark.parametrize("variation", ["nominal", "actual"])
+def test_a_reset_is_the_same_for_the_same_generator(variation):
+    rows = []
+    for _ in range(2):
+        simulator, context = started(packaged_loop(variation), seed=3)
+        recorder = Recorder(packaged_loop(variation), PORTS)
+        for time in (0.0, 0.05, 0.1):
+            simulator.AdvanceTo(time)
+            recorder.record(context)
+        rows.append(recorder.arrays())
+    for name in PORTS:
+        np.testing.assert_array_equal(rows[0][name], rows[1][name])
+    _, context = started(packaged_loop(variation), seed=4)
+    other = packaged_loop(variation).GetOutputPort("true_state").Eval(context)
+    assert not np.allclose(other, rows[0]["true_state"][0])
+
+
+def test_starts_are_inside_the_ranges_that_the_scenario_gives():
+    loop = packaged_loop()
+    sampling = loop.scenario.parameters.start
+    names = loop.state_names
+    first_steps = set()
+    for seed in range(60):
+        context = loop.CreateDefaultContext()
+        first_steps.add(loop.reset(context, np.random.default_rng(seed)))
+        state = loop.GetOutputPort("true_state").Eval(context)
+        lowest, highest = loop.kinematics.position_limits.T
+        joints = state[12 : 12 + loop.kinematics.num_joints]
+        assert np.all((joints >= lowest) & (joints <= highest))
+        height = state[names.index("base_z")]
+        assert sampling.base_height_m[0] <= height <= sampling.base_height_m[1]
+        assert np.abs(state[3:5]).max() < 2 * sampling.tilt_rad
+    assert first_steps == {0, 1}
+
+
+def test_feet_are_at_rest_in_a_moving_start():
+    """0 = J v: what the base does, the legs allow for."""
+    scenario = scenario_of(PACKAGED)
+    text = yaml.safe_load(scenario.to_yaml().split("---")[0])
+    body = yaml.safe_load(scenario.to_yaml().split("---")[1])
+    body["start"] |= {"velocity_std_m_s": [0.5, 0.3, 0.1], "angular_velocity_std_rad_s": 0.4}
+    loop = parse_scenario(
+        yaml.safe_dump(text | {"parameters": body}), name="moving", folder=Path("/")
+    ).make_loop()
+    kinematics = loop.kinematics
+    for seed in range(5):
+        context = loop.CreateDefaultContext()
+        loop.reset(context, np.random.default_rng(seed))
+        x = loop.GetOutputPort("plant_state").Eval(context)
+        q, v = np.split(x, [kinematics.num_positions])
+        assert np.abs(v[:6]).max() > 0.05
+        np.testing.assert_allclose(kinematics.contact_jacobian(q) @ v, 0.0, atol=1e-6)
+        assert np.abs(kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii).max() < 1e-3
+
+
+def momenta(loop, context):
+    """Momentum of the robot and of the ball [kg m/s]."""
+    plant, plant_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
+    (ball,) = {
+        plant.get_body(i).model_instance()
+        for i in plant.GetFloatingBaseBodies()
+        if plant.get_body(i).model_instance() != loop.robot_instance
+    }
+    return [
+        plant.CalcTotalMass(plant_context, [instance])
+        * plant.CalcCenterOfMassTranslationalVelocityInWorld(plant_context, [instance])
+        for instance in (loop.robot_instance, ball)
+    ]
+
+
+@pytest.mark.parametrize("direction", [0.0, math.pi / 2, -2.0])
+def test_a_thrown_ball_hits_at_the_promised_time(direction):
+    loop = standing_loop(variation="nominal", ball=True)
+    simulator, context = started(loop)
+    simulator.AdvanceTo(0.2)
+    throw = Throw(mass_kg=3.0, speed_m_s=6.0, direction_rad=direction, time_s=0.3)
+    touch_s = loop.throw_ball(context, throw, 0.1)
+    assert touch_s == pytest.approx(0.3)
+    along = np.array([math.cos(direction), math.sin(direction), 0.0])
+    step_s = loop.scenario.time_step_s
+    simulator.AdvanceTo(touch_s - 2 * step_s)
+    robot, ball = momenta(loop, context)
+    assert ball @ along == pytest.approx(18.0, abs=0.1)
+    assert abs(robot @ along) < 0.5
+    simulator.AdvanceTo(touch_s + 4 * step_s)
+    robot, ball = momenta(loop, context)
+    assert ball @ along < 0.6 * 18.0
+    assert robot @ along > 0.3 * 18.0
+
+
+def test_a_loop_without_a_ball_says_how_to_get_one():
+    loop = standing_loop()
+    with pytest.raises(ValueError, match="without a ball; pass ball=True"):
+        loop.throw_ball(loop.CreateDefaultContext(), Throw(), 0.1)
+
+
+def test_a_ball_that_waits_far_away_changes_nothing():
+    alone = episode_of()
+    with_ball = run_episode(standing_loop(variation="nominal", ball=True))
+    np.testing.assert_allclose(with_ball.true_state, alone.true_state, atol=1e-6)
+
+
+@functools.cache
+def recovery_log(name, threshold_falls_at_s=0.2, duration_s=1.8):
+    """Heights of the feet, and who was in charge, around a recovery of a standing robot."""
+    loop = standing_loop(name, recovery=True)
+    probability = loop.GetInputPort("safety_probability")
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, np.random.default_rng(0))
+    probability.FixValue(context, [1.0])
+    simulator.Initialize()
+    rows = []
+    for step in range(round(duration_s / 0.01) + 1):
+        time = 0.01 * step
+        simulator.AdvanceTo(time)
+        is_low = abs(time - threshold_falls_at_s) < 0.011
+        probability.FixValue(context, [0.0 if is_low else 1.0])
+        x = loop.GetOutputPort("plant_state").Eval(context)
+        p_WC = loop.kinematics.contact_positions(x[: loop.kinematics.num_positions])
+        active = loop.GetOutputPort("recovery_active").Eval(context)[0]
+        margins = loop.GetOutputPort("margins").Eval(context)
+        rows.append((time, active, p_WC[:, 2] - loop.kinematics.foot_radii, margins))
+    return loop, [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def test_a_low_probability_makes_the_robot_step_and_hand_over_again():
+    _, (time, active, clearance, margins) = recovery_log(PACKAGED)
+    assert not active[time < 0.2].any()
+    start, end = time[active > 0][[0, -1]]
+    assert start <= 0.2 + 0.021
+    assert end < time[-1]
+    assert np.all(active[(time >= start) & (time <= end)] > 0)
+    assert clearance[time < 0.2].max() < 0.005
+    assert np.all(clearance[active > 0].max(axis=0) > 0.01)  # Every foot swung.
+    assert margins[-1].min() > 0
+    assert clearance[-1].max() < 0.005
+
+
+@pytest.mark.slow
+def test_recovery_saves_a_robot_that_would_have_fallen():
+    throw = Throw(mass_kg=4.0, speed_m_s=8.0, direction_rad=math.pi / 2, time_s=0.3)
+    lowest = {}
+    for recovery in (False, True):
+        loop = packaged_loop("actual", ball=True, recovery=recovery)
+        simulator = Simulator(loop)
+        context = simulator.get_mutable_context()
+        loop.reset_calm(context, np.random.default_rng(0))
+        if recovery:
+            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
+        simulator.AdvanceTo(0.2)
+        loop.throw_ball(context, throw, 0.1)
+        simulator.AdvanceTo(0.32)
+        if recovery:
+            loop.GetInputPort("safety_probability").FixValue(context, [0.0])
+            simulator.AdvanceTo(0.34)
+            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
+        fall = loop.constraint_names.index(loop.fall_name)
+        margins = []
+        for time in np.arange(0.35, 3.0, 0.05):
+            simulator.AdvanceTo(time)
+            margins.append(loop.GetOutputPort("margins").Eval(context)[fall])
+        lowest[recovery] = min(margins)
+    assert lowest[False] < 0
+    assert lowest[True] > 0

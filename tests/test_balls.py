@@ -1,0 +1,170 @@
+"""Balls fly as free bodies and touch the robot when and where they were thrown to."""
+
+import math
+
+import numpy as np
+import pytest
+from pydrake.geometry import HalfSpace
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_safety.control.robot import add_robot
+from drake_safety.simulation.balls import Ball, Throw, add_ball
+from legged_robots import robot_model
+
+TIME_STEP_S = 0.0005
+
+
+class Bench:
+    """A robot that floats in its posture while a ball is thrown at it."""
+
+    def __init__(self, name="laikago", height=0.5):
+        builder = DiagramBuilder()
+        self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, TIME_STEP_S)
+        robot = robot_model(name)
+        self.robot = add_robot(self.plant, robot, scene_graph=scene_graph)
+        self.instance = add_ball(self.plant)
+        self.plant.RegisterCollisionGeometry(
+            self.plant.world_body(), RigidTransform(), HalfSpace(), "floor", CoulombFriction(1, 1)
+        )
+        # The robot hangs: without gravity it stays where it is until the ball comes.
+        self.plant.set_gravity_enabled(self.robot, False)
+        self.plant.Finalize()
+        self.ball = Ball(self.plant, scene_graph, self.instance, robot.base)
+        self.diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        self.root = self.simulator.get_mutable_context()
+        self.context = self.plant.GetMyMutableContextFromRoot(self.root)
+        base = self.plant.GetBodyByName(robot.base)
+        self.plant.SetFreeBodyPose(self.context, base, RigidTransform([0.3, -0.2, height]))
+        port = self.plant.get_desired_state_input_port(self.robot)
+        indices = self.plant.GetJointActuatorIndices(self.robot)
+        joints = [self.plant.get_joint_actuator(i).joint() for i in indices]
+        q = [joint.GetOnePosition(self.context) for joint in joints]
+        port.FixValue(self.context, np.concatenate([q, np.zeros(len(q))]))
+
+    def velocity(self):
+        return self.plant.GetVelocities(self.context, self.instance)[3:]
+
+    def position(self):
+        return self.plant.GetPositions(self.context, self.instance)[4:]
+
+    def ball_mass(self):
+        return self.plant.CalcTotalMass(self.context, [self.instance])
+
+    def robot_momentum(self):
+        return self.plant.CalcTotalMass(
+            self.context, [self.robot]
+        ) * self.plant.CalcCenterOfMassTranslationalVelocityInWorld(self.context, [self.robot])
+
+
+DIRECTIONS = [0.0, math.pi / 2, math.pi, -math.pi / 3]
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("name", ["laikago", "hexapod"])
+def test_the_ball_touches_at_the_promised_time_and_not_before(name, direction):
+    bench = Bench(name)
+    throw = Throw(mass_kg=2.0, speed_m_s=6.0, direction_rad=direction)
+    bench.ball.throw(bench.context, throw, 0.1)
+    bench.simulator.AdvanceTo(0.1 - 3 * TIME_STEP_S)
+    assert np.linalg.norm(bench.robot_momentum()) < 1e-6
+    bench.simulator.AdvanceTo(0.1 + 6 * TIME_STEP_S)
+    along = bench.robot_momentum() @ [math.cos(direction), math.sin(direction), 0.0]
+    assert along > 0.1 * throw.mass_kg * throw.speed_m_s
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_what_the_ball_loses_the_robot_gains(direction):
+    bench = Bench()
+    throw = Throw(mass_kg=3.0, speed_m_s=5.0, direction_rad=direction)
+    bench.ball.throw(bench.context, throw, 0.05)
+    bench.simulator.AdvanceTo(0.045)
+    before = throw.mass_kg * bench.velocity() + bench.robot_momentum()
+    bench.simulator.AdvanceTo(0.08)
+    after = throw.mass_kg * bench.velocity() + bench.robot_momentum()
+    # Horizontally nothing else acts: the robot hangs in the air.
+    np.testing.assert_allclose(after[:2], before[:2], atol=0.02 * 15)
+    assert np.linalg.norm(bench.robot_momentum()[:2]) > 0.3 * 15
+
+
+def test_the_ball_arrives_horizontally_at_its_speed():
+    bench = Bench()
+    throw = Throw(speed_m_s=7.0, direction_rad=0.5)
+    bench.ball.throw(bench.context, throw, 0.15)
+    bench.simulator.AdvanceTo(0.15 - 2 * TIME_STEP_S)
+    expected = 7.0 * np.array([math.cos(0.5), math.sin(0.5), 0.0])
+    np.testing.assert_allclose(bench.velocity(), expected, atol=0.03)
+
+
+def test_a_ball_thrown_without_a_flight_touches_now():
+    bench = Bench()
+    bench.ball.throw(bench.context, Throw(speed_m_s=6.0), 0.0)
+    np.testing.assert_allclose(bench.velocity(), [0.0, 6.0, 0.0], atol=1e-12)
+    bench.simulator.AdvanceTo(5 * TIME_STEP_S)
+    assert bench.robot_momentum()[1] > 1.0
+
+
+def test_the_ball_has_the_mass_it_was_thrown_with():
+    bench = Bench()
+    for mass in (4.0, 2.5):
+        bench.ball.throw(bench.context, Throw(mass_kg=mass), 0.0)
+        assert bench.ball_mass() == pytest.approx(mass)
+
+
+def test_height_and_offset_move_the_line_of_flight():
+    bench = Bench()
+    plain, shifted = (
+        Throw(direction_rad=0.0),
+        Throw(direction_rad=0.0, height_m=0.02, offset_m=0.03),
+    )
+    positions = []
+    for throw in (plain, shifted):
+        bench.ball.throw(bench.context, throw, 0.0)
+        positions.append(bench.position())
+    np.testing.assert_allclose((positions[1] - positions[0])[1:], [0.03, 0.02], atol=1e-12)
+
+
+def test_a_parked_ball_lies_still_on_the_ground_far_away():
+    bench = Bench()
+    bench.ball.throw(bench.context, Throw(), 0.1)
+    bench.ball.park(bench.context)
+    before = bench.position()
+    assert np.linalg.norm(before[:2]) > 10
+    assert before[2] == pytest.approx(bench.ball.radius_m)
+    bench.simulator.AdvanceTo(0.2)
+    np.testing.assert_allclose(bench.position(), before, atol=1e-3)
+    assert np.linalg.norm(bench.robot_momentum()) < 1e-6
+
+
+def test_a_line_that_misses_the_robot_is_refused_and_the_ball_parked():
+    bench = Bench()
+    with pytest.raises(ValueError, match=r"line of flight of Throw\(.*height_m=3.0.* misses"):
+        bench.ball.throw(bench.context, Throw(height_m=3.0), 0.1)
+    assert np.linalg.norm(bench.position()[:2]) > 10
+
+
+def test_a_flight_that_would_begin_underground_is_refused_with_the_longest_possible():
+    bench = Bench(height=0.45)
+    message = r"can fly for at most 0\.\d+ s; got lead_s = 0.5"
+    with pytest.raises(ValueError, match=message) as error:
+        bench.ball.throw(bench.context, Throw(), 0.5)
+    longest_s = float(str(error.value).split("at most ")[1].split(" s;")[0])
+    bench.ball.throw(bench.context, Throw(), longest_s - 0.001)
+    assert bench.position()[2] >= bench.ball.radius_m
+
+
+@pytest.mark.parametrize("lead_s", [-0.1, math.nan])
+def test_a_ball_cannot_be_thrown_into_the_past(lead_s):
+    bench = Bench()
+    with pytest.raises(ValueError, match="lead_s must not be negative"):
+        bench.ball.throw(bench.context, Throw(), lead_s)
+
+
+@pytest.mark.parametrize("change", [{"mass_kg": 0.0}, {"speed_m_s": -1.0}, {"mass_kg": math.nan}])
+def test_a_ball_without_mass_or_speed_is_refused(change):
+    (name,) = change
+    with pytest.raises(ValueError, match=f"throw: {name} must be positive"):
+        Throw(**change)

@@ -1,0 +1,257 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from lip_episodes import make_episodes
+
+from drake_safety.evaluation.metrics import (
+    Figure,
+    area_under_curve,
+    auc,
+    auc_difference,
+    episode_figures,
+    median,
+    proportion,
+    segment_figures,
+    threshold_at,
+)
+from drake_safety.learning.segments import split
+
+
+@pytest.fixture(scope="module")
+def segments():
+    return split(make_episodes(80, seed=1), stride=1, discount=0.99)
+
+
+def blurred_truth(segments, seed=0):
+    noise = np.random.default_rng(seed).normal(size=len(segments))
+    return 1.0 / (1.0 + np.exp(-(2.0 * segments.is_unsafe - 1.0 + noise)))
+
+
+def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
+    # 8 of 10 in any table of exact binomial limits.
+    figure = proportion(8, 10)
+    assert (figure.value, figure.n) == (0.8, 10)
+    assert figure.low == pytest.approx(0.4439, abs=1e-4)
+    assert figure.high == pytest.approx(0.9748, abs=1e-4)
+
+
+def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_five_percent():
+    # One-sided 95 % is the lower end of a two-sided 90 % interval: 0.05 ** (1 / 59).
+    assert proportion(59, 59, confidence=0.9).low == pytest.approx(0.05 ** (1 / 59))
+    assert proportion(59, 59).high == 1.0
+    assert proportion(0, 59).low == 0.0
+
+
+def test_nothing_observed_bounds_nothing():
+    figure = proportion(0, 0)
+    assert math.isnan(figure.value)
+    assert (figure.low, figure.high, figure.n) == (0.0, 1.0, 0)
+
+
+@pytest.mark.parametrize(("count", "n"), [(-1, 3), (4, 3)])
+def test_a_count_outside_its_total_is_refused(count, n):
+    with pytest.raises(ValueError, match=rf"count is {count}, expected 0\.\.{n}"):
+        proportion(count, n)
+
+
+def test_a_figure_is_valid_json_even_where_it_is_unknown():
+    text = json.dumps(Figure(math.nan, 0.0, math.inf, np.int64(3)).to_json(), allow_nan=False)
+    assert json.loads(text) == {"value": None, "low": 0.0, "high": None, "n": 3}
+
+
+def test_the_median_lies_in_its_interval_and_more_values_narrow_it():
+    rng = np.random.default_rng(0)
+    few, many = median(rng.normal(size=30)), median(rng.normal(size=3000))
+    for figure in (few, many):
+        assert figure.low <= figure.value <= figure.high
+        assert figure.low < 0.0 < figure.high
+    assert many.high - many.low < 0.3 * (few.high - few.low)
+
+
+def test_the_median_takes_part_of_what_never_happens():
+    assert median(np.array([1.0, 2.0, math.inf])).value == 2.0
+    assert median(np.array([1.0, math.inf, math.inf])).value == math.inf
+    with pytest.raises(ValueError, match="1 of 2 values are NaN"):
+        median(np.array([1.0, math.nan]))
+
+
+def test_the_median_of_an_even_number_is_the_mean_of_the_middle_two():
+    assert median(np.array([4.0, 1.0, 2.0, 9.0])).value == 3.0
+
+
+def test_the_area_is_the_share_of_pairs_in_the_right_order_and_a_tie_counts_half():
+    score = np.array([0.1, 0.4, 0.4, 0.9])
+    label = np.array([False, True, False, True])
+    # Pairs (unsafe, safe): .4>.1, .4=.4, .9>.1, .9>.4.
+    assert area_under_curve(score, label) == 3.5 / 4
+    assert area_under_curve(-score, label) == 0.5 / 4
+
+
+def test_the_area_agrees_with_scikit_learn_with_weights_and_ties():
+    from sklearn.metrics import roc_auc_score
+
+    rng = np.random.default_rng(0)
+    score = rng.integers(0, 9, 300).astype(float)
+    label, weight = rng.random(300) < 0.3, rng.integers(0, 4, 300)
+    expected = roc_auc_score(label, score, sample_weight=weight)
+    assert area_under_curve(score, label, weight) == pytest.approx(expected)
+
+
+def test_the_area_does_not_change_with_a_monotone_scale():
+    rng = np.random.default_rng(1)
+    score, label = rng.normal(size=200), rng.random(200) < 0.5
+    assert area_under_curve(np.exp(3 * score), label) == area_under_curve(score, label)
+
+
+def test_a_score_that_is_nan_counts_as_the_most_unsafe():
+    label = np.array([False, True, True, False])
+    known = np.array([0.1, 0.2, 5.0, 0.3])
+    unknown = np.array([0.1, 0.2, np.nan, 0.3])
+    assert area_under_curve(unknown, label) == area_under_curve(known, label)
+    assert threshold_at(unknown, label) <= 0.3
+
+
+def test_one_class_alone_has_no_area():
+    figure = auc(np.array([0.1, 0.2]), np.array([True, True]), np.array([0, 1]))
+    assert math.isnan(figure.value)
+    assert math.isnan(figure.low)
+
+
+def test_repeating_the_segments_of_an_episode_adds_no_certainty():
+    rng = np.random.default_rng(2)
+    label = rng.random(60) < 0.5
+    score = label + rng.normal(size=60)
+    once = auc(score, label, np.arange(60))
+    often = auc(np.tile(score, 20), np.tile(label, 20), np.tile(np.arange(60), 20))
+    as_if_independent = auc(np.tile(score, 20), np.tile(label, 20), np.arange(1200))
+    assert often == once
+    assert as_if_independent.high - as_if_independent.low < 0.4 * (once.high - once.low)
+
+
+def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
+    rng = np.random.default_rng(3)
+    truth = 0.5 * (1.0 + math.erf(0.5))  # Normal scores one standard deviation apart.
+    num_covered = 0
+    for trial in range(100):
+        label = rng.random(120) < 0.5
+        figure = auc(
+            rng.normal(size=120) + label, label, np.arange(120), num_resamples=200, seed=trial
+        )
+        num_covered += figure.low <= truth <= figure.high
+    assert num_covered >= 88
+
+
+def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetric(segments):
+    one, other = blurred_truth(segments, 0), blurred_truth(segments, 1)
+    label, episode = segments.is_unsafe, segments.episode
+    same = auc_difference(one, one, label, episode)
+    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
+    forth = auc_difference(one, other, label, episode)
+    back = auc_difference(other, one, label, episode)
+    assert forth.value == -back.value
+    assert forth.low == pytest.approx(-back.high)
+
+
+def test_segment_figures_of_the_truth_are_perfect_and_their_recalls_still_uncertain(segments):
+    figures = segment_figures(segments, segments.is_unsafe.astype(float), threshold=0.5)
+    assert set(figures) == {"auc", "safe_recall", "unsafe_recall", "brier"}
+    assert [figures[k].value for k in figures] == [1.0, 1.0, 1.0, 0.0]
+    num_unsafe = len(np.unique(segments.episode[segments.is_unsafe]))
+    assert figures["unsafe_recall"] == proportion(num_unsafe, num_unsafe)
+
+
+def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segments):
+    score = blurred_truth(segments)
+    figures = segment_figures(segments, score, threshold=0.6)
+    label = segments.is_unsafe
+    assert figures["unsafe_recall"].value == pytest.approx((score[label] > 0.6).mean())
+    assert figures["safe_recall"].value == pytest.approx((score[~label] <= 0.6).mean())
+    assert figures["brier"].value == pytest.approx(((score - label) ** 2).mean())
+    assert figures["auc"].n == figures["brier"].n == len(np.unique(segments.episode))
+    assert figures["safe_recall"].n == len(np.unique(segments.episode[~label]))
+    for figure in figures.values():
+        assert figure.low < figure.value < figure.high
+
+
+def test_episode_figures_look_at_each_episodes_first_segment_alone(segments):
+    score = blurred_truth(segments)
+    elsewhere = np.where(segments.is_first, score, 0.123)
+    figures = episode_figures(segments, score, threshold=0.5)
+    assert figures == episode_figures(segments, elsewhere, threshold=0.5)
+    first = segments.take(segments.is_first)
+    score = score[segments.is_first]
+    unsafe = first.is_unsafe
+    assert figures["unsafe_recall"] == proportion(
+        int((score[unsafe] > 0.5).sum()), int(unsafe.sum())
+    )
+    assert figures["safe_recall"] == proportion(
+        int((score[~unsafe] <= 0.5).sum()), int((~unsafe).sum())
+    )
+    assert figures["auc"].value == area_under_curve(score, unsafe)
+
+
+def test_not_knowing_is_judged_unsafe_and_charged_as_certainty(segments):
+    figures = segment_figures(segments, np.full(len(segments), np.nan), threshold=0.5)
+    assert figures["unsafe_recall"].value == 1.0
+    assert figures["safe_recall"].value == 0.0
+    assert figures["auc"].value == 0.5
+    assert figures["brier"].value == pytest.approx((~segments.is_unsafe).mean())
+
+
+def test_scores_that_are_no_probabilities_have_no_brier_score(segments):
+    logit = 4.0 * segments.is_unsafe - 2.0
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got -2.0..2.0"):
+        segment_figures(segments, logit, threshold=0.0)
+    figures = segment_figures(segments, logit, threshold=0.0, is_probability=False)
+    assert set(figures) == {"auc", "safe_recall", "unsafe_recall"}
+
+
+def test_there_must_be_one_score_a_segment(segments):
+    with pytest.raises(ValueError, match="segment_figures: scores, labels and episodes"):
+        segment_figures(segments, np.zeros(3), threshold=0.5)
+    with pytest.raises(ValueError, match="labels must be boolean, got float64"):
+        area_under_curve(np.zeros(3), np.zeros(3))
+
+
+def test_the_threshold_separates_what_can_be_separated():
+    score = np.array([0.1, 0.2, 0.3, 0.7, 0.9])
+    label = np.array([False, False, False, True, True])
+    assert threshold_at(score, label) == pytest.approx(0.5)
+    assert threshold_at(score, label, "equal_error") == pytest.approx(0.5)
+
+
+def test_no_other_threshold_has_a_better_balanced_accuracy():
+    rng = np.random.default_rng(4)
+    label = rng.random(200) < 0.2
+    score = np.round(rng.normal(size=200) + label, 1)
+
+    def balanced(threshold):
+        return 0.5 * ((score[label] > threshold).mean() + (score[~label] <= threshold).mean())
+
+    best = max(balanced(t) for t in np.linspace(-5, 5, 1001))
+    assert balanced(threshold_at(score, label)) == pytest.approx(best)
+
+
+def test_the_equal_error_threshold_errs_alike_on_both_classes():
+    rng = np.random.default_rng(5)
+    label = rng.random(4000) < 0.1
+    score = rng.normal(size=4000) + 2.0 * label
+    threshold = threshold_at(score, label, "equal_error")
+    assert abs((score[label] <= threshold).mean() - (score[~label] > threshold).mean()) < 0.01
+
+
+def test_no_threshold_lies_above_what_is_infinitely_unsafe():
+    label = np.array([True, False, False])
+    assert threshold_at(np.array([0.2, np.inf, np.inf]), label) < math.inf
+
+
+def test_a_threshold_needs_both_classes_a_finite_score_and_a_known_criterion():
+    score = np.array([0.1, 0.2])
+    with pytest.raises(ValueError, match="0 of 2 samples are unsafe"):
+        threshold_at(score, np.array([False, False]))
+    with pytest.raises(ValueError, match="none of the 2 scores is finite"):
+        threshold_at(score * np.nan, np.array([False, True]))
+    with pytest.raises(ValueError, match="unknown criterion 'f1'; the criteria are"):
+        threshold_at(score, np.array([False, True]), "f1")

@@ -1,0 +1,248 @@
+"""RecoveryStepPlanner: rests, swings its feet in groups, returns the base, and says when done."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.control.kinematics import fit_stance
+from drake_safety.control.recovery_step import RecoveryStepParameters, gait_groups
+from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
+from drake_safety.systems.trajectory_planner import to_world
+from legged_robots import ROBOT_NAMES, robot_kinematics
+
+PERIOD_S = 0.01
+HORIZON = 4
+OUTPUTS = ("desired_output", "desired_foot_positions", "desired_preview", "stance_pose")
+
+
+class Bench:
+    """A planner that sees a robot standing (or gliding) in its posture at a stance pose."""
+
+    def __init__(self, name="laikago", stance_pose=(0.0, 0.0, 0.0), speed=(0.0, 0.0), **numbers):
+        self.kinematics = robot_kinematics(name)
+        self.parameters = RecoveryStepParameters(**numbers)
+        self.planner = RecoveryStepPlanner(
+            self.kinematics, self.parameters, period_s=PERIOD_S, horizon=HORIZON
+        )
+        self.simulator = Simulator(self.planner)
+        self.context = self.simulator.get_mutable_context()
+        self.stance_pose = np.array(stance_pose)
+        feet = np.column_stack([self.kinematics.nominal_contacts, self.kinematics.foot_radii])
+        self.feet = to_world(self.stance_pose, feet)
+        base = np.append(self.kinematics.nominal_base_offset, self.kinematics.standing_height)
+        self.base = to_world(self.stance_pose, base)
+        self.planner.set_stance(self.context, self.feet, self.stance_pose)
+        self.speed = np.array([*speed, 0.0])
+        self.see(self.base)
+        self.fix("recovery_active", [0.0])
+        self.fix("nominal_desired_output", self.base)
+
+    def fix(self, name, value):
+        self.planner.GetInputPort(name).FixValue(self.context, value)
+
+    def see(self, p_WB):
+        X_WB = RigidTransform(RotationMatrix.MakeZRotation(self.stance_pose[2]), p_WB)
+        v = np.zeros(self.kinematics.num_velocities)
+        v[3:6] = self.speed
+        q = self.kinematics.positions_at(X_WB, self.kinematics.posture)
+        self.fix("plant_state", np.concatenate([q, v]))
+
+    def get(self, name):
+        return self.planner.GetOutputPort(name).Eval(self.context).copy()
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    def feet_now(self):
+        return self.get("desired_foot_positions").reshape(-1, 3)
+
+    def lifted(self):
+        """Which feet are commanded off the ground."""
+        over = self.feet_now()[:, 2] - self.kinematics.foot_radii > 1e-3
+        slices = self.kinematics.foot_slices
+        return [i for i, rows in enumerate(slices) if over[rows].all()]
+
+    def groups(self):
+        contacts, slices = self.kinematics.nominal_contacts, self.kinematics.foot_slices
+        return gait_groups(np.array([contacts[rows].mean(axis=0) for rows in slices]))
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_its_ports_have_the_sizes_of_the_robot(name):
+    bench = Bench(name)
+    contacts = bench.kinematics.num_contacts
+    sizes = {"desired_output": 3, "desired_foot_positions": 3 * contacts, "stance_pose": 3}
+    sizes |= {"desired_preview": 3 * HORIZON, "recovery_done": 1}
+    assert {n: bench.planner.GetOutputPort(n).size() for n in sizes} == sizes
+    assert bench.planner.GetInputPort("recovery_active").size() == 1
+    assert bench.planner.GetInputPort("nominal_desired_output").size() == 3
+
+
+def test_no_input_feeds_through():
+    assert not Bench().planner.HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_at_rest_the_feet_stay_where_they_were_set(name):
+    bench = Bench(name, stance_pose=(1.0, 2.0, 0.5))
+    bench.advance(0.3)
+    np.testing.assert_array_equal(bench.feet_now(), bench.feet)
+    np.testing.assert_array_equal(bench.get("stance_pose"), [1.0, 2.0, 0.5])
+    assert bench.get("recovery_done")[0] == 0
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
+    bench = Bench(name, speed=(0.5, 0.0), min_steps=4)
+    bench.fix("recovery_active", [1.0])
+    swung = []
+    for _ in range(4):
+        bench.advance(0.5 * bench.parameters.step_duration_s)
+        swung.append(bench.lifted())
+        bench.advance(0.5 * bench.parameters.step_duration_s)
+    assert swung[0] in bench.groups()
+    assert swung[0] == swung[2]
+    assert swung[1] == swung[3]
+    assert sorted(swung[0] + swung[1]) == list(range(len(bench.kinematics.foot_names)))
+
+
+def test_a_swing_rises_by_its_lift():
+    bench = Bench(speed=(0.5, 0.0))
+    bench.fix("recovery_active", [1.0])
+    heights = []
+    for _ in range(round(bench.parameters.step_duration_s / PERIOD_S)):
+        bench.advance(PERIOD_S)
+        heights.append((bench.feet_now()[:, 2] - bench.kinematics.foot_radii).max())
+    assert max(heights) == pytest.approx(bench.parameters.lift_m, rel=0.1)
+
+
+@pytest.mark.parametrize("speed", [(0.6, 0.0), (0.0, 0.6), (-0.4, 0.4)])
+def test_feet_step_in_the_direction_of_the_fall(speed):
+    bench = Bench(speed=speed)
+    bench.fix("recovery_active", [1.0])
+    bench.advance(0.9 * bench.parameters.step_duration_s)
+    moved = (bench.feet_now() - bench.feet)[:, :2]
+    swung = np.concatenate([np.r_[bench.kinematics.foot_slices[i]] for i in bench.lifted()])
+    assert np.all(moved[swung] @ np.array(speed) > 0)
+
+
+def test_the_base_set_point_follows_the_measured_base_at_the_standing_height():
+    bench = Bench(speed=(0.5, 0.0))
+    bench.fix("recovery_active", [1.0])
+    bench.advance(2 * PERIOD_S)
+    bench.see(bench.base + [0.05, -0.02, -0.03])
+    bench.advance(2 * PERIOD_S)
+    expected = [*(bench.base[:2] + [0.05, -0.02]), bench.kinematics.standing_height]
+    np.testing.assert_allclose(bench.get("desired_output"), expected, atol=1e-9)
+
+
+def test_the_preview_is_the_set_point_held_in_the_stance_frame():
+    bench = Bench(stance_pose=(2.0, -1.0, 1.2), speed=(0.5, 0.0))
+    bench.fix("recovery_active", [1.0])
+    bench.advance(5 * PERIOD_S)
+    preview = bench.get("desired_preview").reshape(HORIZON, 3)
+    assert np.all(preview == preview[0])
+    world = to_world(bench.get("stance_pose"), preview[0])
+    np.testing.assert_allclose(world, bench.get("desired_output"), atol=1e-9)
+
+
+def test_a_fast_robot_goes_on_stepping_until_its_last_step():
+    bench = Bench(speed=(1.0, 0.0), max_steps=6)
+    bench.fix("recovery_active", [1.0])
+    bench.advance(5.5 * bench.parameters.step_duration_s)
+    assert bench.lifted()
+    bench.advance(1.0 * bench.parameters.step_duration_s)
+    assert not bench.lifted()
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_a_robot_at_rest_settles_after_the_fewest_steps_and_hands_over(name):
+    bench = Bench(name, min_steps=2, settle_margin_m=0.01)
+    bench.fix("recovery_active", [1.0])
+    bench.advance(2 * bench.parameters.step_duration_s + 2 * PERIOD_S)
+    assert not bench.lifted()
+    assert bench.get("recovery_done")[0] == 0
+    bench.advance(bench.parameters.return_duration_s + 3 * PERIOD_S)
+    assert bench.get("recovery_done")[0] == 1
+
+
+def settled(bench, active=1.0):
+    bench.fix("recovery_active", [active])
+    steps = bench.parameters.max_steps * bench.parameters.step_duration_s
+    bench.advance(steps + bench.parameters.return_duration_s + 0.2)
+    return bench
+
+
+def test_the_return_ends_at_the_nominal_set_point():
+    bench = Bench(stance_pose=(1.0, 1.0, -0.7))
+    goal = bench.base + [0.03, 0.02, 0.01]
+    bench.fix("nominal_desired_output", goal)
+    settled(bench)
+    np.testing.assert_allclose(bench.get("desired_output"), goal, atol=1e-9)
+
+
+def test_the_base_set_point_never_jumps_during_the_return():
+    bench = Bench()
+    bench.fix("nominal_desired_output", bench.base + [0.05, 0.0, 0.0])
+    bench.fix("recovery_active", [1.0])
+    previous, largest = bench.base, 0.0
+    for _ in range(100):
+        bench.advance(PERIOD_S)
+        if bench.context.get_time() > 3 * PERIOD_S:
+            largest = max(largest, np.abs(bench.get("desired_output") - previous).max())
+        previous = bench.get("desired_output")
+    # A minimum-jerk motion's top speed is 15/8 of its mean.
+    bound = 15 / 8 * 0.05 / bench.parameters.return_duration_s * PERIOD_S
+    assert largest <= 1.05 * bound
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
+    bench = Bench(name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01)
+    bench.fix("recovery_active", [1.0])
+    bench.advance(PERIOD_S)
+    bench.see(bench.base + [0.04, 0.02, 0.0])  # Feet and all: the posture has not changed.
+    settled(bench)
+    stance = bench.get("stance_pose")
+    np.testing.assert_allclose(stance, [0.54, 0.02, 0.3], atol=5e-3)
+    fitted = fit_stance(bench.feet_now(), bench.kinematics.nominal_contacts)
+    np.testing.assert_allclose(stance, fitted, atol=1e-9)
+
+
+def test_feet_stand_on_the_ground_after_recovery():
+    bench = settled(Bench(speed=(0.1, 0.0)))
+    np.testing.assert_allclose(bench.feet_now()[:, 2], bench.kinematics.foot_radii, atol=1e-9)
+
+
+def test_done_lasts_until_the_trigger_lets_go_and_then_it_can_step_again():
+    bench = settled(Bench())
+    assert bench.get("recovery_done")[0] == 1
+    bench.fix("recovery_active", [0.0])
+    bench.advance(2 * PERIOD_S)
+    assert bench.get("recovery_done")[0] == 0
+    assert not bench.lifted()
+    bench.fix("recovery_active", [1.0])
+    bench.advance(0.5 * bench.parameters.step_duration_s)
+    assert bench.lifted()
+
+
+def test_setting_the_stance_puts_it_to_rest():
+    bench = Bench(speed=(1.0, 0.0))
+    bench.fix("recovery_active", [1.0])
+    bench.advance(0.5 * bench.parameters.step_duration_s)
+    bench.fix("recovery_active", [0.0])
+    bench.planner.set_stance(bench.context, bench.feet, bench.stance_pose)
+    bench.advance(0.2)
+    assert not bench.lifted()
+    np.testing.assert_array_equal(bench.feet_now(), bench.feet)
+
+
+def test_nothing_is_kept_in_the_planner_itself():
+    bench = Bench(speed=(0.5, 0.0))
+    bench.fix("recovery_active", [1.0])
+    bench.advance(0.5 * bench.parameters.step_duration_s)
+    fresh = bench.planner.CreateDefaultContext()
+    bench.planner.set_stance(fresh, bench.feet, bench.stance_pose)
+    feet = bench.planner.GetOutputPort("desired_foot_positions").Eval(fresh)
+    np.testing.assert_array_equal(feet, bench.feet.ravel())

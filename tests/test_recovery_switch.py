@@ -1,0 +1,140 @@
+"""RecoverySwitch: the nominal set point passes through until Γ falls, and again afterwards."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.systems.recovery_switch import RecoverySwitch
+from legged_robots import ROBOT_NAMES, robot_kinematics
+
+PERIOD_S, OFFSET_S, HORIZON = 0.01, 0.0005, 3
+PREVIEW = np.arange(9.0)
+
+
+class Bench:
+    """The block alone, seeing a robot that stands still."""
+
+    def __init__(self, name="laikago"):
+        self.kinematics = robot_kinematics(name)
+        self.parameters = RecoveryStepParameters(settle_margin_m=0.01)
+        self.switch = RecoverySwitch(
+            self.kinematics,
+            self.parameters,
+            threshold=0.6,
+            period_s=PERIOD_S,
+            offset_s=OFFSET_S,
+            horizon=HORIZON,
+        )
+        self.simulator = Simulator(self.switch)
+        self.context = self.simulator.get_mutable_context()
+        base = np.append(self.kinematics.nominal_base_offset, self.kinematics.standing_height)
+        q = self.kinematics.positions_at(RigidTransform(base), self.kinematics.posture)
+        self.nominal = base + [0.02, 0.01, 0.0]
+        self.feet = np.column_stack([self.kinematics.nominal_contacts, self.kinematics.foot_radii])
+        planner = self.switch.step_planner
+        planner_context = planner.GetMyMutableContextFromRoot(self.context)
+        planner.set_stance(planner_context, self.feet, np.zeros(3))
+        self.fix("plant_state", np.concatenate([q, np.zeros(self.kinematics.num_velocities)]))
+        self.fix("nominal_desired_output", self.nominal)
+        self.fix("nominal_desired_preview", PREVIEW)
+        self.fix("safety_probability", [1.0])
+
+    def fix(self, name, value):
+        self.switch.GetInputPort(name).FixValue(self.context, value)
+
+    def get(self, name):
+        return self.switch.GetOutputPort(name).Eval(self.context).copy()
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    def recovery_duration_s(self):
+        steps = self.parameters.max_steps * self.parameters.step_duration_s
+        return steps + self.parameters.return_duration_s + 0.2
+
+
+def test_it_exports_the_promised_ports():
+    switch = Bench().switch
+    inputs = {switch.get_input_port(i).get_name() for i in range(switch.num_input_ports())}
+    outputs = {switch.get_output_port(i).get_name() for i in range(switch.num_output_ports())}
+    assert inputs == {
+        "safety_probability",
+        "plant_state",
+        "nominal_desired_output",
+        "nominal_desired_preview",
+    }
+    assert outputs == {
+        "desired_output",
+        "desired_preview",
+        "desired_foot_positions",
+        "stance_pose",
+        "recovery_active",
+    }
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_while_safe_the_nominal_plan_passes_through_at_once(name):
+    bench = Bench(name)
+    bench.advance(0.1)
+    assert bench.get("recovery_active")[0] == 0
+    np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
+    np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
+    np.testing.assert_array_equal(bench.get("desired_foot_positions"), bench.feet.ravel())
+    bench.fix("nominal_desired_output", bench.nominal + 1.0)
+    np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal + 1.0)
+
+
+def test_a_low_probability_makes_feet_leave_the_ground_within_two_ticks():
+    bench = Bench()
+    bench.advance(0.1)
+    bench.fix("safety_probability", [0.3])
+    bench.advance(2 * PERIOD_S)
+    assert bench.get("recovery_active")[0] == 1
+    height = bench.get("desired_foot_positions").reshape(-1, 3)[:, 2] - bench.kinematics.foot_radii
+    assert height.max() > 1e-5
+
+
+def test_the_step_planner_ticks_behind_the_trigger_in_the_same_period():
+    bench = Bench()
+    bench.advance(0.1 + 0.5 * PERIOD_S)
+    bench.fix("safety_probability", [0.3])
+    bench.simulator.AdvanceTo(0.11 + OFFSET_S + 1e-6)
+    assert bench.get("recovery_active")[0] == 1
+    before = bench.get("desired_output")
+    bench.simulator.AdvanceTo(0.11 + 2 * OFFSET_S + 1e-6)
+    expected = [*bench.kinematics.nominal_base_offset, bench.kinematics.standing_height]
+    np.testing.assert_allclose(bench.get("desired_output"), expected, atol=1e-9)
+    assert not np.allclose(before, bench.nominal)
+
+
+def test_recovery_ends_with_the_nominal_plan_passing_through_again():
+    bench = Bench()
+    bench.fix("safety_probability", [0.3])
+    bench.advance(3 * PERIOD_S)
+    bench.fix("safety_probability", [1.0])
+    bench.advance(3 * PERIOD_S)
+    assert bench.get("recovery_active")[0] == 1  # It latches.
+    bench.advance(bench.recovery_duration_s())
+    assert bench.get("recovery_active")[0] == 0
+    np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
+    np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
+
+
+def test_a_second_dip_is_answered_by_a_second_recovery():
+    bench = Bench()
+    for _ in range(2):
+        bench.fix("safety_probability", [0.3])
+        bench.advance(3 * PERIOD_S)
+        assert bench.get("recovery_active")[0] == 1
+        bench.fix("safety_probability", [1.0])
+        bench.advance(bench.recovery_duration_s())
+        assert bench.get("recovery_active")[0] == 0
+
+
+def test_without_any_knowledge_it_recovers():
+    bench = Bench()
+    bench.fix("safety_probability", [np.nan])
+    bench.advance(2 * PERIOD_S)
+    assert bench.get("recovery_active")[0] == 1

@@ -1,0 +1,134 @@
+"""RecoveryTrigger: fires below the threshold, latches, and lets go when recovery is done."""
+
+import math
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, PortSwitch
+
+from drake_safety.systems.recovery_trigger import RecoveryTrigger
+
+PERIOD_S = 0.01
+
+
+class Bench:
+    """A trigger alone; `look` lets one period pass."""
+
+    def __init__(self, probability=1.0, **options):
+        self.trigger = RecoveryTrigger(**{"period_s": PERIOD_S} | options)
+        self.simulator = Simulator(self.trigger)
+        self.context = self.simulator.get_mutable_context()
+        self.set(probability)
+
+    def set(self, probability, done=None):
+        self.trigger.GetInputPort("safety_probability").FixValue(self.context, [probability])
+        if done is not None:
+            self.trigger.GetInputPort("recovery_done").FixValue(self.context, [done])
+
+    def look(self, periods=1):
+        self.simulator.AdvanceTo(self.context.get_time() + periods * PERIOD_S)
+        return self.is_active()
+
+    def is_active(self):
+        return bool(self.trigger.GetOutputPort("recovery_active").Eval(self.context)[0])
+
+
+def test_its_ports_and_its_lack_of_feedthrough():
+    trigger = RecoveryTrigger(period_s=PERIOD_S)
+    assert trigger.GetInputPort("safety_probability").size() == 1
+    assert trigger.GetInputPort("recovery_done").size() == 1
+    assert trigger.GetOutputPort("recovery_active").size() == 1
+    assert not trigger.HasAnyDirectFeedthrough()
+    assert trigger.threshold == 0.6
+
+
+@pytest.mark.parametrize(
+    ("probability", "fires"),
+    [(1.0, False), (0.6, False), (np.nextafter(0.6, 0), True), (0.0, True), (math.nan, True)],
+)
+def test_it_fires_below_the_threshold_and_when_nothing_is_known(probability, fires):
+    assert Bench(probability).look() == fires
+
+
+def test_it_is_at_rest_before_its_first_look():
+    assert not Bench(0.0).is_active()
+
+
+def test_a_threshold_of_zero_fires_only_on_what_is_no_number():
+    assert not Bench(0.0, threshold=0.0).look()
+    assert Bench(math.nan, threshold=0.0).look()
+
+
+def test_it_latches_whatever_the_probability_does():
+    bench = Bench(0.1)
+    assert bench.look()
+    bench.set(1.0)
+    assert bench.look(20)
+    bench.set(1.0, done=0.0)
+    assert bench.look(20)
+
+
+def test_it_lets_go_when_recovery_is_done():
+    bench = Bench(0.1)
+    bench.look()
+    bench.set(1.0, done=1.0)
+    assert not bench.look()
+
+
+def test_it_may_fire_again_after_it_let_go():
+    bench = Bench(0.1)
+    bench.look()
+    bench.set(1.0, done=1.0)
+    assert not bench.look()
+    bench.set(0.1, done=0.0)
+    assert bench.look()
+
+
+def test_recovery_done_means_nothing_before_it_fired():
+    bench = Bench(0.1)
+    bench.set(0.1, done=1.0)
+    assert bench.look()
+
+
+def test_it_looks_only_at_its_own_times():
+    bench = Bench(0.1, offset_s=0.005)
+    bench.simulator.AdvanceTo(0.004)
+    assert not bench.is_active()
+    bench.simulator.AdvanceTo(0.006)
+    assert bench.is_active()
+
+
+def test_a_dip_between_two_looks_is_not_seen():
+    bench = Bench(1.0)
+    bench.simulator.AdvanceTo(0.001)
+    bench.set(0.0)
+    bench.simulator.AdvanceTo(0.009)
+    bench.set(1.0)
+    assert not bench.look(5)
+
+
+def test_its_selector_drives_drakes_port_switch():
+    builder = DiagramBuilder()
+    trigger = builder.AddSystem(RecoveryTrigger(period_s=PERIOD_S))
+    switch = builder.AddSystem(PortSwitch(1))
+    builder.Connect(trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port())
+    for name, number in (("nominal", 10.0), ("recovery", 20.0)):
+        source = builder.AddSystem(ConstantVectorSource([number]))
+        builder.Connect(source.get_output_port(), switch.DeclareInputPort(name))
+    builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
+    builder.ExportOutput(switch.GetOutputPort("value"), "value")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    for time, probability, expected in ((0.05, 0.9, 10.0), (0.1, 0.2, 20.0), (0.15, 0.9, 20.0)):
+        diagram.GetInputPort("safety_probability").FixValue(context, [probability])
+        simulator.AdvanceTo(time)
+        assert diagram.GetOutputPort("value").Eval(context)[0] == expected
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.1, math.nan])
+def test_a_threshold_that_is_no_probability_is_refused(threshold):
+    with pytest.raises(ValueError, match=r"threshold must be in \[0, 1\]; got"):
+        RecoveryTrigger(threshold=threshold, period_s=PERIOD_S)

@@ -1,0 +1,235 @@
+"""Rollouts: the same bits for any number of workers, after any interruption, whatever diverges."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_safety import load_scenario, run_episode, run_episodes
+from drake_safety.learning.segments import DIVERGED
+from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.rollouts import episode_rng, parallel_map
+from drake_safety.simulation.scenario import parse_scenario
+from gliding_task import SCENARIO
+
+ARRAYS = ("time_s", "state", "true_state", "output", "desired_output", "desired_preview")
+ARRAYS += ("features", "margins")
+
+
+def gliding(**parameters):
+    text = f"{SCENARIO}parameters: {parameters}\n"
+    return parse_scenario(text, name="gliding", folder=Path())
+
+
+def assert_identical(episodes, others):
+    assert [e.index for e in episodes] == [e.index for e in others]
+    for episode, other in zip(episodes, others, strict=True):
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(episode, name), getattr(other, name))
+        for name in ("is_safe", "cause", "first_step"):
+            assert getattr(episode, name) == getattr(other, name)
+
+
+def test_rows_are_a_step_apart_from_zero_to_the_end():
+    scenario = gliding(speed_m_s=0.1)
+    episode = run_episode(scenario.make_loop())
+    np.testing.assert_allclose(episode.time_s, scenario.step_s * np.arange(21), atol=1e-12)
+    assert episode.is_safe
+    assert episode.cause == ""
+    for name in ARRAYS:
+        assert len(getattr(episode, name)) == 21
+
+
+def test_a_row_holds_what_the_loops_ports_say():
+    episode = run_episode(gliding(speed_m_s=0.5).make_loop(), 3, seed=5)
+    x, v = episode.state[0]
+    np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=0.0101 * abs(v))
+    np.testing.assert_array_equal(episode.features[:, 0], 1 - episode.state[:, 0])
+    expected = np.stack([1 - episode.state[:, 0], 1 + episode.state[:, 0]], axis=1)
+    np.testing.assert_array_equal(episode.margins, expected)
+
+
+def test_an_unsafe_episode_ends_as_it_leaves_and_names_the_violated_constraint():
+    episodes = [run_episode(gliding(speed_m_s=4.0).make_loop(), i) for i in range(20)]
+    unsafe = [e for e in episodes if not e.is_safe]
+    assert {e.cause for e in unsafe} == {"left", "right"}
+    for episode in unsafe:
+        violated = ["right", "left"].index(episode.cause)
+        assert episode.margins[-1, violated] < 0
+        assert episode.margins[-2].min() >= 0
+        assert episode.time_s[-1] - episode.time_s[-2] <= 0.04 + 1e-12
+        # The state moves up to 0.04 m in a control period: it ends within one of leaving.
+        assert episode.margins[-1, violated] > -0.0801
+
+
+def test_the_generator_of_an_episode_depends_on_seed_and_index_alone():
+    draws = {(s, i): episode_rng(s, i).random() for s in range(3) for i in range(3)}
+    assert len(set(draws.values())) == 9
+    assert episode_rng(2, 1).random() == draws[2, 1]
+
+
+def test_a_loop_can_be_used_again_in_any_order():
+    loop = gliding().make_loop()
+    forward = [run_episode(loop, i) for i in range(6)]
+    backward = [run_episode(loop, i) for i in reversed(range(6))]
+    assert_identical(forward, backward[::-1])
+
+
+def test_a_longer_set_begins_with_the_shorter_one():
+    assert_identical(
+        run_episodes(gliding(), 5, num_workers=1), run_episodes(gliding(), 9, num_workers=1)[:5]
+    )
+
+
+def test_seeds_and_variations_are_kept_in_the_info():
+    episodes = run_episodes(gliding(), 2, variation="actual", seed=7, num_workers=1)
+    assert episodes.info.variation == "actual"
+    assert episodes.info.seed == 7
+    assert episodes.info.scenario_hash == gliding().simulation_hash()
+    assert episodes.info.constraint_names == ["right", "left"]
+    other = run_episodes(gliding(), 2, variation="actual", seed=8, num_workers=1)
+    assert episodes[0].state[0, 0] != other[0].state[0, 0]
+
+
+def test_an_own_task_runs_in_worker_processes():
+    alone = run_episodes(gliding(), 10, num_workers=1)
+    assert_identical(run_episodes(gliding(), 10, num_workers=2), alone)
+
+
+@pytest.mark.parametrize("failure", ["raise", "nan", "inf"])
+def test_a_diverged_simulation_is_recorded_as_such_and_the_run_goes_on(failure):
+    episodes = run_episodes(gliding(failure=failure), 20, num_workers=1)
+    sound = run_episodes(gliding(), 20, num_workers=1)
+    assert len(episodes) == 20
+    diverged = [e for e in episodes if e.cause == DIVERGED]
+    assert len(diverged) == episodes.num_diverged > 0
+    for episode in diverged:
+        assert not episode.is_safe
+        assert 0 <= episode.first_step < len(episode.time_s)
+        for name in ARRAYS:
+            assert np.isfinite(getattr(episode, name)).all()
+    for episode, other in zip(episodes, sound, strict=True):
+        reached = (other.true_state[:, 0] > 0.5).any()
+        assert (episode.cause == DIVERGED) == reached
+        if not reached:
+            np.testing.assert_array_equal(episode.state, other.state)
+
+
+def test_a_diverged_simulation_keeps_the_rows_before_it_diverged():
+    (episode, *_) = [
+        e for e in run_episodes(gliding(failure="nan"), 20, num_workers=1) if e.cause == DIVERGED
+    ]
+    sound = run_episode(gliding().make_loop(), episode.index)
+    np.testing.assert_array_equal(episode.state, sound.state[: len(episode.state)])
+    assert sound.state[len(episode.state), 0] > 0.5
+
+
+def test_progress_counts_up_to_the_number_wanted():
+    seen = []
+    run_episodes(gliding(), 10, num_workers=1, progress=lambda *counts: seen.append(counts))
+    done = [count for count, _ in seen]
+    assert done[0] == 0
+    assert done[-1] == 10
+    assert done == sorted(done)
+    assert {wanted for _, wanted in seen} == {10}
+
+
+class Interruption:
+    """A user who presses Ctrl-C once enough episodes are done."""
+
+    def __init__(self, after):
+        self.after = after
+
+    def __call__(self, done, wanted):
+        if done >= self.after:
+            raise KeyboardInterrupt
+
+
+# joblib tells of the tasks that it cancelled, which is what was asked for.
+@pytest.mark.filterwarnings("ignore:.*still being processed by the workers:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*have been successfully executed:UserWarning")
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_an_interrupted_run_keeps_what_was_finished_and_goes_on_to_the_same_set(
+    tmp_path, num_workers
+):
+    uninterrupted = run_episodes(gliding(), 24, num_workers=1)
+    with pytest.raises(KeyboardInterrupt):
+        run_episodes(
+            gliding(), 24, num_workers=num_workers, path=tmp_path, progress=Interruption(8)
+        )
+    kept = completed(tmp_path)
+    assert 8 <= len(kept) < 24
+    simulated = []
+    resumed = run_episodes(
+        gliding(), 24, num_workers=1, path=tmp_path, progress=lambda n, _: simulated.append(n)
+    )
+    assert simulated[0] == len(kept)
+    assert_identical(resumed, uninterrupted)
+    assert_identical(load_episodes(tmp_path), uninterrupted)
+
+
+def test_a_finished_set_on_disk_is_read_not_simulated(tmp_path):
+    first = run_episodes(gliding(), 6, num_workers=1, path=tmp_path)
+    seen = []
+    again = run_episodes(
+        gliding(), 6, num_workers=1, path=tmp_path, progress=lambda n, _: seen.append(n)
+    )
+    assert seen == [6]
+    assert_identical(again, first)
+
+
+def test_a_folder_of_another_set_is_refused(tmp_path):
+    run_episodes(gliding(), 3, num_workers=1, path=tmp_path)
+    with pytest.raises(ValueError, match="seed"):
+        run_episodes(gliding(), 3, seed=1, num_workers=1, path=tmp_path)
+    with pytest.raises(ValueError, match="scenario_hash"):
+        run_episodes(gliding(speed_m_s=1.0), 3, num_workers=1, path=tmp_path)
+
+
+def _square(number):
+    return number**2
+
+
+def _fail_at_two(number):
+    if number == 2:
+        raise ValueError("two")
+    return number
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_parallel_map_calls_every_argument_once(num_workers):
+    results = parallel_map(_square, [(i,) for i in range(9)], num_workers)
+    assert sorted(results) == [i**2 for i in range(9)]
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_failure_in_a_worker_reaches_the_caller(num_workers):
+    with pytest.raises(ValueError, match="two"):
+        list(parallel_map(_fail_at_two, [(i,) for i in range(5)], num_workers))
+
+
+def balancing(episode_duration_s):
+    scenario = load_scenario("laikago_balancing")
+    scenario.episode_duration_s = episode_duration_s
+    return scenario
+
+
+def test_an_episode_begun_by_a_push_counts_from_after_it():
+    loop = balancing(0.4).make_loop()
+    episodes = [run_episode(loop, i) for i in range(12)]
+    assert {e.first_step for e in episodes if len(e.time_s) > 1} == {0, 1}
+
+
+def test_what_is_random_during_an_episode_is_the_same_in_every_worker():
+    scenario = balancing(0.4)
+    alone = run_episodes(scenario, 16, variation="actual", num_workers=1)
+    assert_identical(run_episodes(scenario, 16, variation="actual", num_workers=2), alone)
+    assert alone.num_diverged == 0
+
+
+@pytest.mark.slow
+def test_sixty_four_episodes_are_the_same_to_the_bit_with_one_and_two_workers():
+    scenario = balancing(1.2)
+    alone = run_episodes(scenario, 64, num_workers=1)
+    assert_identical(run_episodes(scenario, 64, num_workers=2), alone)
+    assert 0.2 < alone.num_unsafe / 64 < 0.8

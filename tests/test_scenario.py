@@ -1,0 +1,185 @@
+"""A scenario is one YAML file; what it misspells is answered with what exists."""
+
+from pathlib import Path
+
+import pytest
+
+from drake_safety import load_scenario
+from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
+from gliding_task import SCENARIO, Gliding
+from legged_robots import write_hexapod
+
+BALANCING = "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\n"
+
+
+def parsed(text, name="mine", folder=Path()):
+    return parse_scenario(text, name=name, folder=folder)
+
+
+def with_parameters(text):
+    return f"{SCENARIO}parameters: {text}\n"
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_scenario_of_the_package_loads_and_knows_its_name(name):
+    scenario = load_scenario(name)
+    assert scenario.name == name
+    assert "nominal" in scenario.variations
+    assert isinstance(scenario.parameters, scenario.task_class().Parameters)
+
+
+def test_a_file_holds_only_what_differs_from_the_defaults():
+    scenario = parsed(with_parameters("{speed_m_s: 0.5}"))
+    assert scenario.parameters.speed_m_s == 0.5
+    assert scenario.parameters.failure == ""
+    assert scenario.control_period_s == 0.01
+    assert scenario.variation("nominal").mass_scale == 1.0
+    assert scenario.variation("actual").mass_scale == 1.2
+
+
+def test_an_own_task_in_an_own_folder_needs_no_line_in_the_package(tmp_path):
+    path = tmp_path / "sliding.yaml"
+    path.write_text(SCENARIO)
+    scenario = load_scenario(path)
+    assert scenario.name == "sliding"
+    assert scenario.task_class() is Gliding
+    assert isinstance(scenario.make_loop(), Gliding)
+
+
+def test_the_number_of_steps_is_the_duration_over_the_step():
+    assert parsed(SCENARIO).num_steps == 20
+
+
+def test_an_unknown_scenario_is_answered_with_those_that_exist():
+    with pytest.raises(ValueError, match=r"'nobody' does not exist; scenarios are \['laikago_"):
+        load_scenario("nobody")
+
+
+def test_a_missing_scenario_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"scenario file '.*gone\.yaml' does not exist"):
+        load_scenario(tmp_path / "gone.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task: [", "scenario 'mine' is not YAML"),
+        ("- a", "must be a mapping with the keys 'task' and 'robot'"),
+        ("task: a:B", "must be a mapping with the keys 'task' and 'robot'"),
+        (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
+        (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
+        (BALANCING + "parameters: {push: {sharee: 1}}", "'push.sharee'; keys there are .*'share'"),
+        (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
+        (BALANCING + "parameters: {push: {throws: [{mas_kg: 1}]}}", "throws.0.mas_kg'.*'mass_kg'"),
+        (BALANCING + "parameters: {push: {throws: [{mass_kg: 0}]}}", "throw: mass_kg must be pos"),
+        (BALANCING + "parameters: 3", "parameters: this must be a mapping"),
+        (BALANCING + "step_s: fast", "scenario 'mine'.*float.*fast"),
+        (BALANCING + "assessment: {mode: dull}", r"unknown mode 'dull'.*'paper', 'sharpened'"),
+        (BALANCING + "step_s: 0", "step_s must be positive; got 0"),
+        (BALANCING + "step_s: .nan", "step_s must be positive; got nan"),
+        (BALANCING + "variations: {nominal: {mass_scale: -1}}", "mass_scale must be positive"),
+        (BALANCING + "parameters: {push: {share: 2}}", r"share must be in \[0, 1\]; got 2"),
+        (BALANCING + "parameters: {safe_set: {height_m: [1, 0]}}", "lowest < highest"),
+        (BALANCING + "assessment: {horizon: 51}", "horizon of 51 steps .* exceeds the episode"),
+        (with_parameters("{failure: sneeze}"), "gliding: unknown failure 'sneeze'"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):
+    with pytest.raises(ValueError, match=message):
+        parsed(text)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("nowhere:X", r"no module 'nowhere'.*drake_safety\.diagrams\.balancing"),
+        ("drake_safety.diagrams.juggling:X", r"no module 'drake_safety\.diagrams\.juggling'"),
+        ("drake_safety.diagrams.balancing:Nope", r"no task 'Nope'; it has \['Balancing'\]"),
+        ("drake_safety.diagrams.balancing:Throw", r"no task 'Throw'; it has \['Balancing'\]"),
+        ("gliding_task", "task must be 'package.module:Class'; got 'gliding_task'"),
+        (":X", "task must be 'package.module:Class'; got ':X'"),
+    ],
+)
+def test_an_unknown_task_is_answered_with_those_that_exist(task, message):
+    with pytest.raises(ValueError, match=message):
+        parsed(f"task: '{task}'\nrobot: laikago\n")
+
+
+def test_a_module_that_a_task_lacks_is_not_taken_for_the_task(tmp_path, monkeypatch):
+    (tmp_path / "hungry_task.py").write_text("import hungry\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="No module named 'hungry'"):
+        parsed("task: hungry_task:X\nrobot: laikago\n")
+
+
+def test_an_unknown_robot_is_answered_with_those_that_exist():
+    scenario = parsed(
+        "task: drake_safety.diagrams.balancing:Balancing\nrobot: nobody\nvariations: {nominal: {}}"
+    )
+    with pytest.raises(ValueError, match=r"robot 'nobody' does not exist; robots are"):
+        scenario.make_loop()
+
+
+def test_an_unknown_variation_is_answered_with_those_that_exist():
+    with pytest.raises(ValueError, match=r"no variation 'dream'; it has \['nominal', 'actual'\]"):
+        parsed(SCENARIO).make_loop("dream")
+
+
+def test_a_horizon_as_long_as_the_episode_is_allowed_in_spite_of_rounding():
+    # 3 × 0.1 > 0.3 in floating point.
+    text = BALANCING + "episode_duration_s: 0.3\nstep_s: 0.1\nassessment: {horizon: 3}"
+    assert parsed(text).num_steps == 3
+
+
+def test_task_names_are_modules_of_the_package():
+    assert "drake_safety.diagrams.balancing" in task_names()
+
+
+def test_the_canonical_text_keeps_every_value(tmp_path):
+    text = with_parameters("{speed_m_s: 0.125}")
+    assert "speed_m_s: 0.125" in parsed(text).to_yaml()
+    assert "mass_scale: 1.2" in parsed(text).to_yaml()
+
+
+def test_the_same_text_has_the_same_hash_and_order_does_not_matter():
+    other = "robot: none\n" + SCENARIO.replace("robot: none\n", "")
+    assert parsed(SCENARIO).simulation_hash() == parsed(other).simulation_hash()
+    assert len(parsed(SCENARIO).simulation_hash()) == 64
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        SCENARIO.replace("step_s: 0.04", "step_s: 0.02"),
+        SCENARIO.replace("1.2", "1.3"),
+        with_parameters("{speed_m_s: 3.0}"),
+        SCENARIO + "assessment: {horizon: 11}",
+    ],
+)
+def test_what_changes_a_rollout_changes_the_hash(text):
+    assert parsed(text).simulation_hash() != parsed(SCENARIO).simulation_hash()
+
+
+def test_how_the_assessment_is_learned_does_not_change_the_hash():
+    text = SCENARIO + "assessment: {epochs: 3, mode: paper}"
+    assert parsed(text).simulation_hash() == parsed(SCENARIO).simulation_hash()
+
+
+def test_a_robots_files_change_the_hash_and_their_folder_does_not(tmp_path):
+    text = BALANCING.replace("laikago", "robot.yaml")
+    hashes = []
+    for folder in ("here", "there"):
+        write_hexapod(tmp_path / folder)
+        hashes.append(parsed(text, folder=tmp_path / folder).simulation_hash())
+    assert hashes[0] == hashes[1]
+    urdf = tmp_path / "there" / "hexapod.urdf"
+    urdf.write_text(urdf.read_text().replace('mass value="6.0"', 'mass value="7.0"'))
+    assert parsed(text, folder=tmp_path / "there").simulation_hash() != hashes[0]
+
+
+def test_a_relative_robot_path_starts_at_the_scenarios_folder(tmp_path, monkeypatch):
+    write_hexapod(tmp_path / "robots")
+    path = tmp_path / "mine.yaml"
+    path.write_text(BALANCING.replace("laikago", "robots/robot.yaml"))
+    monkeypatch.chdir("/")
+    assert load_scenario(path).robot == str((tmp_path / "robots" / "robot.yaml").resolve())

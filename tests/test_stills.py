@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.stills import StillCamera, render_stills
+from drake_safety.simulation.scenario import load_scenario, scenario_names
+
+SIZE = {"width": 96, "height": 72}
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return load_scenario(scenario_names()[0]).make_loop(ball=True)
+
+
+@pytest.fixture(scope="module")
+def standing(loop):
+    context = loop.CreateDefaultContext()
+    loop.reset_calm(context, np.random.default_rng(0))
+    return loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
+
+
+@pytest.fixture(scope="module")
+def camera(loop, standing):
+    return StillCamera(loop, standing, **SIZE)
+
+
+def moved(loop, positions, body, offset):
+    """`positions` with a floating body displaced by `offset` (3,)."""
+    changed = positions.copy()
+    start = loop.plant.GetBodyByName(body).floating_positions_start()
+    changed[start + 4 : start + 7] += offset
+    return changed
+
+
+def share_of_orange(image):
+    red, green, blue = np.moveaxis(image.astype(int), -1, 0)
+    return ((red > 150) & (red > 1.5 * green) & (green > 1.5 * blue)).mean()
+
+
+def test_a_still_is_an_rgb_image_with_the_dark_robot_in_the_middle_of_a_light_scene(
+    camera, standing
+):
+    image = camera.render(standing)
+    assert image.shape == (72, 96, 3)
+    assert image.dtype == np.uint8
+    is_dark = image.max(axis=-1) < 90
+    rows, columns = np.nonzero(is_dark)
+    assert 0.02 < is_dark.mean() < 0.5
+    assert abs(columns.mean() - 48) < 12
+    assert abs(rows.mean() - 36) < 14
+    # All of it is in the picture.
+    assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
+
+
+def test_the_camera_follows_the_base_over_the_ground_but_not_up(loop, camera, standing):
+    reference = camera.render(standing).astype(int)
+    base = loop.robot.base
+    along = camera.render(moved(loop, standing, base, [0.3, -0.2, 0.0])).astype(int)
+    up = camera.render(moved(loop, standing, base, [0.0, 0.0, 0.15])).astype(int)
+    assert np.abs(along - reference).mean() < 6.0
+    lowered = np.nonzero(up.max(axis=-1) < 90)[0].mean()
+    assert lowered < np.nonzero(reference.max(axis=-1) < 90)[0].mean() - 5
+
+
+def test_a_ball_beside_the_robot_is_seen_and_a_parked_one_is_not(loop, camera, standing):
+    assert share_of_orange(camera.render(standing)) == 0.0
+    ball = standing.copy()
+    start = loop.plant.GetBodyByName("ball").floating_positions_start()
+    ball[start + 4 : start + 7] = [0.1, -0.5, 0.4]
+    assert share_of_orange(camera.render(ball)) > 0.005
+
+
+def test_stills_show_the_nearest_logged_instants(loop, standing):
+    ball = standing.copy()
+    start = loop.plant.GetBodyByName("ball").floating_positions_start()
+    ball[start + 4 : start + 7] = [0.1, -0.5, 0.4]
+    stills = render_stills(loop, [0.0, 0.1], [standing, ball], [0.02, 0.09], **SIZE)
+    assert [time for time, _ in stills] == [0.0, 0.1]
+    assert [share_of_orange(image) > 0.0 for _, image in stills] == [False, True]
+
+
+def test_what_does_not_fit_the_plant_is_refused(loop, camera, standing):
+    with pytest.raises(ValueError, match=r"positions have shape \(3,\), expected \(\d+,\)"):
+        camera.render(np.zeros(3))
+    with pytest.raises(ValueError, match="not finite"):
+        camera.render(standing * np.nan)
+    with pytest.raises(ValueError, match=r"\[0.5\] s are outside the log of 0.0..0.1 s"):
+        render_stills(loop, [0.0, 0.1], [standing, standing], [0.5])
+    with pytest.raises(ValueError, match=r"times have shape \(1,\) and positions \(2, "):
+        render_stills(loop, [0.0], [standing, standing], [0.0])
