@@ -16,6 +16,7 @@ from pydrake.multibody.plant import (
 )
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, RandomSource
+from pydrake.trajectories import PiecewisePolynomial
 from pydrake.common import RandomDistribution, RandomGenerator
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
@@ -77,8 +78,6 @@ class PushSampling:
     height_m: float = 0.03
     target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
     """Half-widths of where the calm motion starts and ends, about the stance [m]."""
-    throws: list[Throw] = field(default_factory=list)
-    """The balls of a demonstration: `drake-safety run --push ball`."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
@@ -117,6 +116,8 @@ class BalancingParameters:
     start: StartSampling = field(default_factory=StartSampling)
     push: PushSampling = field(default_factory=PushSampling)
     recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
+    demonstration: list[Throw] = field(default_factory=list)
+    """The balls of ``drake-safety run --push ball``."""
 
 
 class Balancing(ClosedLoop):
@@ -136,6 +137,7 @@ class Balancing(ClosedLoop):
     """
 
     Parameters = BalancingParameters
+    online_parameters = ("recovery", "demonstration")
 
     def __init__(
         self,
@@ -344,6 +346,7 @@ class Balancing(ClosedLoop):
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self.finish(builder)
+        self._default = self.CreateDefaultContext()
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[str]:
@@ -439,8 +442,20 @@ class Balancing(ClosedLoop):
         plan = interpolate(start, goal, rng.uniform(*sampling.plan_duration_s))
         self._set(context, rng, X_WB, joints, v, contacts, plan)
 
-    def _set(self, context, rng, X_WB, joints, v, contacts, plan) -> None:
+    def _set(
+        self,
+        context: Context,
+        rng: np.random.Generator,
+        X_WB: RigidTransform,
+        joints: np.ndarray,
+        v: np.ndarray,
+        contacts: np.ndarray,
+        plan: PiecewisePolynomial,
+    ) -> None:
         kinematics = self.kinematics
+        # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
+        context.SetTime(0.0)
+        context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         joints = np.clip(
             joints, kinematics.position_limits[:, 0], kinematics.position_limits[:, 1]
         )

@@ -322,7 +322,7 @@ def _throws(scenario: Scenario, push: list[str]) -> list[Throw]:
     throws: list[Throw] = []
     for text in push:
         if text == "ball":
-            throws += scenario.parameters.push.throws
+            throws += scenario.parameters.demonstration
             continue
         values = {}
         for pair in shlex.split(text):

@@ -3,13 +3,13 @@ from types import SimpleNamespace
 import matplotlib.image
 import numpy as np
 import pytest
-from lip_episodes import make_episodes
 from matplotlib.colors import to_hex
 
 from drake_safety.evaluation import figures
 from drake_safety.learning.beliefs import from_scores, fuse_cells
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
+from lip_episodes import make_episodes
 
 
 class StandIn:

@@ -20,7 +20,7 @@ ALLOWED = {
     "systems": {"learning", "control"},
     "simulation": {"systems", "learning", "control", "models"},
     "evaluation": {"simulation", "systems", "learning", "control", "models"},
-    "diagrams": {"simulation", "systems", "control", "models"},
+    "diagrams": {"simulation", "systems", "control", "learning", "models"},
     "cli": {"evaluation", "simulation", "systems", "learning", "control", "models"},
 }
 # An online run needs none of these, so importing the library must not either.

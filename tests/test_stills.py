@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.stills import StillCamera, render_stills
+from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 
 SIZE = {"width": 96, "height": 72}
@@ -14,9 +14,11 @@ def loop():
 
 @pytest.fixture(scope="module")
 def standing(loop):
-    context = loop.CreateDefaultContext()
-    loop.reset_calm(context, np.random.default_rng(0))
-    return loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
+    plant = loop.plant
+    positions = plant.GetPositions(plant.CreateDefaultContext())
+    start = plant.GetBodyByName(loop.robot.base).floating_positions_start()
+    positions[start + 4 : start + 7] = [0.0, 0.0, loop.kinematics.standing_height]
+    return moved(loop, positions, "ball", [50.0, 50.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +79,23 @@ def test_stills_show_the_nearest_logged_instants(loop, standing):
     stills = render_stills(loop, [0.0, 0.1], [standing, ball], [0.02, 0.09], **SIZE)
     assert [time for time, _ in stills] == [0.0, 0.1]
     assert [share_of_orange(image) > 0.0 for _, image in stills] == [False, True]
+
+
+def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):
+    plant, name = loop.plant, loop.robot.name
+    q = np.random.default_rng(0).normal(size=(4, plant.num_positions()))
+    robot, ball = (plant.GetModelInstanceByName(n) for n in (name, "ball"))
+    states = {
+        name: np.array([plant.GetPositionsFromArray(robot, row) for row in q]),
+        "ball": np.array(
+            [np.append(plant.GetPositionsFromArray(ball, row), 6 * [9.0]) for row in q]
+        ),
+    }
+    np.testing.assert_array_equal(stack_positions(loop, states), q)
+    with pytest.raises(ValueError, match=rf"states of \['ball'\], expected those of .*{name}"):
+        stack_positions(loop, {"ball": states["ball"]})
+    with pytest.raises(ValueError, match="'ball' has 3 columns, expected 7 positions or 13"):
+        stack_positions(loop, states | {"ball": np.zeros((4, 3))})
 
 
 def test_what_does_not_fit_the_plant_is_refused(loop, camera, standing):

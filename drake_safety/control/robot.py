@@ -127,7 +127,7 @@ class PlantVariation:
                 )
 
 
-_FRICTION_DAMPING = 200.0  # [N·m·s/rad]: stiction creeps at tau_c / 200, below 0.003 rad/s.
+_FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
 def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:

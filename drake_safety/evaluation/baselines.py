@@ -10,8 +10,8 @@ from drake_safety.learning.segments import Episodes, Segments, split
 
 KINDS = ("gradient_boosting", "mlp")
 _VALIDATION_SHARE = 0.1
-_MLP_EPOCHS = 40
-_MLP_PATIENCE = 8
+_MLP_EPOCHS = 60
+_MLP_PATIENCE = 20
 
 
 class DirectClassifier:
@@ -89,8 +89,8 @@ class DirectClassifier:
         x = self._inputs(state, desired_preview, features)
         if x.shape[1] != self.num_inputs_:
             raise ValueError(
-                f"DirectClassifier '{self.kind}': the input has {x.shape[1]} columns, it was fitted "
-                f"to {self.num_inputs_}"
+                f"DirectClassifier '{self.kind}': the input has {x.shape[1]} columns, it was "
+                f"fitted to {self.num_inputs_}"
             )
         probability = np.full(len(x), np.nan)
         is_finite = np.isfinite(x).all(axis=1)
@@ -161,13 +161,14 @@ class DirectClassifier:
             learning_rate_init=1e-3,
             random_state=self.seed,
         )
-        best, best_loss, waited = None, np.inf, 0
+        best, smallest_error, waited = None, np.inf, 0
         for _ in range(_MLP_EPOCHS):
             model.partial_fit(x, label, classes=[False, True])
-            loss = _log_loss(model.predict_proba(x_held_out)[:, 1], label_held_out)
+            # The log loss would stop a net that is overconfident but still learning to rank.
+            error = np.mean((model.predict_proba(x_held_out)[:, 1] - label_held_out) ** 2)
             waited += 1
-            if loss < best_loss:
-                best_loss, waited = loss, 0
+            if error < smallest_error:
+                smallest_error, waited = error, 0
                 best = [w.copy() for w in (*model.coefs_, *model.intercepts_)]
             if waited == _MLP_PATIENCE:
                 break
@@ -179,8 +180,3 @@ class DirectClassifier:
     def _standardised(self, x: np.ndarray) -> np.ndarray:
         # Double precision: the penalty drives idle weights into float32's slow subnormal range.
         return (x - self.mean_) / self.scale_
-
-
-def _log_loss(probability: np.ndarray, label: np.ndarray) -> float:
-    of_truth = np.where(label, probability, 1.0 - probability)
-    return float(-np.log(np.maximum(of_truth, 1e-12)).mean())

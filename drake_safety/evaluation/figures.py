@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import GridSpecBase
 
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.balls import Throw
@@ -44,7 +45,7 @@ OUTCOMES: dict[str, tuple[str, str]] = {
 }
 """What can come of a throw, with colour and marker."""
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 10.0,
     "axes.titlesize": 11.0,
     "axes.titleweight": "bold",
@@ -118,7 +119,7 @@ def embedding_figure(
     beliefs: np.ndarray | None = None,
     right: str = "causes",
 ) -> Figure:
-    """The map: segments in the embedding, the beliefs of its cells, and what they say beyond safety.
+    """The map: segments in the embedding, the beliefs of its cells, and their causes.
 
     Of an ensemble it is the first map.
 
@@ -186,8 +187,9 @@ def _draw_segments(
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
     bar = fig.colorbar(dots, ax=axes, shrink=0.8, pad=0.02, label="unsafety score λ")
-    bar.outline.set_visible(False)  # type: ignore[operator]
-    bar.solids.set_alpha(1.0)
+    bar.outline.set_visible(False)
+    if bar.solids is not None:
+        bar.solids.set_alpha(1.0)
 
 
 def _draw_grid(axes: Axes, grid: Grid) -> None:
@@ -244,7 +246,7 @@ def _draw_safety(
     axes.set_title("Belief of each cell: safe")
     axes.set_xlabel("numbers: segments learned from; hatched: EMPTY")
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label="belief mass of safe")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
 
 
 def _draw_causes(
@@ -281,7 +283,7 @@ def _draw_uncertainty(fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray) ->
     _draw_cells(axes, grid, shade.to_rgba(cells[:, UNCERTAINTY]), cells[:, UNCERTAINTY] >= 1.0)
     axes.set_title("Belief of each cell: unknown")
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label="uncertainty μ")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
 
 
 def _words(name: str) -> str:
@@ -346,11 +348,12 @@ def timeline_figure(
             picture_height = min(aspect * width / len(stills), 2.6) + 0.35
         fig = _new_figure(width, sum(heights) + picture_height + 0.6)
         if stills:
-            top, bottom = fig.add_gridspec(
+            halves = fig.add_gridspec(
                 2, 1, height_ratios=[picture_height, sum(heights)], hspace=0.08
             )
-            pictures = top.subgridspec(1, len(stills), wspace=0.03).subplots()
-            rows = bottom.subgridspec(len(heights), 1, height_ratios=heights)
+            strip = halves[0, 0].subgridspec(1, len(stills), wspace=0.03)
+            pictures = [fig.add_subplot(strip[0, i]) for i in range(len(stills))]
+            rows: GridSpecBase = halves[1, 0].subgridspec(len(heights), 1, height_ratios=heights)
         else:
             rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
         panels: list[Axes] = []
@@ -365,7 +368,7 @@ def timeline_figure(
             _draw_margins(next(remaining), time_s, margins, constraint_names)
         _mark_events(panels, time_s, threshold, throws, trigger_times_s, recovery_intervals_s)
         if stills:
-            _draw_stills(fig, np.atleast_1d(pictures), panels[0], time_s, gamma, stills)
+            _draw_stills(fig, pictures, panels[0], time_s, gamma, stills)
         for panel in panels[:-1]:
             panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time [s]")
@@ -495,7 +498,7 @@ def _mark_events(
 
 def _draw_stills(
     fig: Figure,
-    pictures: np.ndarray,
+    pictures: Sequence[Axes],
     gamma_axes: Axes,
     time_s: np.ndarray,
     gamma: np.ndarray,
@@ -608,7 +611,8 @@ def throws_figure(
 
     Args:
         speed_m_s: Speeds [m/s], (N,).
-        direction_rad: Where each ball flies to, from the robot's forward axis to its left [rad], (N,).
+        direction_rad: Where each ball flies to, from the robot's forward axis to its left [rad],
+            (N,).
         outcomes: One panel each: its title and the outcome of every throw, a key of `OUTCOMES`.
         mass_kg: Masses [kg], (N,); heavier ones are drawn larger.
 

@@ -1,7 +1,7 @@
 """Figures of merit with intervals that respect what is independent: episodes, not their segments.
 
-A scorer gives every segment an unsafe score: a number that is larger where it expects an unsafe end,
-such as 1 - Gamma. A segment is judged unsafe when its score exceeds a threshold, as a recovery
+A scorer gives every segment an unsafe score: a number that is larger where it expects an unsafe
+end, such as 1 - Gamma. A segment is judged unsafe when its score exceeds a threshold, as a recovery
 triggers on Gamma < Gamma_thre. A score that is NaN says "don't know", which counts as unsafe.
 """
 
@@ -121,7 +121,8 @@ def auc(
 ) -> Figure:
     """The area under the ROC curve, with an interval from a bootstrap over episodes.
 
-    Where unsafe and safe samples do not overlap the bootstrap sees no spread: low is then 1 as well.
+    Where the scores of unsafe and safe samples do not overlap the bootstrap sees no spread, and low
+    is 1 as well.
 
     Args:
         unsafe_score: Unsafe scores, (N,).
@@ -351,8 +352,8 @@ def _squared_error(who: str, score: np.ndarray, label: np.ndarray) -> np.ndarray
     probability = np.where(np.isposinf(score), 1.0, score)
     if not np.all((probability >= 0.0) & (probability <= 1.0)):
         raise ValueError(
-            f"{who}: probabilities must lie in [0, 1], got {probability.min()}..{probability.max()}; "
-            "scores of another kind take is_probability=False"
+            f"{who}: probabilities must lie in [0, 1], got {probability.min()}.."
+            f"{probability.max()}; scores of another kind take is_probability=False"
         )
     return (probability - label) ** 2
 

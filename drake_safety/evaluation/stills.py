@@ -7,11 +7,10 @@ seen, and nothing is added to its diagram: the renderer lives in a Context of it
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -24,6 +23,7 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.sensors import CameraInfo
 
 from drake_safety.models import load_robot
@@ -159,6 +159,40 @@ class StillCamera:
         points = np.hstack(corners)
         centre = 0.5 * (points.min(axis=1) + points.max(axis=1))
         return centre, float(np.linalg.norm(points - centre[:, None], axis=0).max())
+
+
+def stack_positions(loop: ClosedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
+    """All of a plant's positions from the logged states of its model instances.
+
+    Args:
+        loop: A closed loop that has its MultibodyPlant as ``plant``.
+        states: Per model instance by name its positions, or positions and velocities, (N, n).
+
+    Returns:
+        Positions, (N, n_q).
+
+    Raises:
+        ValueError: A model instance that moves is missing, or has another number of positions.
+    """
+    plant = loop.plant
+    instances = [ModelInstanceIndex(i) for i in range(plant.num_model_instances())]
+    moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
+    if set(states) != set(moving):
+        raise ValueError(
+            f"stack_positions: states of {sorted(states)}, expected those of {sorted(moving)}"
+        )
+    positions = np.zeros((len(next(iter(states.values()))), plant.num_positions()))
+    for name, state in states.items():
+        instance = moving[name]
+        n_q, n_v = plant.num_positions(instance), plant.num_velocities(instance)
+        if state.shape[1] not in (n_q, n_q + n_v):
+            raise ValueError(
+                f"stack_positions: '{name}' has {state.shape[1]} columns, expected {n_q} positions "
+                f"or {n_q + n_v} with velocities"
+            )
+        for row, values in zip(positions, state[:, :n_q], strict=True):
+            plant.SetPositionsInArray(instance, values, row)
+    return positions
 
 
 def render_stills(

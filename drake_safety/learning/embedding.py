@@ -28,8 +28,8 @@ def tsne(
 ) -> np.ndarray:
     """The t-SNE embedding of a neighbour graph, (N, 2); the same seed gives the same bits.
 
-    The distances enter as they are: openTSNE squares them itself. It runs on one thread: with
-    several, the bits depend on their number, and on a busy machine they mostly wait.
+    The distances enter as they are: openTSNE squares them itself. It runs on one thread:
+    several gain nothing with the FFT of large sets, and on a busy machine they mostly wait.
 
     Raises:
         ValueError: The graph has fewer than three times `perplexity` neighbours a segment.

@@ -61,6 +61,9 @@ class ClosedLoop(Diagram):
     Parameters: type
     """Schema of the task's own part of the scenario file."""
 
+    online_parameters: tuple[str, ...] = ()
+    """Names of parameters that no recorded episode depends on; the scenario's hash leaves them out."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Iterable, Iterator
+import logging
+import warnings
+from collections.abc import Callable, Generator, Iterable
 from os import PathLike
 from typing import Any
 
@@ -25,6 +27,7 @@ _ROW_PORTS = (
     "features",
     "margins",
 )
+_LOGGER = logging.getLogger("drake_safety")
 _BATCH = 4  # Episodes a worker takes at a time.
 
 Progress = Callable[[int, int], None]
@@ -103,9 +106,10 @@ def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
 
     recorder = Recorder(loop)
     is_diverged = False
+    # A mistake in the diagram shows here; what fails once it runs is the simulation.
+    simulator.Initialize()
+    recorder.record(context)
     try:
-        simulator.Initialize()
-        recorder.record(context)
         if safe.Eval(context)[0] >= 1:
             simulator.set_monitor(stop_when_unsafe)
             for step in range(1, scenario.num_steps + 1):
@@ -113,12 +117,16 @@ def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
                 recorder.record(context)
                 if safe.Eval(context)[0] < 1:
                     break
-    except (RuntimeError, ValueError, np.linalg.LinAlgError):
+    except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
+        _LOGGER.info("episode %d of '%s' diverged: %s", index, scenario.name, error)
         is_diverged = True
     arrays = recorder.arrays()
-    is_finite = np.all([np.isfinite(rows).all(axis=1) for rows in list(arrays.values())[1:]], axis=0)
+    is_finite = np.all(
+        [np.isfinite(rows).all(axis=1) for name, rows in arrays.items() if name != "time_s"],
+        axis=0,
+    )
     if is_diverged or not is_finite.all():
-        num_rows = int(np.argmin(is_finite)) if not is_finite.all() else len(is_finite)
+        num_rows = len(is_finite) if is_finite.all() else int(np.argmin(is_finite))
         if num_rows == 0:
             raise RuntimeError(
                 f"episode {index} of '{scenario.name}' (seed {seed}) has no finite initial state"
@@ -175,15 +183,15 @@ def run_episodes(
         progress(len(done), num_episodes)
     finished: list[Episode] = []
     writer = EpisodeWriter(path, info, extra) if path is not None else None
+    results = parallel_map(
+        _episode_batch,
+        [
+            (scenario, variation, loop_options, seed, todo[i : i + _BATCH])
+            for i in range(0, len(todo), _BATCH)
+        ],
+        num_workers,
+    )
     try:
-        results = parallel_map(
-            _episode_batch,
-            [
-                (scenario, variation, loop_options, seed, todo[i : i + _BATCH])
-                for i in range(0, len(todo), _BATCH)
-            ],
-            num_workers,
-        )
         count = len(done)
         for batch in results:
             for episode in batch:
@@ -194,9 +202,10 @@ def run_episodes(
             if progress is not None:
                 progress(count, num_episodes)
     finally:
+        results.close()
         if writer is not None:
             writer.close()
-    if done:
+    if path is not None and done:
         stored = [e for e in load_episodes(path) if e.index in done]
         finished += stored
     return Episodes(info, sorted(finished, key=lambda episode: episode.index))
@@ -204,7 +213,7 @@ def run_episodes(
 
 def parallel_map(
     function: Callable[..., Any], arguments: list[tuple], num_workers: int | None = None
-) -> Iterator[Any]:
+) -> Generator[Any, None, None]:
     """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
 
     Every worker has one BLAS thread, this process too when it does the work, so results do not
@@ -230,11 +239,16 @@ def parallel_map(
         )
         results = parallel(joblib.delayed(function)(*args) for args in arguments)
         try:
-            yield from results
+            for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
+                yield result
         except BaseException:
             from joblib.externals.loky import get_reusable_executor
 
             get_reusable_executor().shutdown(wait=False, kill_workers=True)
+            with warnings.catch_warnings():
+                # Joblib says that not all results were consumed: that is what a stop means.
+                warnings.simplefilter("ignore")
+                results.close()
             raise
 
 

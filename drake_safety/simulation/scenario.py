@@ -113,16 +113,20 @@ class Scenario:
     def simulation_hash(self) -> str:
         """SHA-256 of all that decides what a rollout does and records, robot included.
 
-        How Γ is learned is left out, but for the horizon that shapes the preview: episodes stay
-        valid when only the learning changes.
+        How Γ is learned is left out, but for the horizon that shapes the preview, and so are the
+        task's online parameters: episodes stay valid when only the learning or a threshold changes.
         """
         text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario))
         text["assessment"] = {"horizon": self.assessment.horizon}
         # A robot of one's own is known by its files, wherever their folder lies.
         text["robot"] = Path(self.robot).name
+        task = self.task_class()
         body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
-        digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode() + body.encode())
-        for path in self.task_class().model_files(self):
+        text["parameters"] = yaml.safe_load(body) or {}
+        for name in task.online_parameters:
+            text["parameters"].pop(name, None)
+        digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
+        for path in task.model_files(self):
             digest.update(Path(path).read_bytes())
         return digest.hexdigest()
 

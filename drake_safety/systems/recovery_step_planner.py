@@ -120,6 +120,9 @@ class RecoveryStepPlanner(LeafSystem):
         mode, group, steps, start = discrete_state.get_vector(self._mode).get_value().tolist()
         is_active = self.GetInputPort("recovery_active").Eval(context)[0] > 0
         if mode == _IDLE and not is_active:
+            self._set_base(
+                discrete_state, self.GetInputPort("nominal_desired_output").Eval(context)
+            )
             return
         if mode == _DONE:
             if not is_active:
