@@ -211,7 +211,7 @@ def run(
     from pydrake.geometry import Meshcat
 
     from drake_safety.evaluation.figures import save, timeline_figure
-    from drake_safety.evaluation.stills import render_stills
+    from drake_safety.evaluation.stills import render_stills, stack_positions
     from drake_safety.simulation.scenario import load_scenario
     from drake_safety.simulation.throws import run_throw
 
@@ -252,19 +252,22 @@ def run(
     spans = [
         (float(log.time_s[i]), float(log.time_s[j])) for i, j in zip(rises, falls, strict=True)
     ]
-    moments = still_times(log, throws, triggers)
-    stills = render_stills(loop, log, moments)
+    positions = stack_positions(
+        loop, {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}
+    )
     figure = timeline_figure(
         log.time_s,
         probability,
         threshold,
-        throws=[throw.time_s for throw in throws],
-        triggers=triggers,
-        recoveries=spans,
+        throws=throws,
+        trigger_times_s=triggers,
+        recovery_intervals_s=spans,
+        stills=render_stills(
+            loop, log.time_s, positions, still_times(log, throws, triggers)
+        ),
         belief=log.extra["belief"],
         margins=log.margins,
-        margin_names=loop.constraint_names,
-        stills=list(zip(moments, stills, strict=True)),
+        constraint_names=loop.constraint_names,
     )
     pictures = save(figure, folder / "timeline")
     _print_run(loop, log, throws, triggers, probability)
@@ -348,6 +351,9 @@ def evaluate(
     assessment: AssessmentOption,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     throws: Annotated[int, typer.Option(help="Fresh balls at the actual plant.", min=0)] = 600,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other nominal episodes, to choose the recalls' thresholds.", min=20)
+    ] = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other balls, to choose the classifiers' thresholds.", min=1)
     ] = 200,
@@ -390,16 +396,26 @@ def evaluate(
             progress=lambda done, total: stages("fresh nominal episodes", done, total),
         )
         _check_same_simulation(train_set.info, test_set.info)
+        calibration_set = run_episodes(
+            loaded,
+            calibration_episodes,
+            seed=seed + 3,
+            num_workers=workers,
+            progress=lambda done, total: stages("calibration episodes", done, total),
+        )
         scorers = [
             assessment_scorer("sharpened", sharpened, is_normalized=True),
             assessment_scorer("paper", paper, is_normalized=True),
             *baseline_scorers(train_set, stages),
         ]
-        figures, scores, labels = evaluate_episodes(scorers, train_set, test_set)
+        figures, scores, labels = evaluate_episodes(scorers, calibration_set, test_set)
         pictures = [
             *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
             *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
-            *save(roc_figure(labels, scores), folder / "roc"),
+            *save(
+                roc_figure({name: (score, labels) for name, score in scores.items()}),
+                folder / "roc",
+            ),
         ]
         if throws:
             recovery = loaded.parameters.recovery
@@ -425,7 +441,16 @@ def evaluate(
             figures |= study.figures
             figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
             pictures += save(
-                throws_figure(study.logs, study.recovered["sharpened"]), folder / "throws"
+                throws_figure(
+                    np.array([log.throw.speed_m_s for log in study.logs]),
+                    np.array([log.throw.direction_rad for log in study.logs]),
+                    {
+                        "balancing alone": study.outcomes(),
+                        "with recovery, triggered by Γ": study.outcomes("sharpened"),
+                    },
+                    mass_kg=np.array([log.throw.mass_kg for log in study.logs]),
+                ),
+                folder / "throws",
             )
     report = {
         "command": _command(),

@@ -85,16 +85,16 @@ def baseline_scorers(episodes: Episodes, progress: Progress | None = None) -> li
 
 
 def evaluate_episodes(
-    scorers: Sequence[Scorer], train: Episodes, test: Episodes
+    scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
 ) -> tuple[Figures, dict[str, np.ndarray], np.ndarray]:
     """Every scorer on fresh episodes, per segment and at k = 0.
 
-    The threshold of the recalls is the one of best balanced accuracy on the training episodes'
-    own segments; the test set decides nothing.
+    The threshold of the recalls is the one of best balanced accuracy on the calibration set, of
+    its segments and of its first steps; the test set decides nothing.
 
     Args:
         scorers: Who is judged.
-        train: The training episodes, for thresholds.
+        calibration: Other fresh episodes, for thresholds.
         test: Fresh episodes.
 
     Returns:
@@ -102,7 +102,7 @@ def evaluate_episodes(
         segments' labels.
     """
     segments = split(test, stride=1, discount=1.0)
-    seen = split(train[: min(len(train), 512)], stride=1, discount=1.0)
+    seen = split(calibration, stride=1, discount=1.0)
     figures: Figures = {}
     scores = {}
     for scorer in scorers:
@@ -174,6 +174,24 @@ class ThrowStudy:
     trigger_times_s: dict[str, np.ndarray]
     recovered: dict[str, dict[int, ThrowLog]]
     thresholds: dict[str, float]
+
+    def outcomes(self, rule: str | None = None) -> list[str]:
+        """What became of each throw, in the words of the throws figure.
+
+        Args:
+            rule: Who triggers recovery; nobody by default.
+        """
+        recovered = {} if rule is None else self.recovered[rule]
+        outcomes = []
+        for log in self.logs:
+            final = recovered.get(log.index, log)
+            if final.has_fallen:
+                outcomes.append("fell")
+            elif log.index not in recovered:
+                outcomes.append("survived")
+            else:
+                outcomes.append("recovered" if log.has_left else "false trigger")
+        return outcomes
 
 
 def log_probability(log: ThrowLog, scorer: Scorer) -> np.ndarray:

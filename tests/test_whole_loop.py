@@ -1,0 +1,110 @@
+"""The whole loop: nominal episodes, Γ learned from them, Γ and recovery steps in a diagram."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.throws import run_throw
+
+HARD = Throw(time_s=0.4, mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.2)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    scenario = load_scenario("laikago_balancing")
+    scenario.assessment.epochs = 12
+    scenario.assessment.ensemble_size = 2
+    scenario.assessment.hidden_sizes = [64, 64]
+    return scenario
+
+
+@pytest.fixture(scope="module")
+def episodes(scenario):
+    return run_episodes(scenario, 128, seed=3)
+
+
+@pytest.fixture(scope="module")
+def assessment(scenario, episodes, tmp_path_factory):
+    path = tmp_path_factory.mktemp("assessment") / "sharpened.safetensors"
+    SafetyAssessment(scenario.assessment).fit(episodes).save(path)
+    return SafetyAssessment.load(path)
+
+
+def test_episodes_hold_both_outcomes(episodes):
+    assert 0.2 < episodes.num_unsafe / len(episodes) < 0.8
+    assert episodes.num_diverged == 0
+    assert any(episode.first_step == 1 for episode in episodes), "some begin as a ball hits"
+
+
+def test_gamma_tells_unsafe_episodes_from_safe_ones_shortly_before_the_end(scenario, assessment):
+    fresh = run_episodes(scenario, 48, seed=4)
+    last = []
+    for episode in fresh:
+        row = max(episode.num_steps - 3, episode.first_step)
+        result = assessment.predict(
+            episode.state[row : row + 1],
+            episode.desired_preview[row : row + 1],
+            episode.features[row : row + 1],
+        )
+        last.append(result.normalized[0])
+    is_safe = np.array([episode.is_safe for episode in fresh])
+    assert np.mean(np.array(last)[is_safe]) - np.mean(np.array(last)[~is_safe]) > 0.3
+
+
+def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
+    loop = scenario.make_loop("actual", assessment=assessment, recovery=False, ball=True)
+    ports = ("safety_probability", "normalized_safety_probability", "belief")
+    log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=1.0, ports=ports)
+    result = assessment.predict(log.state, log.desired_preview, log.features)
+    # A row shows the state before the updates of its instant: Γ of a row is published in the next.
+    np.testing.assert_allclose(
+        log.extra["normalized_safety_probability"][1:, 0], result.normalized[:-1], atol=1e-5
+    )
+    np.testing.assert_allclose(log.extra["belief"][1:], result.belief[:-1], atol=1e-5)
+    np.testing.assert_allclose(log.extra["belief"].sum(axis=1), 1.0, atol=1e-6)
+
+
+def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot(scenario, assessment):
+    alone = scenario.make_loop("actual", assessment=assessment, recovery=False, ball=True)
+    log = run_throw(alone, 0, seed=8, throws=[HARD], duration_s=2.5)
+    assert log.has_fallen
+    loop = scenario.make_loop("actual", assessment=assessment, ball=True)
+    log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=3.0)
+    assert not log.has_fallen
+    assert log.trigger_time_s < HARD.time_s + 0.1
+    assert log.violations["legs_collide"] == 0
+    assert log.violations["joint_position"] == 0
+    assert log.violations["joint_effort"] == 0
+
+
+def test_the_lines_of_the_readme_run_a_simulation(scenario, assessment):
+    loop = scenario.make_loop(variation="actual", assessment=assessment)
+    simulator = Simulator(loop)
+    loop.reset(simulator.get_mutable_context(), np.random.default_rng(0))
+    simulator.AdvanceTo(0.2)
+    belief = loop.GetOutputPort("belief").Eval(simulator.get_context())
+    assert belief.sum() == pytest.approx(1.0)
+
+
+def test_an_assessment_of_another_scenario_is_refused_with_both_sides_named(assessment):
+    other = load_scenario("laikago_balancing")
+    other.variations["nominal"].mass_scale = 0.7
+    with pytest.raises(ValueError, match=r"scenario hash.*learned with.*the diagram has"):
+        other.make_loop("actual", assessment=assessment)
+    other = load_scenario("laikago_balancing")
+    other.step_s = 0.05
+    with pytest.raises(ValueError, match=r"step_s.*0\.04.*0\.05"):
+        other.make_loop("actual", assessment=assessment)
+
+
+def test_an_input_that_is_not_finite_is_answered_with_dont_know(assessment):
+    info = assessment.info_
+    state = np.zeros(len(info.state_names))
+    state[3] = np.nan
+    result = assessment.predict_one(
+        state, np.zeros(3 * info.horizon), np.zeros(len(info.feature_names))
+    )
+    np.testing.assert_array_equal(result.belief, [0.0, 0.0, 1.0])
+    assert result.safety_probability == 0.0
