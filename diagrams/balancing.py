@@ -1,11 +1,13 @@
 """Balancing: a legged robot keeps its base over its feet along a plan, and steps when it must."""
 
+import logging
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlparse
 
 import numpy as np
+from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.geometry import HalfSpace, Meshcat, MeshcatVisualizer
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import PackageMap, Parser
@@ -17,7 +19,6 @@ from pydrake.multibody.plant import (
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, RandomSource
 from pydrake.trajectories import PiecewisePolynomial
-from pydrake.common import RandomDistribution, RandomGenerator
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
@@ -166,9 +167,14 @@ class Balancing(ClosedLoop):
         add_to_package_map(parser.package_map())
         parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
         mu = self.variation.foot_friction or robot.foot_friction
+        drake_logger = logging.getLogger("drake")
+        level = drake_logger.level
+        # Drake warns that a half space takes no part in deformable contact; there is none.
+        drake_logger.setLevel(logging.ERROR)
         plant.RegisterCollisionGeometry(
             plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
         )
+        drake_logger.setLevel(level)
         has_ball = parameters.push.share > 0 if ball is None else ball
         ball_instance = add_ball(plant) if has_ball else None
         plant.Finalize()
@@ -216,7 +222,8 @@ class Balancing(ClosedLoop):
         measured = observer.GetOutputPort("measured_plant_state")
 
         planner = builder.AddNamedSystem(
-            "trajectory_planner", TrajectoryPlanner(
+            "trajectory_planner",
+            TrajectoryPlanner(
                 horizon=horizon,
                 step_s=scenario.step_s,
                 outlook_s=scenario.episode_duration_s,
@@ -273,12 +280,8 @@ class Balancing(ClosedLoop):
                 controller.GetInputPort("desired_foot_positions"),
             )
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=self._servo_matrix()))
-        builder.Connect(
-            controller.GetOutputPort("desired_joint_state"), servos.get_input_port()
-        )
-        builder.Connect(
-            servos.get_output_port(), plant.get_desired_state_input_port(instance)
-        )
+        builder.Connect(controller.GetOutputPort("desired_joint_state"), servos.get_input_port())
+        builder.Connect(servos.get_output_port(), plant.get_desired_state_input_port(instance))
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
         monitor = builder.AddNamedSystem(
@@ -359,7 +362,10 @@ class Balancing(ClosedLoop):
             model = str(Path(package_map.GetPath(url.netloc)) / url.path.lstrip("/"))
         else:
             model = str(Path(robot.source_dir) / robot.urdf)
-        return [str(Path(robot.source_dir) / "robot.yaml"), model]
+        file_name = Path(scenario.robot).name
+        if Path(file_name).suffix not in (".yaml", ".yml"):
+            file_name = "robot.yaml"
+        return [str(Path(robot.source_dir) / file_name), model]
 
     def _servo_matrix(self) -> np.ndarray:
         """Maps [q; v] of the joints onto the plant's actuators; friction holds velocity zero."""
@@ -456,9 +462,7 @@ class Balancing(ClosedLoop):
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
-        joints = np.clip(
-            joints, kinematics.position_limits[:, 0], kinematics.position_limits[:, 1]
-        )
+        joints = np.clip(joints, kinematics.position_limits[:, 0], kinematics.position_limits[:, 1])
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
         q = kinematics.positions_at(X_WB, joints)

@@ -8,7 +8,7 @@ import logging
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,10 +35,12 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
     no_args_is_help=True,
+    rich_markup_mode=None,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
+# Square brackets are units here, not markup.
+console = Console(markup=False)
 _MODES = ("sharpened", "paper")
 
 ScenarioArgument = Annotated[
@@ -145,9 +147,11 @@ def train(
         for name in _MODES if mode == "both" else (mode,):
             loaded.assessment.mode = name
             started = time.process_time()
-            assessment = SafetyAssessment(loaded.assessment).fit(
-                data, lambda stage, share, name=name: stages(f"{name}: {stage}", 100 * share, 100)
-            )
+
+            def report(stage: str, share: float, name: str = name) -> None:
+                stages(f"{name}: {stage}", round(100 * share), 100)
+
+            assessment = SafetyAssessment(loaded.assessment).fit(data, report)
             path = assessment_file(out, name)
             assessment.save(path)
             table.add_row(
@@ -177,7 +181,8 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     if not path.is_file():
         there = sorted(file.stem for file in folder.glob("*.safetensors"))
         raise ValueError(
-            f"{folder} holds no '{mode}' assessment; it holds {there}: run `drake-safety train` first"
+            f"{folder} holds no '{mode}' assessment; it holds {there}: "
+            "run `drake-safety train` first"
         )
     return SafetyAssessment.load(path)
 
@@ -201,7 +206,8 @@ def run(
     seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = 0,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
-        Path | None, typer.Option(help="Folder for recording and pictures; ASSESSMENT's by default.")
+        Path | None,
+        typer.Option(help="Folder for recording and pictures; ASSESSMENT's by default."),
     ] = None,
     meshcat: Annotated[
         bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
@@ -225,8 +231,14 @@ def run(
     if meshcat:
         console.print(f"live at {viewer.web_url()}")
         input("Press Enter when the browser shows the robot. ")
-    ports = ("normalized_safety_probability", "safety_probability", "belief", "cause_probability",
-             "predicted_margins", "ball_state")
+    ports = (
+        "normalized_safety_probability",
+        "safety_probability",
+        "belief",
+        "cause_probability",
+        "predicted_margins",
+        "ball_state",
+    )
     viewer.StartRecording()
     log = run_throw(
         loop,
@@ -262,9 +274,7 @@ def run(
         throws=throws,
         trigger_times_s=triggers,
         recovery_intervals_s=spans,
-        stills=render_stills(
-            loop, log.time_s, positions, still_times(log, throws, triggers)
-        ),
+        stills=render_stills(loop, log.time_s, positions, still_times(log, throws, triggers)),
         belief=log.extra["belief"],
         margins=log.margins,
         constraint_names=loop.constraint_names,
@@ -292,7 +302,7 @@ def _print_run(
     table = Table("time [s]", "event", "Γ")
 
     def gamma_at(time_s: float) -> str:
-        return f"{probability[min(int(round(time_s / 0.02)), len(probability) - 1)]:.2f}"
+        return f"{probability[min(round(time_s / 0.02), len(probability) - 1)]:.2f}"
 
     events = [
         (
@@ -303,11 +313,13 @@ def _print_run(
         for throw in throws
     ]
     for time_s in triggers:
-        row = int(round(time_s / 0.02))
+        row = round(time_s / 0.02)
         causes = log.extra["cause_probability"][row]
         cause = loop.constraint_names[int(np.argmax(causes))]
         margin = log.extra["predicted_margins"][row][int(np.argmax(causes))]
-        events.append((time_s, f"recovery triggered; expected violation: {cause}, {100 * margin:+.1f} cm"))
+        events.append(
+            (time_s, f"recovery triggered; expected violation: {cause}, {100 * margin:+.1f} cm")
+        )
     if log.has_fallen:
         events.append((log.fall_time_s, "the robot fell"))
     else:
@@ -320,8 +332,14 @@ def _print_run(
 def _throws(scenario: Scenario, push: list[str]) -> list[Throw]:
     from drake_safety.simulation.balls import Throw
 
-    keys = {"time": "time_s", "mass": "mass_kg", "speed": "speed_m_s", "direction": "direction_rad",
-            "offset": "offset_m", "height": "height_m"}
+    keys = {
+        "time": "time_s",
+        "mass": "mass_kg",
+        "speed": "speed_m_s",
+        "direction": "direction_rad",
+        "offset": "offset_m",
+        "height": "height_m",
+    }
     throws: list[Throw] = []
     for text in push:
         if text == "ball":
@@ -498,22 +516,31 @@ def _print_episodes(figures: dict[str, Any], names: list[str]) -> None:
 def _print_throws(figures: dict[str, Any], names: list[str]) -> None:
     alone = figures["throws.falls_without_recovery"]
     table = Table(
-        "trigger", "Γ_thre", "falls [%]", "false triggers [%]", "falls missed", "after impact [ms]",
+        "trigger",
+        "Γ_thre",
+        "falls [%]",
+        "false triggers [%]",
+        "falls missed",
+        "after impact [ms]",
         "before the fall [s]",
         title=f"{alone.n} fresh throws at the actual plant; balancing alone falls in "
         f"{_interval(alone, 100, 1)} %",
     )
     for name in names:
-        get: Callable[[str], Any] = lambda key, name=name: figures[f"throws.{name}.{key}"]
-        missed = get("falls_missed")
+        rule = {
+            key.removeprefix(f"throws.{name}."): figure
+            for key, figure in figures.items()
+            if key.startswith(f"throws.{name}.")
+        }
+        missed = rule["falls_missed"]
         table.add_row(
             name,
-            f"{get('threshold').value:.2f}",
-            _interval(get("falls_with_recovery"), 100, 1),
-            _interval(get("false_triggers"), 100, 1),
+            f"{rule['threshold'].value:.2f}",
+            _interval(rule["falls_with_recovery"], 100, 1),
+            _interval(rule["false_triggers"], 100, 1),
             f"{round(missed.value * missed.n) if missed.n else 0} of {missed.n}",
-            f"{1000 * get('trigger_after_impact_s').value:.0f}",
-            f"{get('trigger_before_fall_s').value:.2f}",
+            f"{1000 * rule['trigger_after_impact_s'].value:.0f}",
+            f"{rule['trigger_before_fall_s'].value:.2f}",
         )
     console.print(table)
 
@@ -525,8 +552,11 @@ def _command() -> str:
 def _versions() -> dict[str, str]:
     import importlib.metadata
 
-    names = ("drake_safety", "drake", "numpy", "scipy", "scikit-learn", "torch")
-    return {name: importlib.metadata.version(name) for name in names}
+    import drake_safety
+
+    names = ("drake", "numpy", "scipy", "scikit-learn", "torch")
+    versions = {name: importlib.metadata.version(name) for name in names}
+    return {"drake_safety": drake_safety.__version__, **versions}
 
 
 def main() -> None:
@@ -534,13 +564,19 @@ def main() -> None:
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     try:
-        app(standalone_mode=True)
-    except ValueError as error:
-        console.print(f"[bold red]error[/] {error}", highlight=False)
+        sys.exit(app(standalone_mode=False))
+    except (ValueError, OSError) as error:
+        console.print("error", error, style="red", highlight=False, soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except (typer.Abort, KeyboardInterrupt):
         console.print("stopped; finished episodes are kept", highlight=False)
         sys.exit(130)
+    except Exception as error:
+        # Typer's own errors (unknown options, wrong types) know how to show themselves.
+        if not hasattr(error, "exit_code") or not hasattr(error, "show"):
+            raise
+        error.show()
+        sys.exit(error.exit_code)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,10 @@ def test_a_missing_scenario_file_is_named(tmp_path):
         (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
         (BALANCING + "parameters: {push: {sharee: 1}}", "'push.sharee'; keys there are .*'share'"),
         (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
-        (BALANCING + "parameters: {demonstration: [{mas_kg: 1}]}", "demonstration.0.mas_kg'.*'mass_kg'"),
+        (
+            BALANCING + "parameters: {demonstration: [{mas_kg: 1}]}",
+            "demonstration.0.mas_kg'.*'mass_kg'",
+        ),
         (BALANCING + "parameters: {demonstration: [{mass_kg: 0}]}", "throw: mass_kg must be pos"),
         (BALANCING + "parameters: 3", "parameters: this must be a mapping"),
         (BALANCING + "step_s: fast", "scenario 'mine'.*float.*fast"),

@@ -59,9 +59,7 @@ def test_before_the_trigger_recovery_changes_nothing_at_all(balancing, recoverin
 def test_recovery_steps_save_the_robot_without_cheating(recovering):
     for direction in (math.pi / 2, -math.pi / 4, math.pi):
         throw = Throw(time_s=0.3, mass_kg=3.0, speed_m_s=8.0, direction_rad=direction)
-        log = run_throw(
-            recovering, 1, seed=5, throws=[throw], duration_s=3.5, trigger_time_s=0.32
-        )
+        log = run_throw(recovering, 1, seed=5, throws=[throw], duration_s=3.5, trigger_time_s=0.32)
         assert log.trigger_time_s == pytest.approx(0.32)
         assert not log.has_fallen
         assert log.recovery_active[-1] == 0, "the robot has handed over to balancing"

@@ -155,8 +155,10 @@ class RobotKinematics:
         Returns:
             Torques (n_j,) [N·m].
         """
-        J = self.contact_jacobian(q) if J is None else J
-        self._set_positions(q)
+        if J is None:
+            J = self.contact_jacobian(q)  # Sets the positions.
+        else:
+            self._set_positions(q)
         g = self.plant.CalcGravityGeneralizedForces(self.context)
         if not is_stance.all():
             if not is_stance.any():

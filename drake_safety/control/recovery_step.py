@@ -12,7 +12,7 @@ _GRAVITY = 9.81
 class RecoveryStepParameters:
     """The numbers of a recovery step."""
 
-    step_duration_s: float = 0.12
+    step_duration_s: float = 0.09
     """Duration of a swing; the other feet carry the robot meanwhile [s]."""
     lift_m: float = 0.06
     """Height of the swing curve's top [m]."""
@@ -20,7 +20,7 @@ class RecoveryStepParameters:
     """Raibert's gain: how much further than the neutral point per speed [s]."""
     max_reach_m: float = 0.18
     """A foothold is at most this far from its hip's ground projection [m]."""
-    min_lateral_m: float = 0.09
+    min_lateral_m: float = 0.11
     """A foothold is at least this far from the base's midline, on its own side [m]."""
     min_steps: int = 2
     """Swings before the robot may stop."""

@@ -33,7 +33,10 @@ _logger = logging.getLogger("drake_safety")
 
 @dataclass(kw_only=True)
 class AssessmentParameters:
-    """What a safety assessment is trained with; the defaults are the paper's Table I.
+    """What a safety assessment is trained with.
+
+    discount, horizon, score_weight, initial_uncertainty and min_count default to the paper's
+    Table I, resolution and cell_length to its text; the other defaults are our own.
 
     The paper's mode is fixed beyond Table I: one plain map with two layers of 128, trained on
     segments that do not overlap. What is marked "sharpened" has no meaning there.
@@ -55,6 +58,8 @@ class AssessmentParameters:
         ensemble_size: Number of maps K (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Share of activations dropped in training (sharpened).
+        target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
+            decide where neighbours in t-SNE part.
         safety_weight: Weight of the safety head's loss (sharpened).
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
@@ -77,13 +82,14 @@ class AssessmentParameters:
     batch_size: int = 512
     epochs: int = 18
     ensemble_size: int = 3
-    hidden_sizes: list[int] = field(default_factory=lambda: [256, 256, 256])
-    dropout: float = 0.1
+    hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
+    dropout: float = 0.2
+    target_weight: float = 0.1
     safety_weight: float = 5.0
     margin_weight: float = 1.0
     margin_unit: float = 0.02
     margin_range: list[float] = field(default_factory=lambda: [-0.03, 0.10])
-    first_row_weight: float = 1.0
+    first_row_weight: float = 6.0
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -92,7 +98,7 @@ class AssessmentParameters:
             )
         for name in ("discount", "initial_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
-        for name in ("score_weight", "safety_weight", "margin_weight"):
+        for name in ("score_weight", "target_weight", "safety_weight", "margin_weight"):
             self._expect(name, getattr(self, name) >= 0.0, ">= 0")
         for name in ("horizon", "min_count", "resolution", "batch_size", "epochs", "ensemble_size"):
             self._expect(name, getattr(self, name) >= 1, ">= 1")
@@ -291,6 +297,7 @@ class SafetyAssessment:
             epochs=parameters.epochs if is_sharpened else 40,
             batch_size=parameters.batch_size,
             learning_rate=parameters.learning_rate,
+            target_weight=parameters.target_weight if is_sharpened else 1.0,
             safety_weight=parameters.safety_weight if is_sharpened else 0.0,
             margin_weight=parameters.margin_weight if is_sharpened else 0.0,
             margin_unit=parameters.margin_unit,
@@ -403,8 +410,9 @@ class SafetyAssessment:
             masses += self._masses(member_beliefs, points)
         masses /= len(beliefs)
         num_causes = masses.shape[1] - 3
-        known = 1.0 - masses[:, belief_masses.UNCERTAINTY]
         safe = masses[:, belief_masses.SAFE]
+        # As a sum, not as 1 - mu: rounding must not lift the share above one.
+        known = safe + masses[:, belief_masses.UNSAFE]
         margins = np.full((len(x), num_causes), np.nan)
         if output.margins.shape[2]:
             margins = output.margins.mean(axis=0)
@@ -490,10 +498,11 @@ class SafetyAssessment:
     ) -> Assessment:
         if masses is None:
             masses = belief_masses.empty((), num_columns - 3)
-        safe, _, uncertainty = masses[:3].tolist()
+        safe, unsafe, _ = masses[:3].tolist()
+        known = safe + unsafe
         return Assessment(
             safety_probability=safe,
-            normalized=safe / (1.0 - uncertainty) if uncertainty < 1.0 else 0.0,
+            normalized=safe / known if known > 0.0 else 0.0,
             belief=masses[:3],
             embedding=point[:2],
             cause_probability=masses[3:],

@@ -123,10 +123,10 @@ class Embedding:
             (self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :])
             for name in names
         ]
-        for (w, _), (following, _) in zip(self._layers, self._layers[1:], strict=False):
-            if w.shape[0] != following.shape[0] or w.shape[2] != following.shape[1]:
+        for (w, _), (next_w, _) in zip(self._layers, self._layers[1:], strict=False):
+            if w.shape[0] != next_w.shape[0] or w.shape[2] != next_w.shape[1]:
                 raise ValueError(
-                    f"Embedding: a layer of shape {w.shape} is followed by one of {following.shape}"
+                    f"Embedding: a layer of shape {w.shape} is followed by one of {next_w.shape}"
                 )
         first, first_bias = self._layers[0]
         self.num_members, self.num_inputs, width = first.shape
@@ -137,10 +137,19 @@ class Embedding:
             )
         self.has_safety_head = "safety.0.weight" in self.weights
         # All members share the input, so that one product serves their first layers.
-        self._first = first.transpose(1, 0, 2).reshape(self.num_inputs, -1)
+        joint = first.transpose(1, 0, 2).reshape(self.num_inputs, -1)
         self._first_bias = first_bias.reshape(-1)
-        self._stacked = (self.num_members, 1, width)
-        self._online = _pack([self._first, *(w for w, _ in self._layers[1:])])
+        self._first, *following = _pack([joint, *(w for w, _ in self._layers[1:])])
+        biases = [bias for _, bias in self._layers[1:]]
+        self._stacked: tuple[int, ...] = (self.num_members, 1, width)
+        if self.num_members == 1:
+            # Plain products of a vector and a matrix cost numpy half of what stacks of one cost.
+            self._stacked = (width,)
+            self._following = [
+                (w[0], bias[0, 0]) for w, bias in zip(following, biases, strict=True)
+            ]
+        else:
+            self._following = list(zip(following, biases, strict=True))
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
@@ -181,18 +190,14 @@ class Embedding:
 
     def evaluate_one(self, x: np.ndarray) -> np.ndarray:
         """y and margins of one finite float32 input (n_x,) by every member, (K, 2 + n_c)."""
-        z = x.dot(self._online[0])
+        z = x.dot(self._first)
         z += self._first_bias
-        np.maximum(z, 0.0, out=z)
         z = z.reshape(self._stacked)
-        last = self.num_layers
-        for index in range(1, last):
-            z = z @ self._online[index]
-            z += self._layers[index][1]
+        for weight, bias in self._following:
             np.maximum(z, 0.0, out=z)
-        z = z @ self._online[last]
-        z += self._layers[last][1]
-        return z[:, 0]
+            z = z @ weight
+            z += bias
+        return z.reshape(self.num_members, -1)
 
     def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
         w = self.weights
@@ -228,6 +233,7 @@ class MapSettings:
         epochs: Passes over the inputs.
         batch_size: Inputs a step.
         learning_rate: Peak of the one-cycle schedule.
+        target_weight: Weight of the squared distance to t-SNE's point.
         safety_weight: Weight of the safety head's cross entropy; 0 leaves the head out.
         margin_weight: Weight of the margin head's Huber loss; 0 leaves the head out.
         margin_unit: Margin that counts as one in the Huber loss [unit of the margins].
@@ -239,6 +245,7 @@ class MapSettings:
     epochs: int
     batch_size: int
     learning_rate: float
+    target_weight: float
     safety_weight: float
     margin_weight: float
     margin_unit: float
@@ -346,7 +353,11 @@ def _train(
                 output = net["output"](z)
                 y, w = output[:, :2], weight[batch]
                 squared = ((y - target[batch]) ** 2).sum(dim=1)
-                loss = (target_weight[batch] * squared).mean() / mean_target_weight
+                loss = (
+                    settings.target_weight
+                    * (target_weight[batch] * squared).mean()
+                    / mean_target_weight
+                )
                 if has_safety:
                     logit = net["safety"](y)[:, 0]
                     entropy = functional.binary_cross_entropy_with_logits(

@@ -18,7 +18,7 @@ class EpisodesInfo:
 
     Attributes:
         scenario: Name of the scenario.
-        scenario_hash: SHA-256 (hex) of the canonical text of the scenario.
+        scenario_hash: SHA-256 of all that decides what a rollout does, robot files included.
         variation: Which plant was simulated, e.g. "nominal" or "actual".
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
         step_s: Time between two rows of an episode, the assessment step [s].

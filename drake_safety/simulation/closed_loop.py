@@ -29,8 +29,10 @@ RECOVERY_PORTS = ("recovery_active",)
 class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and the assessor when there is Γ.
 
-    Whoever runs, records or judges a task uses only what this class promises: the output ports
-    below, :meth:`reset`, and the names of what the ports carry. A subclass wires its systems in
+    Whoever runs, records or judges episodes uses only what this class promises: the output ports
+    below, :meth:`reset`, and the names of what the ports carry. Throws and pictures also use the
+    plant: ``plant``, ``robot``, ``robot_instance``, ``kinematics``, ``fall_name`` and
+    ``trigger_port``, which a task with a ball provides. A subclass wires its systems in
     ``__init__`` and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
@@ -62,7 +64,7 @@ class ClosedLoop(Diagram):
     """Schema of the task's own part of the scenario file."""
 
     online_parameters: tuple[str, ...] = ()
-    """Names of parameters that no recorded episode depends on; the scenario's hash leaves them out."""
+    """Parameters that no recorded episode depends on; the scenario's hash leaves them out."""
 
     state_names: list[str]
     output_names: list[str]
@@ -80,8 +82,7 @@ class ClosedLoop(Diagram):
         """Builds the diagram and checks that it keeps the contract.
 
         Raises:
-            ValueError: A promised port is missing, or the assessment was made for a diagram
-                with other names or sizes.
+            ValueError: A promised port is missing.
         """
         builder.BuildInto(self)
         ports = [self.get_output_port(i).get_name() for i in range(self.num_output_ports())]

@@ -98,11 +98,12 @@ def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
     context = simulator.get_mutable_context()
     first_step = loop.reset(context, episode_rng(seed, index))
     safe = loop.GetOutputPort("safe")
+    nothing = EventStatus.DidNothing()
 
     def stop_when_unsafe(root: Context) -> EventStatus:
         if safe.Eval(root)[0] < 1:
             return EventStatus.ReachedTermination(loop, "the state left the safe set")
-        return EventStatus.DidNothing()
+        return nothing
 
     recorder = Recorder(loop)
     is_diverged = False
@@ -138,9 +139,7 @@ def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
         is_safe = safe.Eval(context)[0] >= 1
         cause = "" if is_safe else loop.constraint_names[worst]
     first_step = min(first_step, len(arrays["time_s"]) - 1)
-    return Episode(
-        index=index, **arrays, is_safe=cause == "", cause=cause, first_step=first_step
-    )
+    return Episode(index=index, **arrays, is_safe=cause == "", cause=cause, first_step=first_step)
 
 
 def run_episodes(
@@ -257,7 +256,7 @@ _LOOPS: dict[tuple, ClosedLoop] = {}
 
 def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> ClosedLoop:
     """The loop of a worker process, built once per scenario, variation and options."""
-    key = (scenario.name, scenario.simulation_hash(), variation, repr(sorted(options.items())))
+    key = (scenario.to_yaml(), variation, repr(sorted(options.items())))
     if key not in _LOOPS:
         _LOOPS.clear()
         _LOOPS[key] = scenario.make_loop(variation, **options)

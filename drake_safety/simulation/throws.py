@@ -18,7 +18,13 @@ from pydrake.systems.framework import Context
 
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.rollouts import Progress, Recorder, episode_rng, parallel_map, worker_loop
+from drake_safety.simulation.rollouts import (
+    Progress,
+    Recorder,
+    episode_rng,
+    parallel_map,
+    worker_loop,
+)
 from drake_safety.simulation.scenario import Scenario
 
 _FLIGHT_S = 0.1  # From the ball's appearance to its touch.
@@ -97,8 +103,7 @@ class Limits:
         self._velocity_limits = loop.kinematics.velocity_limits
         # The plant reports the net actuation of the joint for each of its actuators.
         actuators = [
-            plant.get_joint_actuator(i)
-            for i in plant.GetJointActuatorIndices(loop.robot_instance)
+            plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(loop.robot_instance)
         ]
         joint_limits: dict[str, float] = {}
         for actuator in actuators:
@@ -133,9 +138,7 @@ class Limits:
         self.counts["joint_position"] += bool(beyond > self._POSITION_SLACK_RAD)
         self.counts["joint_velocity"] += bool(np.any(np.abs(v) > self._velocity_limits))
         effort = plant.get_net_actuation_output_port(instance).Eval(plant_context)
-        self.counts["joint_effort"] += bool(
-            np.any(np.abs(effort) > self._effort_limits + 1e-6)
-        )
+        self.counts["joint_effort"] += bool(np.any(np.abs(effort) > self._effort_limits + 1e-6))
 
 
 def play_throws(

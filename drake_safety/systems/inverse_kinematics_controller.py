@@ -60,11 +60,15 @@ class InverseKinematicsController(LeafSystem):
         self._stiffness = stiffness
         self._period_s = period_s
         n_j = kinematics.num_joints
-        self.DeclareVectorInputPort(
+        self._limits = np.ascontiguousarray(kinematics.position_limits.T)
+        # Looked up by name in every tick, ports would cost more than what they carry.
+        self._state_port = self.DeclareVectorInputPort(
             "plant_state", kinematics.num_positions + kinematics.num_velocities
         )
-        self.DeclareVectorInputPort("desired_output", 3)
-        self.DeclareVectorInputPort("desired_foot_positions", 3 * kinematics.num_contacts)
+        self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
+        self._feet_port = self.DeclareVectorInputPort(
+            "desired_foot_positions", 3 * kinematics.num_contacts
+        )
         standing = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
         self._feet_index = self.DeclareNumericParameter(BasicVector(standing.ravel()))
         # State: joint set point without offset, then the published position and rate command.
@@ -89,27 +93,24 @@ class InverseKinematicsController(LeafSystem):
 
     def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         kinematics = self._kinematics
-        feet_port = self.GetInputPort("desired_foot_positions")
-        if feet_port.HasValue(context):
-            feet = feet_port.Eval(context)
+        if self._feet_port.HasValue(context):
+            feet = self._feet_port.Eval(context)
         else:
             feet = context.get_numeric_parameter(self._feet_index).get_value()
         p_WC = feet.reshape(-1, 3)
         yaw = fit_stance(p_WC, kinematics.nominal_contacts)[2]
-        X_WB = RigidTransform(
-            RotationMatrix.MakeZRotation(yaw), self.GetInputPort("desired_output").Eval(context)
-        )
+        X_WB = RigidTransform(RotationMatrix.MakeZRotation(yaw), self._desired_port.Eval(context))
         joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, guess)
         is_stance = p_WC[:, 2] - kinematics.foot_radii <= _LIFTED_M
         torques = kinematics.gravity_torques(kinematics.positions_at(X_WB, joints), is_stance)
         return joints, torques
 
     def _add_offset(self, joints: np.ndarray, torques: np.ndarray) -> np.ndarray:
-        lowest, highest = self._kinematics.position_limits.T
-        return np.clip(joints + torques / self._stiffness, lowest, highest)
+        lowest, highest = self._limits
+        return np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
-        plant_state = self.GetInputPort("plant_state").Eval(context)
+        plant_state = self._state_port.Eval(context)
         guess = plant_state[7 : self._kinematics.num_positions]
         joints, torques = self._solve(context, guess)
         command = self._add_offset(joints, torques)
@@ -120,7 +121,7 @@ class InverseKinematicsController(LeafSystem):
         previous = context.get_discrete_state_vector().get_value()[:n_j].copy()
         joints, torques = self._solve(context, previous)
         limit = self._kinematics.velocity_limits
-        rate = np.clip((joints - previous) / self._period_s, -limit, limit)
+        rate = np.minimum(np.maximum((joints - previous) / self._period_s, -limit), limit)
         discrete_state.set_value(np.concatenate([joints, self._add_offset(joints, torques), rate]))
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:

@@ -52,15 +52,17 @@ class PlanFeatures(LeafSystem):
         self._n_q = num_positions
         self._preview_shape = (horizon, num_outputs)
         self.feature_names = list(feature_map.feature_names)
-        self.DeclareVectorInputPort("plant_state", num_positions + num_velocities)
-        self.DeclareVectorInputPort("desired_preview", horizon * num_outputs)
+        self._state_port = self.DeclareVectorInputPort(
+            "plant_state", num_positions + num_velocities
+        )
+        self._preview_port = self.DeclareVectorInputPort("desired_preview", horizon * num_outputs)
         self.DeclareVectorOutputPort(
             "features", BasicVector(len(self.feature_names)), self._calc_features
         )
 
     def _calc_features(self, context: Context, output: BasicVector) -> None:
-        state = self.GetInputPort("plant_state").Eval(context)
-        preview = self.GetInputPort("desired_preview").Eval(context).reshape(self._preview_shape)
+        state = self._state_port.Eval(context)
+        preview = self._preview_port.Eval(context).reshape(self._preview_shape)
         output.SetFromVector(
             self._feature_map.features(state[: self._n_q], state[self._n_q :], preview)
         )

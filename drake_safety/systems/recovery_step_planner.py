@@ -163,9 +163,7 @@ class RecoveryStepPlanner(LeafSystem):
         discrete_state.set_value(self._base, base)
 
     def _foot_centres(self, contacts: np.ndarray) -> np.ndarray:
-        return np.array(
-            [contacts[rows, :2].mean(axis=0) for rows in self._kinematics.foot_slices]
-        )
+        return np.array([contacts[rows, :2].mean(axis=0) for rows in self._kinematics.foot_slices])
 
     def _step(
         self,

@@ -17,7 +17,7 @@ class SafetyAssessor(LeafSystem):
         input_ports:
         - state
         - desired_preview
-        - features (optional)
+        - features (read in the sharpened mode only)
         output_ports:
         - safety_probability
         - normalized_safety_probability
@@ -48,9 +48,11 @@ class SafetyAssessor(LeafSystem):
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        self.DeclareVectorInputPort("state", len(info.state_names))
-        self.DeclareVectorInputPort("desired_preview", info.horizon * len(info.output_names))
-        self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
+        self._preview_port = self.DeclareVectorInputPort(
+            "desired_preview", info.horizon * len(info.output_names)
+        )
+        self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
         sizes = {
             "safety_probability": 1,
             "normalized_safety_probability": 1,
@@ -98,9 +100,9 @@ class SafetyAssessor(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         result = self._assessment.predict_one(
-            self.GetInputPort("state").Eval(context),
-            self.GetInputPort("desired_preview").Eval(context),
-            self.GetInputPort("features").Eval(context) if self._uses_features else None,
+            self._state_port.Eval(context),
+            self._preview_port.Eval(context),
+            self._features_port.Eval(context) if self._uses_features else None,
             beliefs=self.get_beliefs(context),
         )
         discrete_state.set_value(

@@ -48,7 +48,9 @@ class SafetyMonitor(LeafSystem):
         self._n_q = num_positions
         self.constraint_names = list(safe_set.names)
         n_c = len(self.constraint_names)
-        self.DeclareVectorInputPort("plant_state", num_positions + num_velocities)
+        self._state_port = self.DeclareVectorInputPort(
+            "plant_state", num_positions + num_velocities
+        )
         state = self.DeclareDiscreteState(n_c)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
@@ -57,7 +59,7 @@ class SafetyMonitor(LeafSystem):
         self.DeclareVectorOutputPort("margins", BasicVector(n_c), self._calc_margins, ticket)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self.GetInputPort("plant_state").Eval(context)
+        state = self._state_port.Eval(context)
         if np.isfinite(state).all():
             margins = self._safe_set.margins(state[: self._n_q], state[self._n_q :])
         else:

@@ -42,8 +42,8 @@ class StateObserver(LeafSystem):
         self._n_q = n_q
         self.state_names = state_names(kinematics)
         self.output_names = ["base_x", "base_y", "base_z"]
-        self.DeclareVectorInputPort("plant_state", n_q + n_v)
-        self.DeclareVectorInputPort("noise", 2 * n_v)
+        self._state_port = self.DeclareVectorInputPort("plant_state", n_q + n_v)
+        self._noise_port = self.DeclareVectorInputPort("noise", 2 * n_v)
         measured = self.DeclareVectorOutputPort(
             "measured_plant_state", BasicVector(n_q + n_v), self._calc_measured
         )
@@ -52,12 +52,11 @@ class StateObserver(LeafSystem):
         self._measured_port = measured
 
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
-        state = self.GetInputPort("plant_state").Eval(context)
-        noise_port = self.GetInputPort("noise")
+        state = self._state_port.Eval(context)
         is_finite = np.isfinite(state).all()
-        if is_finite and not self._is_exact and noise_port.HasValue(context):
+        if is_finite and not self._is_exact and self._noise_port.HasValue(context):
             q, v = add_noise(
-                state[: self._n_q], state[self._n_q :], noise_port.Eval(context), self._noise
+                state[: self._n_q], state[self._n_q :], self._noise_port.Eval(context), self._noise
             )
             state = np.concatenate([q, v])
         output.SetFromVector(state)

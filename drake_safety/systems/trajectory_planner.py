@@ -63,8 +63,9 @@ class TrajectoryPlanner(LeafSystem):
     Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
     ``desired_preview`` is z*_{k:k+H}, row-major in time, in S: what the feet must do does not
     depend on where they stand. ``desired_outlook`` looks further at fewer instants: M samples
-    spread evenly from now to ``outlook_s`` ahead, in S. Before its start and after its end the plan holds still. The
-    stance pose [x, y, yaw] comes from the input if it is connected, else from the parameter.
+    spread evenly from now to ``outlook_s`` ahead, in S. Before its start and after its end the
+    plan holds still. The stance pose [x, y, yaw] comes from the input if it is connected, else
+    from the parameter.
 
     Args:
         horizon: H, samples of the preview.
@@ -103,7 +104,7 @@ class TrajectoryPlanner(LeafSystem):
         hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
         self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
-        self.DeclareVectorInputPort("stance_pose", 3)
+        self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort("desired_output", BasicVector(num_outputs), self._calc_output)
         self.DeclareVectorOutputPort(
             "desired_output_rate", BasicVector(num_outputs), self._calc_rate
@@ -152,9 +153,8 @@ class TrajectoryPlanner(LeafSystem):
         return context.get_abstract_parameter(self._plan_index).get_value()[0]
 
     def _stance_pose(self, context: Context) -> np.ndarray:
-        port = self.GetInputPort("stance_pose")
-        if port.HasValue(context):
-            return port.Eval(context)
+        if self._stance_port.HasValue(context):
+            return self._stance_port.Eval(context)
         return context.get_numeric_parameter(self._stance_index).get_value()
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:

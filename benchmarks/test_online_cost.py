@@ -1,0 +1,195 @@
+"""What one evaluation of Γ costs inside a running diagram."""
+
+import copy
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+)
+from pydrake.systems.primitives import ConstantVectorSource
+from threadpoolctl import threadpool_limits
+
+from drake_safety import SafetyAssessment, Scenario, run_episodes
+from drake_safety.learning.embedding import Embedding
+from drake_safety.learning.segments import Episodes
+from drake_safety.systems.safety_assessor import SafetyAssessor
+
+PERIOD_S = 0.01
+NUM_UPDATES = 2000  # Evaluations in a round.
+ROUNDS = 7
+NUM_EPISODES = 96
+CASES: dict[str, dict[str, Any]] = {
+    "paper": {"mode": "paper"},
+    "sharpened": {"mode": "sharpened", "epochs": 1},
+    "sharpened 3x(256, 256, 256)": {
+        "mode": "sharpened",
+        "epochs": 1,
+        "ensemble_size": 3,
+        "hidden_sizes": [256, 256, 256],
+    },
+}
+MAX_US = {"paper": 15.0, "sharpened": 60.0}
+
+
+class EmptySystem(LeafSystem):
+    """The ports, the state and the events of a system, and nothing behind them."""
+
+    def __init__(self, other: LeafSystem):
+        super().__init__()
+        for i in range(other.num_input_ports()):
+            port = other.get_input_port(i)
+            self.DeclareVectorInputPort(port.get_name(), port.size())
+        state = self.DeclareDiscreteState(
+            sum(other.get_output_port(i).size() for i in range(other.num_output_ports()))
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD_S, 0.0, self._update)
+        for i in range(other.num_output_ports()):
+            port = other.get_output_port(i)
+            self.DeclareVectorOutputPort(
+                port.get_name(),
+                BasicVector(port.size()),
+                lambda context, output: None,
+                {self.discrete_state_ticket(state)},
+            )
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        pass
+
+
+class Running:
+    """A system with constant inputs in a diagram of its own, simulated on and on."""
+
+    def __init__(self, system: LeafSystem, inputs: dict[str, np.ndarray]):
+        builder = DiagramBuilder()
+        self.system = builder.AddSystem(system)
+        for name, value in inputs.items():
+            source = builder.AddSystem(ConstantVectorSource(value))
+            builder.Connect(source.get_output_port(), self.system.GetInputPort(name))
+        self._simulator = Simulator(builder.Build())
+        self._simulator.Initialize()
+        self._num_updates = 0
+
+    def output(self, name: str) -> np.ndarray:
+        context = self.system.GetMyContextFromRoot(self._simulator.get_context())
+        return self.system.GetOutputPort(name).Eval(context)
+
+    def cost_us(self) -> float:
+        """CPU time of one update, the simulator's own share included."""
+        started = time.process_time()
+        # To the middle between two ticks: rounding cannot move a tick out of its round.
+        self._num_updates += NUM_UPDATES
+        self._simulator.AdvanceTo((self._num_updates - 0.5) * PERIOD_S)
+        return 1e6 * (time.process_time() - started) / NUM_UPDATES
+
+
+class EagerNetworks:
+    """The maps of an assessment as torch modules."""
+
+    def __init__(self, embedding: Embedding):
+        def linear(name: str, member: int) -> torch.nn.Linear:
+            weight = torch.tensor(embedding.weights[f"{name}.weight"][member])
+            layer = torch.nn.Linear(*weight.shape)
+            layer.weight.data = weight.T.contiguous()
+            layer.bias.data = torch.tensor(embedding.weights[f"{name}.bias"][member])
+            return layer
+
+        self._networks = []
+        for member in range(embedding.num_members):
+            layers: list[torch.nn.Module] = []
+            for i in range(embedding.num_layers):
+                layers += [linear(f"trunk.{i}", member), torch.nn.ReLU()]
+            self._networks.append(torch.nn.Sequential(*layers, linear("output", member)).eval())
+
+    def evaluate(self, x: np.ndarray) -> list[torch.Tensor]:
+        with torch.inference_mode():
+            z = torch.from_numpy(x)
+            return [network(z) for network in self._networks]
+
+    def cost_us(self, x: np.ndarray) -> float:
+        started = time.process_time()
+        for _ in range(NUM_UPDATES):
+            self.evaluate(x)
+        return 1e6 * (time.process_time() - started) / NUM_UPDATES
+
+
+@pytest.fixture(scope="module")
+def episodes(scenario: Scenario) -> Episodes:
+    return run_episodes(scenario, NUM_EPISODES)
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize("case", list(CASES))
+def test_one_evaluation_inside_a_diagram(
+    benchmark: Any,
+    report: Callable[..., None],
+    scenario: Scenario,
+    episodes: Episodes,
+    case: str,
+) -> None:
+    parameters = copy.deepcopy(scenario.assessment)
+    for name, value in CASES[case].items():
+        setattr(parameters, name, value)
+    assessment = SafetyAssessment(parameters).fit(episodes)
+    chosen = np.argmax(
+        assessment.predict(
+            *(
+                np.stack([getattr(e, name)[0] for e in episodes])
+                for name in ("state", "desired_preview", "features")
+            )
+        ).belief[:, 0]
+    )
+    inputs = {
+        name: getattr(episodes[chosen], name)[0]
+        for name in ("state", "desired_preview", "features")
+    }
+    names = list(inputs) if assessment.uses_features else ["state", "desired_preview"]
+    x = np.concatenate([inputs[name] for name in names]).astype(np.float32)
+
+    previous_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            running = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
+            empty = Running(EmptySystem(running.system), inputs)
+            eager = EagerNetworks(assessment.embedding_)
+            # Γ is really evaluated, and torch does the same.
+            assert running.output("safety_probability")[0] > 0.0
+            ours = assessment.embedding_.evaluate_one(x)
+            theirs = np.stack([z.numpy() for z in eager.evaluate(x)])
+            np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-3)
+            costs: dict[str, list[float]] = {"ours": [], "empty": [], "torch": []}
+
+            def measure_peers() -> None:
+                costs["empty"].append(empty.cost_us())
+                costs["torch"].append(eager.cost_us(x))
+
+            def measure() -> None:
+                costs["ours"].append(running.cost_us())
+
+            for cost in (running.cost_us, empty.cost_us):
+                cost()
+            benchmark.pedantic(measure, setup=measure_peers, rounds=ROUNDS)
+    finally:
+        torch.set_num_threads(previous_threads)
+    cost_us = {name: statistics.median(values) for name, values in costs.items()}
+    weights = assessment.embedding_.weights
+    widths = [weights[f"trunk.{i}.bias"].shape[1] for i in range(assessment.embedding_.num_layers)]
+    report(
+        f"one Γ in a LeafSystem, {case}",
+        cost_us["ours"],
+        "us",
+        at_most=MAX_US[parameters.mode],
+        peers={"empty LeafSystem": cost_us["empty"], "torch eager": cost_us["torch"]},
+        note=f"{assessment.embedding_.num_members} maps, {len(x)} inputs, layers {widths}",
+    )

@@ -1,0 +1,149 @@
+"""The README says what is so: its code runs, its commands parse, its links lead somewhere."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import yaml
+
+from drake_safety.cli import app
+from drake_safety.control.robot import load_robot_file
+from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.simulation.scenario import load_scenario, parse_scenario, task_names
+from legged_robots import write_hexapod
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+# Files that `train`, `evaluate` and `run` write: they exist after `make demo`.
+WRITTEN = re.compile(r"runs/|evaluation\.json|info\.json|\S*\.safetensors")
+
+
+def blocks(language):
+    """The fenced blocks of a language, each without the indentation of its list."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```$", README, flags=re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
+
+
+def shell_commands(program):
+    """The arguments of every line that calls a program, inline ones too."""
+    lines = [line for text in blocks("sh") for line in text.splitlines()]
+    lines += re.findall(r"`([^`\n]+)`", README)
+    return [shlex.split(line)[1:] for line in lines if line.startswith(f"{program} ")]
+
+
+@pytest.fixture
+def own_robot(tmp_path):
+    """A folder as the README describes it: a robot.yaml beside its URDF, and the README's YAML."""
+    write_hexapod(tmp_path)
+    (text,) = blocks("yaml")
+    (tmp_path / "balancing.yaml").write_text(text)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_path):
+    first, *others = blocks("python")
+    # The README's number of episodes takes minutes; it is the only thing that is changed.
+    assert first.count("num_episodes=2048") == 1
+    first = first.replace("num_episodes=2048", "num_episodes=64")
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join([first, *others]), encoding="utf-8")
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    belief = np.array(done.stdout.strip().strip("[]").split(), dtype=float)
+    assert belief.shape == (3,)
+    assert np.all(belief >= 0)
+    assert belief.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_every_drake_safety_command_of_the_readme_parses():
+    group = typer.main.get_command(app)
+    calls = shell_commands("drake-safety")
+    assert {call[0] for call in calls} == set(group.commands)
+    for name, *arguments in calls:
+        # Parses and validates; nothing is run.
+        group.commands[name].make_context(name, arguments)
+
+
+def test_every_make_target_of_the_readme_is_in_the_makefile():
+    makefile = (ROOT / "Makefile").read_text()
+    targets = set(re.findall(r"^([a-z]+):.*## ", makefile, flags=re.MULTILINE))
+    named = {call[0] for call in shell_commands("make")}
+    assert {"demo", "test"} <= named <= targets
+
+
+def test_the_figures_come_from_the_same_training_as_the_demo():
+    makefile = (ROOT / "Makefile").read_text()
+    trained = [call for call in shell_commands("drake-safety") if "runs/laikago" in call]
+    assert f"/drake-safety {shlex.join(trained[0])}\n" in makefile
+
+
+@pytest.mark.parametrize("target", re.findall(r"\]\(([^)#\s]+)", README))
+def test_every_relative_link_of_the_readme_leads_to_a_file(target):
+    if not re.match(r"https?://", target):
+        assert not Path(target).is_absolute()
+        assert (ROOT / target).is_file()
+
+
+def test_every_path_in_code_style_exists_or_is_written_by_a_command():
+    named = re.findall(r"`([\w./-]+/[\w./-]*|[\w-]+\.(?:yaml|json|md|toml|safetensors))`", README)
+    kept = [path for path in named if not WRITTEN.match(path)]
+    assert kept, "the README names files of the checkout"
+    for path in kept:
+        assert (ROOT / path).exists() or list((ROOT / "models").glob(f"*/{path}")), path
+
+
+def test_the_figures_are_filled_in():
+    assert re.findall(r"\{\{.*?\}\}", README) == []
+
+
+def test_the_scenario_of_the_readme_makes_a_loop_with_a_robot_of_ones_own(own_robot):
+    scenario = load_scenario(own_robot / "balancing.yaml")
+    assert Path(scenario.robot) == own_robot / "robot.yaml"
+    for variation in ("nominal", "actual"):
+        loop = scenario.make_loop(variation)
+        assert loop.robot.name == load_robot_file(own_robot / "robot.yaml").name
+    assert scenario.task.partition(":")[0] in task_names()
+
+
+def test_a_key_that_does_not_exist_is_answered_with_those_that_do(own_robot):
+    raw = yaml.safe_load((own_robot / "balancing.yaml").read_text())
+    with pytest.raises(ValueError, match=r"unknown key 'robots'; keys there are \['name', "):
+        parse_scenario(yaml.safe_dump(raw | {"robots": "two"}), name="own", folder=own_robot)
+
+
+def test_the_numbers_in_the_readmes_prose_are_the_programs_defaults():
+    recovery = load_scenario("laikago_balancing").parameters.recovery
+    assert recovery.is_normalized
+    assert f"a threshold ({recovery.threshold:g} by default)" in README
+    parameters = AssessmentParameters()
+    assert f"{parameters.resolution} × {parameters.resolution} cells" in README
+    assert parameters.ensemble_size == 3
+    assert re.search(r"the\s+mean of three such maps", README)
+    assert f"at most 1 − μ = {1 - parameters.initial_uncertainty:g}" in README
+    robot_lines = (ROOT / "models/laikago/robot.yaml").read_text().splitlines()
+    assert f"has {len(robot_lines)} lines" in README
+
+
+def test_the_versions_in_the_readme_are_those_of_the_constraints():
+    constraints = (ROOT / "constraints.txt").read_text()
+    (drake,) = re.findall(r"^drake==(\S+)$", constraints, flags=re.MULTILINE)
+    assert f"Drake {drake} (" in README
+    assert "!=1.52.0" in (ROOT / "pyproject.toml").read_text()
+
+
+def test_the_readme_knows_no_path_of_anyones_machine():
+    assert re.findall(r"(?<![\w.])/(?:home|root|tmp|work|Users)/\S*", README) == []
