@@ -141,18 +141,10 @@ def test_one_evaluation_inside_a_diagram(
     for name, value in CASES[case].items():
         setattr(parameters, name, value)
     assessment = SafetyAssessment(parameters).fit(episodes)
-    chosen = np.argmax(
-        assessment.predict(
-            *(
-                np.stack([getattr(e, name)[0] for e in episodes])
-                for name in ("state", "desired_preview", "features")
-            )
-        ).belief[:, 0]
-    )
-    inputs = {
-        name: getattr(episodes[chosen], name)[0]
-        for name in ("state", "desired_preview", "features")
-    }
+    input_names = ("state", "desired_preview", "features")
+    starts = [np.stack([getattr(e, name)[0] for e in episodes]) for name in input_names]
+    safest = int(np.argmax(assessment.predict(*starts).belief[:, 0]))
+    inputs = {name: rows[safest] for name, rows in zip(input_names, starts, strict=True)}
     names = list(inputs) if assessment.uses_features else ["state", "desired_preview"]
     x = np.concatenate([inputs[name] for name in names]).astype(np.float32)
 

@@ -19,6 +19,7 @@ SETTINGS = MapSettings(
     epochs=30,
     batch_size=64,
     learning_rate=5e-3,
+    target_weight=1.0,
     safety_weight=1.0,
     margin_weight=1.0,
     margin_unit=0.02,

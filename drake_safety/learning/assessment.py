@@ -459,9 +459,7 @@ class SafetyAssessment:
         if x.shape[0] != embedding.num_inputs:
             self._check_width(x.shape[0])
         num_members, num_cells, num_columns = beliefs.shape
-        with np.errstate(over="ignore"):
-            is_usable = x.dot(x) < _INPUT_LIMIT
-        if not is_usable:
+        if not np.vdot(x, x) < _INPUT_LIMIT:  # Unlike x.dot(x), silent when it overflows.
             unknown = np.full(num_columns - 3, np.nan)
             return self._assessment(None, np.full(2, np.nan), unknown, num_columns)
         output = embedding.evaluate_one(x.astype(np.float32))

@@ -142,9 +142,10 @@ class Embedding:
         self._first, *following = _pack([joint, *(w for w, _ in self._layers[1:])])
         biases = [bias for _, bias in self._layers[1:]]
         self._stacked: tuple[int, ...] = (self.num_members, 1, width)
+        self._product: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.matmul
         if self.num_members == 1:
             # Plain products of a vector and a matrix cost numpy half of what stacks of one cost.
-            self._stacked = (width,)
+            self._stacked, self._product = (width,), np.dot
             self._following = [
                 (w[0], bias[0, 0]) for w, bias in zip(following, biases, strict=True)
             ]
@@ -195,7 +196,7 @@ class Embedding:
         z = z.reshape(self._stacked)
         for weight, bias in self._following:
             np.maximum(z, 0.0, out=z)
-            z = z @ weight
+            z = self._product(z, weight)
             z += bias
         return z.reshape(self.num_members, -1)
 

@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 
+_RATE_SHARE = 0.7  # Of a joint's speed limit; the servo overshoots a ramp by the rest.
 _LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
 
 
@@ -29,7 +30,8 @@ class InverseKinematicsController(LeafSystem):
     the planar fit of the feet. The joint servos are the plant's own implicit ones (q̇ of the
     command is the rate of the set point); to their set point the static offset τ/k_p is added,
     with τ from the robot model's weight split over the feet that are down, which removes the
-    sag that a stiff-less-than-infinite servo would show. Commands respect the joint limits.
+    sag of a servo of finite stiffness. Commands respect the joint limits, and set points move no
+    faster than 0.7 of the joints' speed limits.
 
     Args:
         kinematics: The robot as the controller believes it to be.
@@ -58,6 +60,7 @@ class InverseKinematicsController(LeafSystem):
             )
         self._kinematics = kinematics
         self._stiffness = stiffness
+        self._rate_limit = _RATE_SHARE * kinematics.velocity_limits
         self._period_s = period_s
         n_j = kinematics.num_joints
         self._limits = np.ascontiguousarray(kinematics.position_limits.T)
@@ -119,9 +122,10 @@ class InverseKinematicsController(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         n_j = self._kinematics.num_joints
         previous = context.get_discrete_state_vector().get_value()[:n_j].copy()
-        joints, torques = self._solve(context, previous)
-        limit = self._kinematics.velocity_limits
-        rate = np.minimum(np.maximum((joints - previous) / self._period_s, -limit), limit)
+        wanted, torques = self._solve(context, previous)
+        rate = (wanted - previous) / self._period_s
+        rate = np.minimum(np.maximum(rate, -self._rate_limit), self._rate_limit)
+        joints = previous + self._period_s * rate
         discrete_state.set_value(np.concatenate([joints, self._add_offset(joints, torques), rate]))
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:

@@ -107,12 +107,12 @@ class SafetyAssessor(LeafSystem):
         )
         discrete_state.set_value(
             np.concatenate(
-                [
-                    [result.safety_probability, result.normalized],
+                (
+                    (result.safety_probability, result.normalized),
                     result.belief,
                     result.embedding,
                     result.cause_probability,
                     result.predicted_margins,
-                ]
+                )
             )
         )
