@@ -28,6 +28,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.balls import Throw
     from drake_safety.simulation.scenario import Scenario
     from drake_safety.simulation.throws import ThrowLog
@@ -119,7 +120,6 @@ def train(
 
     Episodes are kept as they finish: a run that was stopped goes on with --resume.
     """
-    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.dataset import completed
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
@@ -144,24 +144,57 @@ def train(
             extra={"command": _command(), "scenario_yaml": loaded.to_yaml()},
         )
         table = Table("mode", "segments", "unsafe episodes", "CPU time", "file")
-        for name in _MODES if mode == "both" else (mode,):
-            loaded.assessment.mode = name
-            started = time.process_time()
-
-            def report(stage: str, share: float, name: str = name) -> None:
-                stages(f"{name}: {stage}", round(100 * share), 100)
-
-            assessment = SafetyAssessment(loaded.assessment).fit(data, report)
-            path = assessment_file(out, name)
-            assessment.save(path)
-            table.add_row(
-                name,
-                f"{assessment.training_points_.shape[1]}",
-                f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)",
-                f"{time.process_time() - started:.0f} s",
-                str(path),
-            )
+        modes = _MODES if mode == "both" else (mode,)
+        # The modes are independent: the first is learned here, the others in processes beside.
+        with _workers(len(modes) - 1) as submit:
+            beside = [submit(_learn, loaded, name, out) for name in modes[1:]]
+            rows = [_learn(loaded, modes[0], out, data, stages)]
+            for done, learned in enumerate(beside):
+                stages(f"{modes[done + 1]}", 0, 1)
+                rows.append(learned.result())
+                stages(f"{modes[done + 1]}", 1, 1)
+        unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
+        for name, (num_segments, cpu_s) in zip(modes, rows, strict=True):
+            file = str(assessment_file(out, name))
+            table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s", file)
     console.print(table)
+
+
+@contextlib.contextmanager
+def _workers(num_workers: int) -> Iterator[Any]:
+    """Gives what submits a call to a worker process; on an error or Ctrl-C the workers end."""
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    executor = ProcessPoolExecutor(max_workers=max(num_workers, 1))
+    try:
+        yield executor.submit
+    except BaseException:
+        executor.shutdown(wait=False, kill_workers=True)
+        raise
+    executor.shutdown()
+
+
+def _learn(
+    scenario: Scenario,
+    mode: str,
+    out: Path,
+    data: Episodes | None = None,
+    stages: _Stages | None = None,
+) -> tuple[int, float]:
+    """Learns and saves one mode; returns the number of segments and the CPU time [s]."""
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.dataset import load_episodes
+
+    def report(stage: str, share: float) -> None:
+        if stages is not None:
+            stages(f"{mode}: {stage}", round(100 * share), 100)
+
+    started = time.process_time()
+    scenario.assessment.mode = mode
+    data = load_episodes(out / "episodes") if data is None else data
+    assessment = SafetyAssessment(scenario.assessment).fit(data, report)
+    assessment.save(assessment_file(out, mode))
+    return assessment.training_points_.shape[1], time.process_time() - started
 
 
 def assessment_file(folder: Path, mode: str) -> Path:

@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from pydrake.math import RotationMatrix
 
+from drake_safety.control.observation import quaternion_of
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throw, run_throws, trigger_time
@@ -72,7 +74,7 @@ def test_footholds_stay_on_their_own_side_and_within_reach(recovering):
     kinematics = recovering.kinematics
     stretched = 0.25 + 0.25 + 0.037
     for plant_state in log.plant_state:
-        q = plant_state[: kinematics.num_positions]
+        feet = kinematics.contact_positions(plant_state[: kinematics.num_positions])
         hips = [
             kinematics.plant.CalcPointsPositions(
                 kinematics.context,
@@ -81,10 +83,12 @@ def test_footholds_stay_on_their_own_side_and_within_reach(recovering):
                 kinematics.world_frame,
             ).ravel()
             for foot in kinematics.foot_names
-            if kinematics.contact_positions(q) is not None
         ]
-        feet = kinematics.contact_positions(q)
         assert np.linalg.norm(feet - hips, axis=1).max() <= stretched + 1e-6
+        # The left feet stay to the left of the right ones, so that legs never cross.
+        sideways = RotationMatrix(quaternion_of(plant_state)).matrix()[:2, 1]
+        right, left = feet[0::2, :2], feet[1::2, :2]
+        assert np.all((left - right) @ sideways > 0.05)
 
 
 def test_throws_do_not_depend_on_the_workers_and_keep_their_order(scenario):

@@ -121,8 +121,10 @@ class InverseKinematicsController(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         n_j = self._kinematics.num_joints
-        previous = context.get_discrete_state_vector().get_value()[:n_j].copy()
-        wanted, torques = self._solve(context, previous)
+        state = context.get_discrete_state_vector().get_value()
+        previous, last_rate = state[:n_j].copy(), state[2 * n_j :]
+        # Smooth set points go on as they went: most ticks then need no Newton step at all.
+        wanted, torques = self._solve(context, previous + self._period_s * last_rate)
         rate = (wanted - previous) / self._period_s
         rate = np.minimum(np.maximum(rate, -self._rate_limit), self._rate_limit)
         joints = previous + self._period_s * rate
