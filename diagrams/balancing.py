@@ -44,6 +44,10 @@ from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.state_observer import StateObserver
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
+# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
+# is deformable.
+logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
+
 _NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
 _LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
 
@@ -167,14 +171,9 @@ class Balancing(ClosedLoop):
         add_to_package_map(parser.package_map())
         parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
         mu = self.variation.foot_friction or robot.foot_friction
-        drake_logger = logging.getLogger("drake")
-        level = drake_logger.level
-        # Drake warns that a half space takes no part in deformable contact; there is none.
-        drake_logger.setLevel(logging.ERROR)
         plant.RegisterCollisionGeometry(
             plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
         )
-        drake_logger.setLevel(level)
         has_ball = parameters.push.share > 0 if ball is None else ball
         ball_instance = add_ball(plant) if has_ball else None
         plant.Finalize()

@@ -143,7 +143,7 @@ def train(
             progress=lambda done, total: stages("nominal episodes", done, total),
             extra={"command": _command(), "scenario_yaml": loaded.to_yaml()},
         )
-        table = Table("mode", "segments", "unsafe episodes", "CPU time", "file")
+        table = Table("mode", "segments", "unsafe episodes", "CPU time")
         modes = _MODES if mode == "both" else (mode,)
         # The modes are independent: the first is learned here, the others in processes beside.
         with _workers(len(modes) - 1) as submit:
@@ -155,9 +155,16 @@ def train(
                 stages(f"{modes[done + 1]}", 1, 1)
         unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
         for name, (num_segments, cpu_s) in zip(modes, rows, strict=True):
-            file = str(assessment_file(out, name))
-            table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s", file)
+            table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
     console.print(table)
+    _print_path("episodes  ", out / "episodes")
+    for name in modes:
+        _print_path("assessment", assessment_file(out, name))
+
+
+def _print_path(what: str, path: Path) -> None:
+    # Whole on one line, so that it can be copied.
+    console.print(what, str(path), soft_wrap=True, highlight=False)
 
 
 @contextlib.contextmanager
@@ -314,9 +321,9 @@ def run(
     )
     pictures = save(figure, folder / "timeline")
     _print_run(loop, log, throws, triggers, probability)
-    console.print("recording", str(recording))
+    _print_path("recording", recording)
     for picture in pictures:
-        console.print("picture  ", str(picture))
+        _print_path("picture  ", picture)
 
 
 def still_times(log: ThrowLog, throws: list[Throw], triggers: list[float]) -> list[float]:
@@ -518,9 +525,9 @@ def evaluate(
     _print_episodes(figures, [scorer.name for scorer in scorers])
     if throws:
         _print_throws(figures, [rule.name for rule in rules])
-    console.print("figures ", str(file))
+    _print_path("figures", file)
     for picture in pictures:
-        console.print("picture ", str(picture))
+        _print_path("picture", picture)
 
 
 def _check_same_simulation(trained: Any, fresh: Any) -> None:

@@ -15,6 +15,8 @@ from pydrake.systems.framework import Context
 from drake_safety.control.robot import add_to_package_map
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
+_MAX_TRACES = 30_000
+_LEAST_TRACE_M = 1e-4
 _PARKED = np.array([50.0, 50.0, 0.0])
 
 
@@ -113,7 +115,7 @@ class Ball:
         aim = aim + throw.offset_m * sideways + [0.0, 0.0, throw.height_m]
         # Sphere tracing: the signed distance is a step that cannot overshoot.
         p = aim - 2.0 * direction
-        for _ in range(100):
+        for _ in range(_MAX_TRACES):
             self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
             query = self._plant.get_geometry_query_input_port().Eval(context)
             distance = min(
@@ -122,7 +124,8 @@ class Ball:
             )
             if distance < 1e-4 or (p - aim) @ direction > 1.0:
                 break
-            p = p + distance * direction
+            # A line that grazes a leg would creep along it: a step has a least length.
+            p = p + max(distance, _LEAST_TRACE_M) * direction
         else:
             distance = math.inf
         if not distance < 1e-4:
