@@ -24,7 +24,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -40,8 +40,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-# Square brackets are units here, not markup.
-console = Console(markup=False)
+# Square brackets are units here, not markup. A log has no width of its own.
+console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 _MODES = ("sharpened", "paper")
 
 ScenarioArgument = Annotated[
@@ -54,6 +54,11 @@ WorkersOption = Annotated[
 AssessmentOption = Annotated[
     Path, typer.Option("--assessment", help="Folder that `train` wrote.", file_okay=False)
 ]
+
+
+def _table(*columns: str, title: str | None = None) -> Table:
+    """A table whose cells fold where they do not fit: no figure is cut short."""
+    return Table(*(Column(name, overflow="fold") for name in columns), title=title)
 
 
 class _Stages:
@@ -88,7 +93,7 @@ def scenarios() -> None:
     """List the scenarios that come with the package."""
     from drake_safety.simulation.scenario import load_scenario, scenario_names
 
-    table = Table("scenario", "task", "robot", "plants", "horizon")
+    table = _table("scenario", "task", "robot", "plants", "horizon")
     for name in scenario_names():
         scenario = load_scenario(name)
         horizon_s = scenario.assessment.horizon * scenario.step_s
@@ -143,7 +148,7 @@ def train(
             progress=lambda done, total: stages("nominal episodes", done, total),
             extra={"command": _command(), "scenario_yaml": loaded.to_yaml()},
         )
-        table = Table("mode", "segments", "unsafe episodes", "CPU time")
+        table = _table("mode", "segments", "unsafe episodes", "CPU time")
         modes = _MODES if mode == "both" else (mode,)
         # The modes are independent: the first is learned here, the others in processes beside.
         with _workers(len(modes) - 1) as submit:
@@ -339,7 +344,7 @@ def still_times(log: ThrowLog, throws: list[Throw], triggers: list[float]) -> li
 def _print_run(
     loop: Any, log: ThrowLog, throws: list[Throw], triggers: list[float], probability: np.ndarray
 ) -> None:
-    table = Table("time [s]", "event", "Γ")
+    table = _table("time [s]", "event", "Γ")
 
     def gamma_at(time_s: float) -> str:
         return f"{probability[min(round(time_s / 0.02), len(probability) - 1)]:.2f}"
@@ -547,7 +552,7 @@ def _interval(figure: Any, scale: float = 1.0, digits: int = 3) -> str:
 def _print_episodes(figures: dict[str, Any], names: list[str]) -> None:
     for kind, title in (("segments", "per segment"), ("episodes", "per episode, at k = 0")):
         columns = ("auc", "safe_recall", "unsafe_recall", "brier")
-        table = Table("scorer", *columns, title=f"Fresh nominal episodes, {title}")
+        table = _table("scorer", *columns, title=f"Fresh nominal episodes, {title}")
         for name in names:
             table.add_row(name, *(_interval(figures[f"{kind}.{name}.{key}"]) for key in columns))
         console.print(table)
@@ -555,7 +560,7 @@ def _print_episodes(figures: dict[str, Any], names: list[str]) -> None:
 
 def _print_throws(figures: dict[str, Any], names: list[str]) -> None:
     alone = figures["throws.falls_without_recovery"]
-    table = Table(
+    table = _table(
         "trigger",
         "Γ_thre",
         "falls [%]",
