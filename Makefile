@@ -13,7 +13,7 @@ help: ## Show these targets
 demo: $(INSTALLED) ## Train on 2048 episodes, evaluate, and throw a ball at the robot
 	$(BIN)/drake-safety train laikago_balancing --episodes 2048 --out runs/laikago
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/laikago \
-		--episodes 200 --calibration-episodes 100 --throws 100 --calibration-throws 60
+		--episodes 200 --calibration-episodes 60 --throws 60 --calibration-throws 40
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/laikago --push ball
 
 test: $(INSTALLED) ## Run the tests
