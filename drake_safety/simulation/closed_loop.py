@@ -110,7 +110,7 @@ class ClosedLoop(Diagram):
             The first step whose future is undisturbed: 0, or later when the episode begins
             with a push.
         """
-        raise NotImplementedError
+        raise TypeError(f"task '{type(self).__name__}' must override reset")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.
