@@ -66,6 +66,7 @@ class BarePlant:
             plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
         )
         add_ball(plant)
+        plant.SetUseSampledOutputPorts(False)
         plant.Finalize()
         port = plant.get_desired_state_input_port(instance)
         self._source = builder.AddSystem(

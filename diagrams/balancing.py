@@ -176,6 +176,8 @@ class Balancing(ClosedLoop):
         )
         has_ball = parameters.push.share > 0 if ball is None else ball
         ball_instance = add_ball(plant) if has_ball else None
+        # What the ports say is of now, not of the last step: no copies are kept for it.
+        plant.SetUseSampledOutputPorts(False)
         plant.Finalize()
         self.plant, self.robot, self.robot_instance = plant, robot, instance
         self.ball = (

@@ -80,6 +80,7 @@ def assessment_for(loop, **changes):
     info = {
         "scenario": scenario.name,
         "scenario_hash": scenario.simulation_hash(),
+        "variation": "nominal",
         "horizon": scenario.assessment.horizon,
         "step_s": scenario.step_s,
     }

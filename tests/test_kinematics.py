@@ -38,8 +38,8 @@ def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinemat
         kinematics.contact_positions(q)  # Sets the Context whose map turns v into q̇.
         qdot = kinematics.plant.MapVelocityToQDot(kinematics.context, v)
         step = 1e-6
-        difference = kinematics.contact_positions(q + step * qdot)
-        difference -= kinematics.contact_positions(q - step * qdot)
+        ahead = kinematics.contact_positions(q + step * qdot)
+        difference = ahead - kinematics.contact_positions(q - step * qdot)
         np.testing.assert_allclose(J @ v, difference.ravel() / (2 * step), atol=1e-7)
 
 

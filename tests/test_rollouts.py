@@ -85,7 +85,7 @@ def test_seeds_and_variations_are_kept_in_the_info():
     episodes = run_episodes(gliding(), 2, variation="actual", seed=7, num_workers=1)
     assert episodes.info.variation == "actual"
     assert episodes.info.seed == 7
-    assert episodes.info.scenario_hash == gliding().simulation_hash()
+    assert episodes.info.scenario_hash == gliding().simulation_hash("actual")
     assert episodes.info.constraint_names == ["right", "left"]
     other = run_episodes(gliding(), 2, variation="actual", seed=8, num_workers=1)
     assert episodes[0].state[0, 0] != other[0].state[0, 0]

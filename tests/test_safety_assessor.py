@@ -29,21 +29,14 @@ class AssessmentDouble:
         self.uses_features = uses_features
         self.asked = []
 
-    def predict_one(self, state, desired_preview, features=None, beliefs=None):
+    def predict_row(self, state, desired_preview, features, beliefs):
         self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
         if not np.isfinite(state).all():
-            safe, belief = 0.0, np.array([0.0, 0.0, 1.0])
+            safe, belief = 0.0, [0.0, 0.0, 1.0]
         else:
             safe = state[0] * beliefs[0, 0, 0]
-            belief = np.array([safe, 0.9 - safe, 0.1])
-        return SimpleNamespace(
-            safety_probability=safe,
-            normalized=safe / 0.9,
-            belief=belief,
-            embedding=np.array([3.0, -4.0]),
-            cause_probability=np.array([0.2, 0.3]),
-            predicted_margins=np.array([0.01, np.nan]),
-        )
+            belief = [safe, 0.9 - safe, 0.1]
+        return np.array([safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan])
 
 
 def running(assessment=None, features=FEATURES):

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from drake_safety import load_scenario
+from drake_safety.control.robot import PlantVariation
 from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
 from gliding_task import SCENARIO, Gliding
 from legged_robots import write_hexapod
@@ -154,7 +155,7 @@ def test_the_same_text_has_the_same_hash_and_order_does_not_matter():
     "text",
     [
         SCENARIO.replace("step_s: 0.04", "step_s: 0.02"),
-        SCENARIO.replace("1.2", "1.3"),
+        SCENARIO.replace("nominal: {}", "nominal: {mass_scale: 1.2}"),
         with_parameters("{speed_m_s: 3.0}"),
         SCENARIO + "assessment: {horizon: 11}",
     ],
@@ -166,6 +167,16 @@ def test_what_changes_a_rollout_changes_the_hash(text):
 def test_how_the_assessment_is_learned_does_not_change_the_hash():
     text = SCENARIO + "assessment: {epochs: 3, mode: paper}"
     assert parsed(text).simulation_hash() == parsed(SCENARIO).simulation_hash()
+
+
+def test_another_plant_does_not_change_the_hash_of_this_one():
+    scenario = parsed(SCENARIO)
+    before = scenario.simulation_hash()
+    scenario.variations["payload"] = PlantVariation(mass_scale=1.4)
+    assert scenario.simulation_hash() == before
+    assert scenario.simulation_hash("payload") != before
+    with pytest.raises(ValueError, match=r"no variation 'lighter'.*'payload'"):
+        scenario.simulation_hash("lighter")
 
 
 def test_a_robots_files_change_the_hash_and_their_folder_does_not(tmp_path):

@@ -1,10 +1,13 @@
 """The whole loop: nominal episodes, Γ learned from them, Γ and recovery steps in a diagram."""
 
+import copy
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety.control.robot import PlantVariation
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.throws import run_throw
 
@@ -22,7 +25,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def episodes(scenario):
-    return run_episodes(scenario, 128, seed=3)
+    return run_episodes(scenario, 256, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -54,17 +57,21 @@ def test_gamma_tells_unsafe_episodes_from_safe_ones_shortly_before_the_end(scena
 
 
 def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
-    loop = scenario.make_loop("actual", assessment=assessment, recovery=False, ball=True)
+    # Without measurement noise, of which every reading at an instant may be a fresh draw.
+    quiet = copy.deepcopy(scenario)
+    quiet.variations["quiet"] = PlantVariation(joint_friction_nm=0.4)
+    loop = quiet.make_loop("quiet", assessment=assessment, recovery=False, ball=True)
     ports = ("safety_probability", "normalized_safety_probability", "belief")
     log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=1.0, ports=ports)
     result = assessment.predict(log.state, log.desired_preview, log.features)
-    # A row shows the state before the updates of its instant: Γ of a row is published in the next,
-    # and from a fresh draw of the measurement noise.
-    published = log.extra["normalized_safety_probability"][1:, 0]
-    difference = np.abs(published - result.normalized[:-1])
-    assert np.median(difference) < 0.01
-    assert np.corrcoef(published, result.normalized[:-1])[0, 1] > 0.95
-    np.testing.assert_allclose(log.extra["belief"].sum(axis=1), 1.0, atol=1e-6)
+    # A row shows the state before the updates of its instant: Γ of a row is published in the next.
+    for name, expected in (
+        ("safety_probability", result.safety_probability[:, None]),
+        ("normalized_safety_probability", result.normalized[:, None]),
+        ("belief", result.belief),
+    ):
+        np.testing.assert_allclose(log.extra[name][1:], expected[:-1], atol=1e-5)
+    assert np.ptp(result.normalized) > 0.5
 
 
 def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot(scenario, assessment):
@@ -74,7 +81,7 @@ def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot(scenario, assessmen
     loop = scenario.make_loop("actual", assessment=assessment, ball=True)
     log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=3.0)
     assert not log.has_fallen
-    assert HARD.time_s < log.trigger_time_s < HARD.time_s + 0.2
+    assert HARD.time_s < log.trigger_time_s < HARD.time_s + 0.1
     assert log.violations["legs_collide"] == 0
     assert log.violations["joint_position"] == 0
     assert log.violations["joint_effort"] == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from pydrake.math import RigidTransform
+from scipy.linalg.lapack import dposv
 
 from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
@@ -14,6 +15,8 @@ from drake_safety.control.kinematics import (
 _TOLERANCE_M = 1e-4
 _DAMPING = 1e-8  # [m²/rad²]: keeps a stretched leg's step finite.
 _MAX_STEP_RAD = 0.5  # in one iteration.
+# What a Newton step leaves is of second order: with a leg of 1 m, some 1e-5 m after this step.
+_LAST_STEP_RAD = 0.004
 
 
 def solve_inverse_kinematics(
@@ -42,30 +45,66 @@ def solve_inverse_kinematics(
     Returns:
         Joint positions (n_j,) [rad].
     """
+    joints, _ = solve_from(
+        kinematics,
+        kinematics.positions_at(X_WB, guess),
+        p_WC,
+        max_iterations=max_iterations,
+        tolerance_m=tolerance_m,
+    )
+    return joints
+
+
+def solve_from(
+    kinematics: RobotKinematics,
+    q: np.ndarray,
+    p_WC: np.ndarray,
+    *,
+    max_iterations: int = 20,
+    tolerance_m: float = _TOLERANCE_M,
+) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`solve_inverse_kinematics` for a controller's tick, which goes on to use a Jacobian.
+
+    Args:
+        kinematics: The robot.
+        q: Base pose and joint positions to start from, (n_q,); the joints are overwritten.
+        p_WC: Wanted positions of the contact spheres' centres, (n_c, 3) [m].
+        max_iterations: Bound on the Newton steps.
+        tolerance_m: Largest error of a contact point's coordinate at which the search ends [m].
+
+    Returns:
+        Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last point of
+        the search that was looked at, at most one small step away.
+    """
     lowest, highest = kinematics.position_limits.T
-    q = kinematics.positions_at(X_WB, guess)
-    joints = np.minimum(np.maximum(guess, lowest), highest)
+    joints = np.minimum(np.maximum(q[NUM_BASE_POSITIONS:], lowest), highest)
+    J = np.empty((3 * kinematics.num_contacts, kinematics.num_velocities))
     for _ in range(max_iterations):
         q[NUM_BASE_POSITIONS:] = joints
-        error = (p_WC - kinematics.contact_positions(q)).ravel()
+        reached, J = kinematics.contact_positions_and_jacobian(q)
+        error = (p_WC - reached).ravel()
         if max(error.max(), -error.min()) < tolerance_m:
             break
         # Columns of joints that move no foot are zero: the damping leaves those joints alone.
-        J = kinematics.contact_jacobian(q)[:, NUM_BASE_VELOCITIES:]
-        step = _damped_step(J, error)
-        moved = np.minimum(np.maximum(joints + step, lowest), highest)
-        is_blocked = (moved == joints) & (step != 0)
-        if is_blocked.any():
+        J_joints = J[:, NUM_BASE_VELOCITIES:]
+        step = _damped_step(J_joints, error)
+        wanted = joints + step
+        moved = np.minimum(np.maximum(wanted, lowest), highest)
+        if (moved != wanted).any():
             # Joints pushed against a limit give no help: the others must do without them.
-            J[:, is_blocked] = 0.0
-            moved = np.minimum(np.maximum(joints + _damped_step(J, error), lowest), highest)
+            J_joints = J_joints.copy()
+            J_joints[:, (moved == joints) & (step != 0)] = 0.0
+            step = _damped_step(J_joints, error)
+            moved = np.minimum(np.maximum(joints + step, lowest), highest)
         joints = moved
-    return joints
+        if max(step.max(), -step.min()) < _LAST_STEP_RAD:
+            break
+    return joints, J
 
 
 def _damped_step(J: np.ndarray, error: np.ndarray) -> np.ndarray:
     gram = J.T @ J
     gram.flat[:: len(gram) + 1] += _DAMPING
-    step = np.linalg.solve(gram, J.T @ error)
+    _, step, _ = dposv(gram, J.T @ error)
     largest = max(step.max(), -step.min())
     return step * (_MAX_STEP_RAD / largest) if largest > _MAX_STEP_RAD else step

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.linalg.lapack import dposv
 
 from drake_safety.control.robot import (
     PlantVariation,
@@ -53,6 +54,7 @@ class RobotKinematics:
                 f"{self.plant.num_velocities()} velocities"
             )
         self.context = self.plant.CreateDefaultContext()
+        self._last_contacts: tuple[bytes, np.ndarray] = (b"", np.empty((0, 3)))
         if variation is not None and variation.mass_scale != 1.0:
             apply_mass_scale(self.plant, self.context, robot, variation.mass_scale)
         self.num_positions = self.plant.num_positions()
@@ -77,6 +79,7 @@ class RobotKinematics:
             self.foot_frames.append(self.plant.GetFrameByName(foot.body))
             self.foot_points.append(np.asfortranarray(np.array(foot.contact_points).T))
             radii += [foot.radius_m] * len(foot.contact_points)
+        self._feet = list(zip(self.foot_frames, self.foot_points, strict=True))
         self.foot_radii = np.array(radii)
         self.num_contacts = len(self.foot_radii)
         posture = posture_positions(self.plant, robot)
@@ -113,30 +116,42 @@ class RobotKinematics:
         self.plant.SetPositions(self.context, q)
 
     def contact_positions(self, q: np.ndarray) -> np.ndarray:
-        """World positions of the contact spheres' centres, (n_c, 3) [m]."""
+        """World positions of the contact spheres' centres, (n_c, 3) [m], read-only."""
+        # Margins, observed state and features of one instant ask for the same positions.
+        key = q.tobytes()
+        if key == self._last_contacts[0]:
+            return self._last_contacts[1]
         self._set_positions(q)
-        return np.concatenate(
-            [
-                self.plant.CalcPointsPositions(self.context, frame, points, self.world_frame).T
-                for frame, points in zip(self.foot_frames, self.foot_points, strict=True)
-            ]
-        )
+        p_WC = self._contacts()
+        p_WC.flags.writeable = False
+        self._last_contacts = (key, p_WC)
+        return p_WC
 
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
         """Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
         self._set_positions(q)
+        return self._jacobian()
+
+    def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """:meth:`contact_positions` and :meth:`contact_jacobian` for the price of one pose."""
+        self._set_positions(q)
+        return self._contacts(), self._jacobian()
+
+    def _contacts(self) -> np.ndarray:
+        calculate, context, world = self.plant.CalcPointsPositions, self.context, self.world_frame
         return np.concatenate(
-            [
-                self.plant.CalcJacobianTranslationalVelocity(
-                    self.context,
-                    JacobianWrtVariable.kV,
-                    frame,
-                    points,
-                    self.world_frame,
-                    self.world_frame,
-                )
-                for frame, points in zip(self.foot_frames, self.foot_points, strict=True)
-            ]
+            [calculate(context, frame, points, world).T for frame, points in self._feet]
+        )
+
+    def _jacobian(self) -> np.ndarray:
+        calculate, context, world = (
+            self.plant.CalcJacobianTranslationalVelocity,
+            self.context,
+            self.world_frame,
+        )
+        kind = JacobianWrtVariable.kV
+        return np.concatenate(
+            [calculate(context, kind, frame, points, world, world) for frame, points in self._feet]
         )
 
     def gravity_torques(
@@ -169,7 +184,9 @@ class RobotKinematics:
         # others be balanced in the least-squares sense.
         gram = A @ A.T
         gram.flat[:: NUM_BASE_VELOCITIES + 1] += 1e-4
-        forces = A.T @ np.linalg.solve(gram, -g[:NUM_BASE_VELOCITIES])
+        # LAPACK itself: for six unknowns numpy's checks cost more than the solution.
+        _, weights, _ = dposv(gram, -g[:NUM_BASE_VELOCITIES])
+        forces = A.T @ weights
         return -g[NUM_BASE_VELOCITIES:] - J[:, NUM_BASE_VELOCITIES:].T @ forces
 
     def center_of_mass(self, q: np.ndarray) -> np.ndarray:

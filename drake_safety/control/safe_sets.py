@@ -1,6 +1,7 @@
 """Safe sets as signed margins: positive inside, zero on the boundary, negative outside."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,7 +41,9 @@ def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
     return chain(ordered) + chain(ordered[::-1])
 
 
-def signed_distance_to_polygon(point: np.ndarray, corners: list[tuple[float, float]]) -> float:
+def signed_distance_to_polygon(
+    point: Sequence[float] | np.ndarray, corners: list[tuple[float, float]]
+) -> float:
     """Signed distance of a point to a convex polygon's boundary, positive inside.
 
     Args:
@@ -143,14 +146,15 @@ class BalanceSafeSet:
         del v
         p_WC = self.kinematics.contact_positions(q)
         _, is_support = self._support(p_WC)
-        height = float(q[6])
+        # Plain floats: each operation on a short array costs more than all of them here.
+        w, x, y, z, base_x, base_y, height = q[:7].tolist()
         if is_support.any():
             corners = convex_hull(p_WC[is_support, :2])
-            support = signed_distance_to_polygon(q[4:6], corners)
+            support = signed_distance_to_polygon((base_x, base_y), corners)
         else:
-            support = -float(np.hypot(*(q[4:6] - p_WC[:, :2].mean(axis=0)))) - 1e-3
+            centre_x, centre_y = p_WC[:, :2].mean(axis=0).tolist()
+            support = -math.hypot(base_x - centre_x, base_y - centre_y) - 1e-3
         lowest, highest = self.limits.height_m
-        w, x, y, z = q[:4]
         cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
         fall = min(
             height - self.limits.fall_height_m,
@@ -194,7 +198,7 @@ class BalanceSafeSet:
         goal = preview[-1, :2]
         reach = (contacts[is_support] @ _DIRECTIONS).max(axis=0)
         corners = convex_hull(contacts[is_support])
-        points = (base, capture_point, goal)
+        points = np.stack([base, capture_point, goal])
         qw, qx, qy, qz = q[:4]
         base_yaw = math.atan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
         yaw_error = math.remainder(base_yaw - yaw, 2 * math.pi)
@@ -202,10 +206,10 @@ class BalanceSafeSet:
         heights = preview[:, 2].tolist()
         return np.concatenate(
             [
-                *(reach - p @ _DIRECTIONS for p in points),
-                [signed_distance_to_polygon(p, corners) for p in points],
+                (reach - points @ _DIRECTIONS).ravel(),
+                [signed_distance_to_polygon(p, corners) for p in points.tolist()],
                 [
-                    min(signed_distance_to_polygon(p, corners) for p in preview[:, :2]),
+                    min(signed_distance_to_polygon(p, corners) for p in preview[:, :2].tolist()),
                     min(min(heights) - lowest, highest - max(heights)),
                     heights[-1],
                 ],

@@ -14,6 +14,7 @@ import numpy as np
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
+    INPUT_LIMIT,
     Embedding,
     MapData,
     MapSettings,
@@ -27,7 +28,8 @@ from drake_safety.learning.segments import Episodes, EpisodesInfo, Segments, spl
 MODES = ("paper", "sharpened")
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 1
-_INPUT_LIMIT = 1e30
+_INSIDE_SHARE = 0.995
+"""Share of the inputs that a map may not send beyond the extent of t-SNE's points."""
 _logger = logging.getLogger("drake_safety")
 
 
@@ -166,8 +168,8 @@ class Assessment:
     safety_probability: float
     normalized: float
     belief: np.ndarray
-    embedding: np.ndarray
     cause_probability: np.ndarray
+    embedding: np.ndarray
     predicted_margins: np.ndarray
 
 
@@ -316,7 +318,19 @@ class SafetyAssessment:
             )
             members.append(train_map(data, settings, seed=seed, progress=report))
         num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
-        return stack_members(members, num_margins=num_margins)
+        embedding = stack_members(members, num_margins=num_margins)
+        return self._fill_grid(embedding, data) if is_sharpened else embedding
+
+    @staticmethod
+    def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
+        """Scales the maps so that what they do with the inputs is as wide as t-SNE's points.
+
+        Departure: a light weight on the distance to t-SNE's points leaves the maps' scale open;
+        some inputs would fall off the grid, or all into few of its cells.
+        """
+        reach = np.abs(embedding.embed(data.x)).max(axis=2)
+        extent = np.quantile(reach, _INSIDE_SHARE, axis=1)
+        return embedding.scaled((np.abs(data.target).max() / extent).astype(np.float32))
 
     def _fill_cells(self, x: np.ndarray, segments: Segments) -> None:
         parameters = self.parameters
@@ -402,7 +416,7 @@ class SafetyAssessment:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
         self._check_width(x.shape[1])
         with np.errstate(over="ignore", invalid="ignore"):
-            is_usable = np.einsum("ij,ij->i", x, x) < _INPUT_LIMIT
+            is_usable = np.einsum("ij,ij->i", x, x) < INPUT_LIMIT
         x = np.where(is_usable[:, None], x, np.nan)
         output = self.embedding_.evaluate(x)
         masses = np.zeros((len(x), beliefs.shape[2]))
@@ -449,63 +463,76 @@ class SafetyAssessment:
     ) -> Assessment:
         """Assesses one input; the arguments are those of `predict` without the axis N."""
         self._check_fitted()
-        beliefs = self._beliefs(beliefs)
-        is_sharpened = self.parameters.is_sharpened
+        row = self.predict_row(state, desired_preview, features, self._beliefs(beliefs))
+        num_columns = self.beliefs_.shape[2]
+        return Assessment(
+            safety_probability=float(row[0]),
+            normalized=float(row[1]),
+            belief=row[2:5],
+            cause_probability=row[5 : 2 + num_columns],
+            embedding=row[2 + num_columns : 4 + num_columns],
+            predicted_margins=row[4 + num_columns :],
+        )
+
+    def predict_row(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None,
+        beliefs: np.ndarray,
+    ) -> np.ndarray:
+        """`predict_one` as one vector, for the online run: what it costs is most of the tick.
+
+        Returns:
+            The fields of `Assessment` one after the other, in their order, (7 + 2 n_c,).
+        """
+        is_sharpened = self.parameters.mode == "sharpened"
         parts: tuple[np.ndarray, ...] = (state, desired_preview)
         if is_sharpened and features is not None:
             parts = (state, desired_preview, features)
-        x = np.concatenate(parts)
-        embedding = self.embedding_
-        if x.shape[0] != embedding.num_inputs:
-            self._check_width(x.shape[0])
+        embedding, grid = self.embedding_, self.grid_
+        width = sum(map(len, parts))
+        if width != embedding.num_inputs:
+            self._check_width(width)
         num_members, num_cells, num_columns = beliefs.shape
-        if not np.vdot(x, x) < _INPUT_LIMIT:  # Unlike x.dot(x), silent when it overflows.
-            unknown = np.full(num_columns - 3, np.nan)
-            return self._assessment(None, np.full(2, np.nan), unknown, num_columns)
-        output = embedding.evaluate_one(x.astype(np.float32))
-        points = output[:, :2].tolist()
-        if embedding.num_margins:
-            margins = np.add.reduce(output[:, 2:])
-            margins /= num_members
-        else:
-            margins = np.full(num_columns - 3, np.nan)
-        masses: np.ndarray | None = None
-        if not is_sharpened:
-            cell = self.grid_.locate_one(*points[0])
-            if cell != OUTSIDE:
-                masses = beliefs[0, cell]
-            return self._assessment(masses, output[0], margins, num_columns)
+        row = np.empty(1 + 2 * num_columns)
+        masses = row[2 : 2 + num_columns]
+        output = embedding.evaluate_one(*parts)
         rows: list[int] = []
-        weights: list[float] = []
-        for member, (first, second) in enumerate(points):
-            corners = self.grid_.bilinear_one(first, second)
-            if corners is not None:
-                start = member * num_cells
-                rows += [start + cell for cell in corners[0]]
-                weights += corners[1]
-        if rows:
-            masses = np.array(weights).dot(beliefs.reshape(-1, num_columns).take(rows, axis=0))
-            masses /= num_members
-            # A map that sends the input outside its grid knows nothing of it.
-            masses[belief_masses.UNCERTAINTY] += 1.0 - len(rows) / (4 * num_members)
-        return self._assessment(masses, output[0], margins, num_columns)
-
-    @staticmethod
-    def _assessment(
-        masses: np.ndarray | None, point: np.ndarray, margins: np.ndarray, num_columns: int
-    ) -> Assessment:
-        if masses is None:
-            masses = belief_masses.empty((), num_columns - 3)
-        safe, unsafe, _ = masses[:3].tolist()
+        if output is None:
+            row[2 + num_columns :] = np.nan
+        elif is_sharpened:
+            weights: list[float] = []
+            for member, (first, second) in enumerate(output[:, :2].tolist()):
+                corners = grid.bilinear_one(first, second)
+                if corners is not None:
+                    start = member * num_cells
+                    rows += [start + cell for cell in corners[0]]
+                    weights += corners[1]
+            if rows:
+                np.dot(weights, beliefs.reshape(-1, num_columns).take(rows, axis=0), out=masses)
+                masses /= num_members
+                # A map that sends the input outside its grid knows nothing of it.
+                masses[belief_masses.UNCERTAINTY] += 1.0 - len(rows) / (4 * num_members)
+        else:
+            cell = grid.locate_one(*output[0, :2].tolist())
+            if cell != OUTSIDE:
+                rows = [cell]
+                masses[:] = beliefs[0, cell]
+        if not rows:
+            masses[:] = 0.0
+            masses[belief_masses.UNCERTAINTY] = 1.0
+        safe, unsafe = masses[:2].tolist()
         known = safe + unsafe
-        return Assessment(
-            safety_probability=safe,
-            normalized=safe / known if known > 0.0 else 0.0,
-            belief=masses[:3],
-            embedding=point[:2],
-            cause_probability=masses[3:],
-            predicted_margins=margins,
-        )
+        row[0] = safe
+        row[1] = safe / known if known > 0.0 else 0.0
+        if output is not None:
+            row[2 + num_columns : 4 + num_columns] = output[0, :2]
+            row[4 + num_columns :] = np.nan
+            if embedding.num_margins:
+                np.add.reduce(output[:, 2:], out=row[4 + num_columns :])
+                row[4 + num_columns :] /= num_members
+        return row
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one safetensors file, first under a temporary name: it is whole or absent."""

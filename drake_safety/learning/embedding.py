@@ -71,6 +71,10 @@ def tsne(
     return np.asarray(embedding, dtype=float).copy()
 
 
+INPUT_LIMIT = 1e30
+"""Squared length from which on an input counts as not finite."""
+
+
 class EmbeddingOutput(NamedTuple):
     """What a stack of K maps says of inputs.
 
@@ -128,29 +132,39 @@ class Embedding:
                 raise ValueError(
                     f"Embedding: a layer of shape {w.shape} is followed by one of {next_w.shape}"
                 )
-        first, first_bias = self._layers[0]
-        self.num_members, self.num_inputs, width = first.shape
+        self.num_members, self.num_inputs, width = self._layers[0][0].shape
         if self._layers[-1][0].shape[2] != 2 + num_margins:
             raise ValueError(
                 f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
                 f"{2 + num_margins} for {num_margins} margins"
             )
         self.has_safety_head = "safety.0.weight" in self.weights
-        # All members share the input, so that one product serves their first layers.
-        joint = first.transpose(1, 0, 2).reshape(self.num_inputs, -1)
-        self._first_bias = first_bias.reshape(-1)
-        self._first, *following = _pack([joint, *(w for w, _ in self._layers[1:])])
-        biases = [bias for _, bias in self._layers[1:]]
-        self._stacked: tuple[int, ...] = (self.num_members, 1, width)
+        # For one input at a time every operation counts: a last entry that is always one carries
+        # the biases through the products, and all members share the first.
+        layers = [_with_bias(w, bias[:, 0]) for w, bias in self._layers[:-1]]
+        layers.append(np.concatenate([self._layers[-1][0], self._layers[-1][1]], axis=1))
+        joint = layers[0].transpose(1, 0, 2).reshape(self.num_inputs + 1, -1)
+        self._first, *following = _pack([joint, *layers[1:]])
+        self._stacked: tuple[int, ...] = (self.num_members, 1, width + 1)
         self._product: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.matmul
         if self.num_members == 1:
             # Plain products of a vector and a matrix cost numpy half of what stacks of one cost.
-            self._stacked, self._product = (width,), np.dot
-            self._following = [
-                (w[0], bias[0, 0]) for w, bias in zip(following, biases, strict=True)
-            ]
-        else:
-            self._following = list(zip(following, biases, strict=True))
+            self._stacked, self._product = (width + 1,), np.dot
+            following = [w[0] for w in following]
+        widths = [w.shape[-2] for w in following]
+        self._following = [
+            (np.zeros((*self._stacked[:-1], width), dtype=np.float32), w)
+            for width, w in zip(widths, following, strict=True)
+        ]
+
+    def scaled(self, factors: np.ndarray) -> Embedding:
+        """The same maps with y multiplied by a factor each, (K,); their safety heads follow."""
+        weights = {name: w.copy() for name, w in self.weights.items()}
+        for name in ("output.weight", "output.bias"):
+            weights[name][..., :2] *= factors.reshape(-1, *[1] * (weights[name].ndim - 1))
+        if self.has_safety_head:
+            weights["safety.0.weight"] /= factors[:, None, None]
+        return Embedding(weights, num_margins=self.num_margins)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
@@ -189,21 +203,42 @@ class Embedding:
         """Psi: inputs (N, n_x) to points (K, N, 2)."""
         return self.evaluate(x).embedding
 
-    def evaluate_one(self, x: np.ndarray) -> np.ndarray:
-        """y and margins of one finite float32 input (n_x,) by every member, (K, 2 + n_c)."""
-        z = x.dot(self._first)
-        z += self._first_bias
-        z = z.reshape(self._stacked)
-        for weight, bias in self._following:
-            np.maximum(z, 0.0, out=z)
-            z = self._product(z, weight)
-            z += bias
+    def evaluate_one(self, *parts: np.ndarray) -> np.ndarray | None:
+        """y and margins of one input by every member, (K, 2 + n_c).
+
+        Args:
+            parts: Vectors that x consists of, in their order, (n_x,) together.
+
+        Returns:
+            None for an input that is not finite, or too large for single precision.
+        """
+        x = np.empty(self.num_inputs + 1, dtype=np.float32)
+        start, square = 0, 0.0
+        for part in parts:
+            square += np.vdot(part, part)  # Unlike part.dot(part), silent when it overflows.
+            if not square < INPUT_LIMIT:
+                return None
+            stop = start + len(part)
+            x[start:stop] = part
+            start = stop
+        x[start:] = 1.0
+        z = x.dot(self._first).reshape(self._stacked)
+        for zero, weight in self._following:
+            z = self._product(np.maximum(z, zero, out=z), weight)
         return z.reshape(self.num_members, -1)
 
     def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
         w = self.weights
         hidden = np.maximum(y[0] @ w["safety.0.weight"][member] + w["safety.0.bias"][member], 0.0)
         return (hidden @ w["safety.1.weight"][member] + w["safety.1.bias"][member])[:, 0]
+
+
+def _with_bias(weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """Weights (K, n, m) and biases (K, m) as one (K, n + 1, m + 1) that keeps a last entry of 1."""
+    k, n, m = weight.shape
+    joined = np.zeros((k, n + 1, m + 1), dtype=weight.dtype)
+    joined[:, :n, :m], joined[:, n, :m], joined[:, n, m] = weight, bias, 1.0
+    return joined
 
 
 def _pack(arrays: list[np.ndarray]) -> list[np.ndarray]:

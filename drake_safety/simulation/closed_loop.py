@@ -170,7 +170,7 @@ def check_assessment(
         "output": (list(info.output_names), list(output_names)),
         "features": (list(info.feature_names), list(feature_names)),
         "constraints": (list(info.constraint_names), list(constraint_names)),
-        "scenario hash": (info.scenario_hash, scenario.simulation_hash()),
+        "scenario hash": (info.scenario_hash, scenario.simulation_hash(info.variation)),
     }
     for what, (learned, here) in sides.items():
         if learned != here:

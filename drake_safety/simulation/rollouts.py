@@ -43,7 +43,7 @@ def episodes_info(loop: ClosedLoop, seed: int) -> EpisodesInfo:
     scenario = loop.scenario
     return EpisodesInfo(
         scenario=scenario.name,
-        scenario_hash=scenario.simulation_hash(),
+        scenario_hash=scenario.simulation_hash(loop.variation_name),
         variation=loop.variation_name,
         seed=seed,
         step_s=scenario.step_s,

@@ -110,14 +110,29 @@ class Scenario:
         body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
         return head + "---\n" + body
 
-    def simulation_hash(self) -> str:
+    def simulation_hash(self, variation: str = "nominal") -> str:
         """SHA-256 of all that decides what a rollout does and records, robot included.
 
         How Γ is learned is left out, but for the horizon that shapes the preview, and so are the
-        task's online parameters: episodes stay valid when only the learning or a threshold changes.
+        task's online parameters and the other variations: episodes stay valid when only the
+        learning, a threshold or another plant changes.
+
+        Args:
+            variation: The plant that is simulated. The nominal one always counts: controllers
+                take it for the robot.
+
+        Raises:
+            ValueError: No such variation.
         """
+        if variation != "nominal":
+            self.variation(variation)
         text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario))
         text["assessment"] = {"horizon": self.assessment.horizon}
+        text["variations"] = {
+            name: values
+            for name, values in text["variations"].items()
+            if name in ("nominal", variation)
+        }
         # A robot of one's own is known by its files, wherever their folder lies.
         text["robot"] = Path(self.robot).name
         task = self.task_class()

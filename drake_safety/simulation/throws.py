@@ -167,10 +167,16 @@ def play_throws(
         while waiting and waiting[0].time_s - _FLIGHT_S <= time:
             throw = waiting.pop(0)
             release_s = max(throw.time_s - _FLIGHT_S, 0.0)
-            simulator.AdvanceTo(release_s)
+            _advance(simulator, release_s)
             loop.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
-        simulator.AdvanceTo(time)
+        _advance(simulator, time)
         yield time
+
+
+def _advance(simulator: Simulator, time: float) -> None:
+    # To advance to the present would already take the step that begins now.
+    if time > simulator.get_context().get_time():
+        simulator.AdvanceTo(time)
 
 
 def run_throw(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from drake_safety.control.kinematics import RobotKinematics, fit_stance
+from drake_safety.control.inverse_kinematics import solve_from
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
 
 _RATE_SHARE = 0.7  # Of a joint's speed limit; the servo overshoots a ramp by the rest.
 _LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
@@ -61,6 +62,7 @@ class InverseKinematicsController(LeafSystem):
         self._kinematics = kinematics
         self._stiffness = stiffness
         self._rate_limit = _RATE_SHARE * kinematics.velocity_limits
+        self._lowest_rate = -self._rate_limit
         self._period_s = period_s
         n_j = kinematics.num_joints
         self._limits = np.ascontiguousarray(kinematics.position_limits.T)
@@ -101,11 +103,16 @@ class InverseKinematicsController(LeafSystem):
         else:
             feet = context.get_numeric_parameter(self._feet_index).get_value()
         p_WC = feet.reshape(-1, 3)
-        yaw = fit_stance(p_WC, kinematics.nominal_contacts)[2]
-        X_WB = RigidTransform(RotationMatrix.MakeZRotation(yaw), self._desired_port.Eval(context))
-        joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, guess)
+        half_yaw = 0.5 * fit_stance(p_WC, kinematics.nominal_contacts)[2]
+        n_b = NUM_BASE_POSITIONS
+        q = np.zeros(kinematics.num_positions)
+        q[0], q[3] = math.cos(half_yaw), math.sin(half_yaw)
+        q[4:n_b] = self._desired_port.Eval(context)
+        q[n_b:] = guess
+        joints, J = solve_from(kinematics, q, p_WC)
+        q[n_b:] = joints
         is_stance = p_WC[:, 2] - kinematics.foot_radii <= _LIFTED_M
-        torques = kinematics.gravity_torques(kinematics.positions_at(X_WB, joints), is_stance)
+        torques = kinematics.gravity_torques(q, is_stance, J)
         return joints, torques
 
     def _add_offset(self, joints: np.ndarray, torques: np.ndarray) -> np.ndarray:
@@ -114,7 +121,7 @@ class InverseKinematicsController(LeafSystem):
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         plant_state = self._state_port.Eval(context)
-        guess = plant_state[7 : self._kinematics.num_positions]
+        guess = plant_state[NUM_BASE_POSITIONS : self._kinematics.num_positions]
         joints, torques = self._solve(context, guess)
         command = self._add_offset(joints, torques)
         discrete_state.set_value(np.concatenate([joints, command, np.zeros_like(joints)]))
@@ -126,7 +133,7 @@ class InverseKinematicsController(LeafSystem):
         # Smooth set points go on as they went: most ticks then need no Newton step at all.
         wanted, torques = self._solve(context, previous + self._period_s * last_rate)
         rate = (wanted - previous) / self._period_s
-        rate = np.minimum(np.maximum(rate, -self._rate_limit), self._rate_limit)
+        rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
         joints = previous + self._period_s * rate
         discrete_state.set_value(np.concatenate([joints, self._add_offset(joints, torques), rate]))
 

@@ -22,8 +22,8 @@ class SafetyAssessor(LeafSystem):
         - safety_probability
         - normalized_safety_probability
         - belief
-        - embedding
         - cause_probability
+        - embedding
         - predicted_margins
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
@@ -53,12 +53,13 @@ class SafetyAssessor(LeafSystem):
             "desired_preview", info.horizon * len(info.output_names)
         )
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        # In the order of the row that the assessment gives.
         sizes = {
             "safety_probability": 1,
             "normalized_safety_probability": 1,
             "belief": 3,
-            "embedding": 2,
             "cause_probability": n_c,
+            "embedding": 2,
             "predicted_margins": n_c,
         }
         state = self.DeclareDiscreteState(sum(sizes.values()))
@@ -99,20 +100,11 @@ class SafetyAssessor(LeafSystem):
         context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        result = self._assessment.predict_one(
-            self._state_port.Eval(context),
-            self._preview_port.Eval(context),
-            self._features_port.Eval(context) if self._uses_features else None,
-            beliefs=self.get_beliefs(context),
-        )
         discrete_state.set_value(
-            np.concatenate(
-                (
-                    (result.safety_probability, result.normalized),
-                    result.belief,
-                    result.embedding,
-                    result.cause_probability,
-                    result.predicted_margins,
-                )
+            self._assessment.predict_row(
+                self._state_port.Eval(context),
+                self._preview_port.Eval(context),
+                self._features_port.Eval(context) if self._uses_features else None,
+                self.get_beliefs(context),
             )
         )

@@ -37,12 +37,9 @@ def interpolate(
 
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) [m] of the stance frame ``[x, y, yaw]``, in the world."""
-    x, y, yaw = stance_pose
+    x, y, yaw = stance_pose.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
-    world = points.copy()
-    world[..., 0] = x + c * points[..., 0] - s * points[..., 1]
-    world[..., 1] = y + s * points[..., 0] + c * points[..., 1]
-    return world
+    return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
 
 
 class TrajectoryPlanner(LeafSystem):
@@ -158,8 +155,8 @@ class TrajectoryPlanner(LeafSystem):
         return context.get_numeric_parameter(self._stance_index).get_value()
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
-        z = self.get_plan(context).value(context.get_time()).reshape(-1, 3)
-        output.SetFromVector(to_world(self._stance_pose(context), z).ravel())
+        z = self.get_plan(context).value(context.get_time())
+        output.SetFromVector(to_world(self._stance_pose(context), z.reshape(-1, 3)).ravel())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
         plan, derivative = context.get_abstract_parameter(self._plan_index).get_value()
