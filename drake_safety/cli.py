@@ -261,8 +261,9 @@ def run(
     """Simulate once with Γ in the loop: a recording, a timeline, and what happened when."""
     from pydrake.geometry import Meshcat
 
-    from drake_safety.evaluation.figures import save, timeline_figure
+    from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.stills import render_stills, stack_positions
+    from drake_safety.evaluation.timeline_figure import timeline_figure
     from drake_safety.simulation.scenario import load_scenario
     from drake_safety.simulation.throws import run_throw
 
@@ -427,12 +428,9 @@ def evaluate(
     workers: WorkersOption = None,
 ) -> None:
     """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers."""
-    from drake_safety.evaluation.figures import (
-        embedding_figure,
-        roc_figure,
-        save,
-        throws_figure,
-    )
+    from drake_safety.evaluation.embedding_figure import embedding_figure
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.roc_figure import roc_figure
     from drake_safety.evaluation.study import (
         TriggerRule,
         assessment_scorer,
@@ -440,6 +438,7 @@ def evaluate(
         evaluate_episodes,
         evaluate_throws,
     )
+    from drake_safety.evaluation.throws_figure import throws_figure
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
