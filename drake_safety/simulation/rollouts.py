@@ -177,7 +177,7 @@ def run_episodes(
     loop = scenario.make_loop(variation, **loop_options)
     info = episodes_info(loop, seed)
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
-    todo = [index for index in range(num_episodes) if index not in done]
+    remaining = [index for index in range(num_episodes) if index not in done]
     if progress is not None:
         progress(len(done), num_episodes)
     finished: list[Episode] = []
@@ -185,8 +185,8 @@ def run_episodes(
     results = parallel_map(
         _episode_batch,
         [
-            (scenario, variation, loop_options, seed, todo[i : i + _BATCH])
-            for i in range(0, len(todo), _BATCH)
+            (scenario, variation, loop_options, seed, remaining[i : i + _BATCH])
+            for i in range(0, len(remaining), _BATCH)
         ],
         num_workers,
     )
