@@ -429,15 +429,11 @@ def evaluate(
 ) -> None:
     """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers."""
     from drake_safety.evaluation.embedding_figure import embedding_figure
+    from drake_safety.evaluation.episode_study import evaluate_episodes
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.roc_figure import roc_figure
-    from drake_safety.evaluation.study import (
-        TriggerRule,
-        assessment_scorer,
-        baseline_scorers,
-        evaluate_episodes,
-        evaluate_throws,
-    )
+    from drake_safety.evaluation.scorers import assessment_scorer, classifier_scorers
+    from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
     from drake_safety.evaluation.throws_figure import throws_figure
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.rollouts import run_episodes
@@ -468,7 +464,7 @@ def evaluate(
         scorers = [
             assessment_scorer("sharpened", sharpened, is_normalized=True),
             assessment_scorer("paper", paper, is_normalized=True),
-            *baseline_scorers(train_set, stages),
+            *classifier_scorers(train_set, stages),
         ]
         figures, scores, labels = evaluate_episodes(scorers, calibration_set, test_set)
         pictures = [

@@ -1,145 +1,18 @@
-"""The study behind ``drake-safety evaluate``: fresh episodes, fresh throws, every scorer alike."""
+"""Balls at the actual plant: when each scorer would have the robot step, and what becomes of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from drake_safety.evaluation.baselines import KINDS, DirectClassifier
-from drake_safety.evaluation.metrics import (
-    Figure,
-    auc_difference,
-    episode_figures,
-    median,
-    proportion,
-    segment_figures,
-    threshold_at,
-)
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import Episodes, split
+from drake_safety.evaluation.metrics import Figure, median, proportion
+from drake_safety.evaluation.scorers import Scorer, StageProgress
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
-
-MAX_TRIGGER_DELAY_S = 0.05
-Figures = dict[str, Figure]
-Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scorer:
-    """Something that says how probable safety is.
-
-    Attributes:
-        name: Its key in tables.
-        probability: Safety probability of states, previews and features, (N,); NaN where it does
-            not know.
-        uses_true_state: Whether nominal episodes show it the state without noise.
-    """
-
-    name: str
-    probability: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-    uses_true_state: bool = False
-
-
-def assessment_scorer(name: str, assessment: SafetyAssessment, *, is_normalized: bool) -> Scorer:
-    """Γ as a scorer, normalised or literal."""
-
-    def probability(
-        state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
-    ) -> np.ndarray:
-        result = assessment.predict(
-            state, desired_preview, features if assessment.uses_features else None
-        )
-        return result.normalized if is_normalized else result.safety_probability
-
-    return Scorer(
-        name=name,
-        probability=probability,
-        uses_true_state=not assessment.parameters.is_sharpened,
-    )
-
-
-def baseline_scorers(episodes: Episodes, progress: Progress | None = None) -> list[Scorer]:
-    """The direct classifiers, trained on the assessment's own training episodes."""
-    scorers = []
-    for i, kind in enumerate(KINDS):
-        if progress is not None:
-            progress("direct classifiers", i, len(KINDS))
-        classifier = DirectClassifier(kind).fit(episodes)
-
-        def probability(
-            state: np.ndarray,
-            desired_preview: np.ndarray,
-            features: np.ndarray,
-            classifier: DirectClassifier = classifier,
-        ) -> np.ndarray:
-            return 1.0 - classifier.predict_unsafe(state, desired_preview, features)
-
-        scorers.append(Scorer(name=kind, probability=probability))
-    if progress is not None:
-        progress("direct classifiers", len(KINDS), len(KINDS))
-    return scorers
-
-
-def evaluate_episodes(
-    scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
-) -> tuple[Figures, dict[str, np.ndarray], np.ndarray]:
-    """Every scorer on fresh episodes, per segment and at k = 0.
-
-    The threshold of the recalls is the one of best balanced accuracy on the calibration set, of
-    its segments and of its first steps; the test set decides nothing.
-
-    Args:
-        scorers: Who is judged.
-        calibration: Other fresh episodes, for thresholds.
-        test: Fresh episodes.
-
-    Returns:
-        The figures by dotted key, the unsafe score of every test segment by scorer, and the
-        segments' labels.
-    """
-    segments = split(test, stride=1, discount=1.0)
-    seen = split(calibration, stride=1, discount=1.0)
-    figures: Figures = {}
-    scores = {}
-    for scorer in scorers:
-        name = scorer.name
-        unsafe, seen_unsafe = (
-            1.0
-            - scorer.probability(
-                part.true_state if scorer.uses_true_state else part.state,
-                part.desired_preview,
-                part.features,
-            )
-            for part in (segments, seen)
-        )
-        scores[name] = unsafe
-        threshold = threshold_at(seen_unsafe, seen.is_unsafe)
-        at_start = seen.is_first
-        start_threshold = threshold_at(seen_unsafe[at_start], seen.is_unsafe[at_start])
-        for key, value in segment_figures(segments, unsafe, threshold=threshold).items():
-            figures[f"segments.{name}.{key}"] = value
-        for key, value in episode_figures(segments, unsafe, threshold=start_threshold).items():
-            figures[f"episodes.{name}.{key}"] = value
-    names = [scorer.name for scorer in scorers]
-    if "sharpened" in names:
-        first = segments.is_first
-        for key, rows in (("segments", slice(None)), ("episodes", first)):
-            others = [name for name in names if name in KINDS]
-            if others:
-                best = max(others, key=lambda name: figures[f"{key}.{name}.auc"].value)
-                figures[f"{key}.sharpened_minus_best_classifier.auc"] = auc_difference(
-                    scores["sharpened"][rows],
-                    scores[best][rows],
-                    segments.is_unsafe[rows],
-                    segments.episode[rows],
-                )
-    figures["episodes.share_unsafe"] = proportion(test.num_unsafe, test.num_unsafe + test.num_safe)
-    figures["episodes.share_diverged"] = proportion(test.num_diverged, len(test))
-    return figures, scores, segments.is_unsafe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +37,12 @@ class ThrowStudy:
     Attributes:
         figures: By dotted key.
         logs: The throws without recovery.
-        trigger_times_s: Per rule, when it triggered in each throw, (N,); NaN for never.
+        trigger_times_s: Per rule, when it triggered in each throw [s], (N,); NaN for never.
         recovered: Per rule, the logs with recovery by index of the throw, triggered ones only.
         thresholds: Per rule.
     """
 
-    figures: Figures
+    figures: dict[str, Figure]
     logs: list[ThrowLog]
     trigger_times_s: dict[str, np.ndarray]
     recovered: dict[str, dict[int, ThrowLog]]
@@ -244,7 +117,7 @@ def evaluate_throws(
     calibration_seed: int,
     variation: str = "actual",
     num_workers: int | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> ThrowStudy:
     """Throws balls at the actual plant and compares when rules trigger, and what becomes of it.
 
@@ -260,35 +133,26 @@ def evaluate_throws(
         progress: Called with a stage, the number done and the number wanted.
 
     Raises:
-        ValueError: Both seeds are the same.
+        ValueError: Both seeds are the same, or there is no threshold to choose: every calibration
+            throw leaves the safe set.
     """
     if seed == calibration_seed:
         raise ValueError(f"throws: seed and calibration seed are both {seed}; they must differ")
-
-    def report(stage: str) -> Callable[[int, int], None] | None:
-        return None if progress is None else lambda done, total: progress(stage, done, total)
-
+    report = progress or _report_to_nobody
+    throw = partial(run_throws, scenario, variation=variation, num_workers=num_workers)
     thresholds = {rule.name: rule.threshold for rule in rules if rule.threshold is not None}
     if len(thresholds) < len(rules):
-        calibration = run_throws(
-            scenario,
+        calibration = throw(
             list(range(num_calibration)),
             seed=calibration_seed,
-            variation=variation,
-            num_workers=num_workers,
-            progress=report("calibration throws"),
+            progress=partial(report, "calibration throws"),
         )
         for rule in rules:
             if rule.threshold is None:
                 probabilities = [log_probability(log, rule.scorer) for log in calibration]
                 thresholds[rule.name] = choose_threshold(calibration, probabilities)
-    logs = run_throws(
-        scenario,
-        list(range(num_throws)),
-        seed=seed,
-        variation=variation,
-        num_workers=num_workers,
-        progress=report("throws, balancing alone"),
+    logs = throw(
+        list(range(num_throws)), seed=seed, progress=partial(report, "throws, balancing alone")
     )
     triggers = {
         rule.name: np.array(
@@ -299,57 +163,27 @@ def evaluate_throws(
         )
         for rule in rules
     }
-    # Rules often agree on the instant: each distinct recovery is simulated once.
-    wanted: set[tuple[int, float]] = set()
-    for times in triggers.values():
-        wanted |= {
-            (log.index, float(time))
-            for log, time in zip(logs, times, strict=True)
-            if not math.isnan(time)
-        }
-    by_round: list[dict[int, float]] = []
-    for index, time in sorted(wanted):
-        for recoveries in by_round:
-            if index not in recoveries:
-                recoveries[index] = time
-                break
-        else:
-            by_round.append({index: time})
-    results: dict[tuple[int, float], ThrowLog] = {}
-    done = 0
-    for recoveries in by_round:
-        start = done
-
-        def advance(count: int, _: int, start: int = start) -> None:
-            if progress is not None:
-                progress("throws, with recovery", start + count, len(wanted))
-
-        for log in run_throws(
-            scenario,
-            sorted(recoveries),
-            seed=seed,
-            variation=variation,
-            trigger_times_s=recoveries,
-            num_workers=num_workers,
-            progress=advance,
-        ):
-            results[log.index, recoveries[log.index]] = log
-        done += len(recoveries)
-    recovered = {
+    triggered = {
         name: {
-            log.index: results[log.index, float(time)]
+            log.index: float(time)
             for log, time in zip(logs, times, strict=True)
             if not math.isnan(time)
         }
         for name, times in triggers.items()
     }
+    # Rules often agree on the instant: each distinct recovery is simulated once.
+    wanted = {pair for times in triggered.values() for pair in times.items()}
+    simulated = _simulate_recoveries(partial(throw, seed=seed), wanted, report)
+    recovered = {
+        name: {index: simulated[index, time] for index, time in times.items()}
+        for name, times in triggered.items()
+    }
     figures = _balancing_figures(logs)
     for rule in rules:
-        for key, value in _rule_figures(logs, triggers[rule.name], recovered[rule.name]).items():
-            figures[f"throws.{rule.name}.{key}"] = value
-        figures[f"throws.{rule.name}.threshold"] = Figure(
-            thresholds[rule.name], thresholds[rule.name], thresholds[rule.name], len(logs)
-        )
+        found = _rule_figures(logs, triggers[rule.name], recovered[rule.name])
+        threshold = thresholds[rule.name]
+        found["threshold"] = Figure(threshold, threshold, threshold, len(logs))
+        figures |= {f"throws.{rule.name}.{key}": figure for key, figure in found.items()}
     return ThrowStudy(
         figures=figures,
         logs=logs,
@@ -359,7 +193,53 @@ def evaluate_throws(
     )
 
 
-def _balancing_figures(logs: Sequence[ThrowLog]) -> Figures:
+def _report_to_nobody(stage: str, done: int, total: int) -> None:
+    """Stands in for a progress that was not asked for."""
+
+
+def _simulate_recoveries(
+    throw: Callable[..., list[ThrowLog]],
+    wanted: Collection[tuple[int, float]],
+    report: StageProgress,
+) -> dict[tuple[int, float], ThrowLog]:
+    """Simulates throws with recovery.
+
+    Args:
+        throw: `run_throws` but for indices, trigger times and progress.
+        wanted: Pairs of index and trigger time [s].
+        report: Progress.
+
+    Returns:
+        The log of each pair.
+    """
+    logs: dict[tuple[int, float], ThrowLog] = {}
+
+    def report_round(done_before: int, done: int, _: int) -> None:
+        report("throws, with recovery", done_before + done, len(wanted))
+
+    for trigger_times_s in _rounds(wanted):
+        for log in throw(
+            sorted(trigger_times_s),
+            trigger_times_s=trigger_times_s,
+            progress=partial(report_round, len(logs)),
+        ):
+            logs[log.index, trigger_times_s[log.index]] = log
+    return logs
+
+
+def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
+    """Shares pairs of index and trigger time out among rounds in which no index stands twice."""
+    rounds: list[dict[int, float]] = []
+    for index, time_s in sorted(wanted):
+        free = next((one for one in rounds if index not in one), None)
+        if free is None:
+            rounds.append(free := {})
+        free[index] = time_s
+    return rounds
+
+
+def _balancing_figures(logs: Sequence[ThrowLog]) -> dict[str, Figure]:
+    """What becomes of the throws when the robot never steps."""
     n = len(logs)
     left = [log for log in logs if log.has_left]
     fell = [log for log in logs if log.has_fallen]
@@ -377,7 +257,14 @@ def _balancing_figures(logs: Sequence[ThrowLog]) -> Figures:
 
 def _rule_figures(
     logs: Sequence[ThrowLog], times: np.ndarray, recovered: Mapping[int, ThrowLog]
-) -> Figures:
+) -> dict[str, Figure]:
+    """What becomes of the throws when a rule has the robot step.
+
+    Args:
+        logs: The N throws without recovery.
+        times: When the rule triggered in each [s], (N,); NaN for never.
+        recovered: By index of the throw, the logs with recovery of those it triggered in.
+    """
     n = len(logs)
     calm = [i for i, log in enumerate(logs) if not log.has_left]
     fell = [i for i, log in enumerate(logs) if log.has_fallen]
