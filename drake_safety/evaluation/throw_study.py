@@ -10,9 +10,13 @@ from functools import partial
 import numpy as np
 
 from drake_safety.evaluation.metrics import Figure, median, proportion
-from drake_safety.evaluation.scorers import Scorer, StageProgress
+from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
+
+PAPER_THRESHOLD = 0.6
+"""Γ_thre of the paper, on b_safe."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +32,43 @@ class TriggerRule:
     name: str
     scorer: Scorer
     threshold: float | None = None
+
+
+def trigger_rules(
+    sharpened: SafetyAssessment,
+    paper: SafetyAssessment,
+    classifiers: Sequence[Scorer],
+    *,
+    threshold: float,
+    is_normalized: bool,
+) -> list[TriggerRule]:
+    """Those compared: Γ as the scenario triggers on it, Γ as the paper does, and the classifiers.
+
+    Args:
+        sharpened: An assessment in the sharpened mode.
+        paper: One in the paper's mode.
+        classifiers: Direct classifiers; their thresholds are left open.
+        threshold: The scenario's Γ_thre.
+        is_normalized: Whether that is on b_safe / (1 - μ) or, literally, on b_safe.
+
+    Returns:
+        The rules, the scenario's own first, named "sharpened".
+    """
+    own = assessment_scorer("sharpened", sharpened, is_normalized=is_normalized)
+    literal = assessment_scorer("literal", sharpened, is_normalized=False)
+    paper_literal = assessment_scorer("paper_literal", paper, is_normalized=False)
+    return [
+        TriggerRule(name="sharpened", scorer=own, threshold=threshold),
+        TriggerRule(
+            name=f"sharpened_literal_{PAPER_THRESHOLD}", scorer=literal, threshold=PAPER_THRESHOLD
+        ),
+        TriggerRule(
+            name=f"paper_literal_{PAPER_THRESHOLD}",
+            scorer=paper_literal,
+            threshold=PAPER_THRESHOLD,
+        ),
+        *(TriggerRule(name=scorer.name, scorer=scorer) for scorer in classifiers),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

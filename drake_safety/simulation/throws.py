@@ -79,6 +79,16 @@ class ThrowLog:
         """Whether the robot left its safe set."""
         return math.isfinite(self.leave_time_s)
 
+    @property
+    def recovery_intervals_s(self) -> list[tuple[float, float]]:
+        """First and last instant of each recovery step [s]; one under way at the end ends there."""
+        starts = np.flatnonzero(np.diff(self.recovery_active, prepend=0.0) > 0)
+        ends = np.flatnonzero(np.diff(self.recovery_active, append=0.0) < 0)
+        return [
+            (float(self.time_s[i]), float(self.time_s[j]))
+            for i, j in zip(starts, ends, strict=True)
+        ]
+
 
 class Limits:
     """Counts what a simulated success must not rest on, at every row of a log.
