@@ -14,19 +14,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
 from drake_safety.simulation.scenario import Scenario
 
-_ROW_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
 _LOGGER = logging.getLogger("drake_safety")
 _BATCH = 4  # Episodes a worker takes at a time.
 
@@ -64,7 +55,7 @@ class Recorder:
         names: Ports to read.
     """
 
-    def __init__(self, loop: ClosedLoop, names: Iterable[str] = _ROW_PORTS):
+    def __init__(self, loop: ClosedLoop, names: Iterable[str] = RECORDED_PORTS):
         self._ports = {name: loop.GetOutputPort(name) for name in names}
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in self._ports}
         self._times: list[float] = []
