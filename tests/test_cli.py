@@ -12,6 +12,7 @@ from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import MODES, assessment_file, load_assessment
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation.balls import Throw
+from gliding_task import SCENARIO
 
 
 def call(monkeypatch, *arguments):
@@ -55,6 +56,15 @@ def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(message)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simulated(
+    monkeypatch, capsys, tmp_path
+):
+    file = tmp_path / "gliding.yaml"
+    file.write_text(SCENARIO)
+    assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path) == 2
+    assert "has no recovery to judge: pass --throws 0" in capsys.readouterr().out
 
 
 def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):

@@ -53,6 +53,8 @@ def evaluate(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
+    if throws and not hasattr(loaded.parameters, "recovery"):
+        raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
     train_set = load_episodes(episodes_folder(assessment))

@@ -24,8 +24,9 @@ RECORDED_PORTS = (
 )
 """Output ports that an episode records, row by row."""
 REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
+"""Output ports that every task exports."""
 ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-RECOVERY_PORTS = ("recovery_active",)
+"""Output ports that a task exports besides when it has an assessment."""
 
 
 class ClosedLoop(Diagram):
