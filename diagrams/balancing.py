@@ -17,10 +17,10 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.balls import Ball, Throw, add_ball
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.scenes import add_ground
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_switch import RecoverySwitch

@@ -1,4 +1,4 @@
-"""Scenes: what a robot stands on."""
+"""The ground that a robot stands on."""
 
 import logging
 
