@@ -1,103 +1,35 @@
 """Balancing: a legged robot keeps its base over its feet along a plan, and steps when it must."""
 
-import logging
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import urlparse
 
 import numpy as np
-from pydrake.common import RandomDistribution, RandomGenerator
-from pydrake.geometry import HalfSpace, Meshcat, MeshcatVisualizer
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.parsing import PackageMap, Parser
-from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    CoulombFriction,
-    DiscreteContactApproximation,
-)
+from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, RandomSource
-from pydrake.trajectories import PiecewisePolynomial
+from pydrake.systems.primitives import MatrixGain
 
-from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot import (
-    ObservationNoise,
-    add_robot,
-    add_to_package_map,
-    apply_mass_scale,
-    by_pattern,
-)
+from drake_safety.control.robot import ObservationNoise, add_robot, apply_mass_scale, by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.models import load_robot
+from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.balls import Ball, Throw, add_ball
-from drake_safety.simulation.closed_loop import ClosedLoop, check_assessment
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.ground import add_ground
+from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
-from drake_safety.systems.state_observer import StateObserver
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
-
-# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
-# is deformable.
-logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 
 _NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
 _LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
-
-
-@dataclass(kw_only=True)
-class StartSampling:
-    """Random initial states and plans. Ranges are half-widths about the standing posture."""
-
-    foot_offset_m: float = 0.02
-    base_offset_m: list[float] = field(default_factory=lambda: [0.08, 0.05])
-    base_height_m: list[float] = field(default_factory=lambda: [0.36, 0.45])
-    """Lowest and highest height of the base [m]."""
-    tilt_rad: float = 0.1
-    """Roll, pitch and yaw, each [rad]."""
-    velocity_std_m_s: list[float] = field(default_factory=lambda: [0.5, 0.35, 0.1])
-    angular_velocity_std_rad_s: float = 0.4
-    joint_std_rad: float = 0.02
-    target_offset_m: list[float] = field(default_factory=lambda: [0.20, 0.11])
-    target_height_m: list[float] = field(default_factory=lambda: [0.34, 0.46])
-    plan_duration_s: list[float] = field(default_factory=lambda: [0.8, 1.6])
-    """Shortest and longest duration of the planned motion [s]."""
-
-
-@dataclass(kw_only=True)
-class PushSampling:
-    """Random balls, and the calm motion during which they are thrown."""
-
-    share: float = 0.25
-    """Share of nominal episodes that begin as a ball hits."""
-    mass_kg: list[float] = field(default_factory=lambda: [2.0, 4.0])
-    speed_m_s: list[float] = field(default_factory=lambda: [2.0, 11.0])
-    offset_m: float = 0.0
-    height_m: float = 0.03
-    target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
-    """Half-widths of where the calm motion starts and ends, about the stance [m]."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"push: share must be in [0, 1]; got {self.share}")
-
-    def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """A random ball from any horizontal direction."""
-        return Throw(
-            time_s=time_s,
-            mass_kg=rng.uniform(*self.mass_kg),
-            speed_m_s=rng.uniform(*self.speed_m_s),
-            direction_rad=rng.uniform(-math.pi, math.pi),
-            offset_m=rng.uniform(-self.offset_m, self.offset_m),
-            height_m=rng.uniform(-self.height_m, self.height_m),
-        )
 
 
 @dataclass(kw_only=True)
@@ -167,13 +99,7 @@ class Balancing(ClosedLoop):
         plant.set_name("plant")
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
         instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph)
-        parser = Parser(plant)
-        add_to_package_map(parser.package_map())
-        parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
-        mu = self.variation.foot_friction or robot.foot_friction
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
-        )
+        add_ground(plant, self.variation.foot_friction or robot.foot_friction)
         has_ball = parameters.push.share > 0 if ball is None else ball
         ball_instance = add_ball(plant) if has_ball else None
         # What the ports say is of now, not of the last step: no copies are kept for it.
@@ -192,34 +118,14 @@ class Balancing(ClosedLoop):
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
         plant_state = plant.get_state_output_port(instance)
 
-        noise, extra = self.variation.observation_noise, self.variation.input_noise
-        input_noise = ObservationNoise(
-            position=math.hypot(noise.position, extra.position),
-            velocity=math.hypot(noise.velocity, extra.velocity),
+        noise = self.variation.observation_noise
+        observers = Observers(builder, kinematics, plant_state, scenario.control_period_s)
+        self._observers = observers
+        observer = observers.add("observer", noise)
+        assessor_observer = observers.add(
+            "assessor_observer", combined(noise, self.variation.input_noise)
         )
-        self._noise_sources = []
-        observers: dict[tuple[float, float], StateObserver] = {}
-
-        def observe(name: str, std: ObservationNoise) -> StateObserver:
-            key = (std.position, std.velocity)
-            if key not in observers:
-                observer = builder.AddNamedSystem(name, StateObserver(kinematics, std))
-                builder.Connect(plant_state, observer.GetInputPort("plant_state"))
-                if key != (0.0, 0.0):
-                    source = builder.AddNamedSystem(
-                        f"{name}_noise",
-                        RandomSource(
-                            RandomDistribution.kGaussian, 2 * n_v, scenario.control_period_s
-                        ),
-                    )
-                    builder.Connect(source.get_output_port(), observer.GetInputPort("noise"))
-                    self._noise_sources.append(source)
-                observers[key] = observer
-            return observers[key]
-
-        observer = observe("observer", noise)
-        assessor_observer = observe("assessor_observer", input_noise)
-        true_observer = observe("true_observer", ObservationNoise())
+        true_observer = observers.add("true_observer", ObservationNoise())
         measured = observer.GetOutputPort("measured_plant_state")
 
         planner = builder.AddNamedSystem(
@@ -308,14 +214,7 @@ class Balancing(ClosedLoop):
         self.constraint_names = monitor.constraint_names
         self.fall_name = safe_set.fall_name
         if assessment is not None:
-            check_assessment(
-                assessment,
-                scenario=scenario,
-                state_names=self.state_names,
-                output_names=self.output_names,
-                feature_names=self.feature_names,
-                constraint_names=self.constraint_names,
-            )
+            self.check_assessment()
             assessor = builder.AddNamedSystem(
                 "safety_assessor",
                 SafetyAssessor(assessment, period_s=parameters.recovery.assessment_period_s),
@@ -353,20 +252,9 @@ class Balancing(ClosedLoop):
         self._default = self.CreateDefaultContext()
 
     @classmethod
-    def model_files(cls, scenario: Scenario) -> list[str]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
-        robot = load_robot(scenario.robot)
-        url = urlparse(robot.urdf)
-        if url.scheme == "package":
-            package_map = PackageMap()
-            add_to_package_map(package_map)
-            model = str(Path(package_map.GetPath(url.netloc)) / url.path.lstrip("/"))
-        else:
-            model = str(Path(robot.source_dir) / robot.urdf)
-        file_name = Path(scenario.robot).name
-        if Path(file_name).suffix not in (".yaml", ".yml"):
-            file_name = "robot.yaml"
-        return [str(Path(robot.source_dir) / file_name), model]
+        return robot_files(scenario.robot)
 
     def _servo_matrix(self) -> np.ndarray:
         """Maps [q; v] of the joints onto the plant's actuators; friction holds velocity zero."""
@@ -387,7 +275,7 @@ class Balancing(ClosedLoop):
         parameters = self.scenario.parameters
         is_push = self.ball is not None and rng.random() < parameters.push.share
         if not is_push:
-            self._reset_offset(context, rng)
+            self._set(context, rng, parameters.start.sample(self.kinematics, rng))
             return 0
         # The ball hits at any moment of a calm motion, not only as it starts.
         self._start_calm(context, rng, elapsed_s=rng.uniform(0.0, _LATEST_HIT_S))
@@ -402,93 +290,43 @@ class Balancing(ClosedLoop):
 
     def _start_calm(self, context: Context, rng: np.random.Generator, elapsed_s: float) -> None:
         """Enters a calm motion ``elapsed_s`` after its start, as if it had been tracked well."""
-        push = self.scenario.parameters.push
-        kinematics = self.kinematics
-        half = np.array([*push.target_offset_m, 0.0])
-        nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
-        start = nominal + rng.uniform(-half, half)
-        goal = nominal + rng.uniform(-half, half)
-        duration_s = rng.uniform(*self.scenario.parameters.start.plan_duration_s)
-        plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
-        contacts = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-        X_WB = RigidTransform(plan.value(0.0).ravel())
-        joints = solve_inverse_kinematics(kinematics, X_WB, contacts, kinematics.posture)
-        v = np.zeros(kinematics.num_velocities)
-        if elapsed_s < duration_s:
-            v[3:6] = plan.MakeDerivative().value(0.0).ravel()
-        self._rest_feet(X_WB, joints, v)
-        self._set(context, rng, X_WB, joints, v, contacts, plan)
-
-    def _rest_feet(self, X_WB: RigidTransform, joints: np.ndarray, v: np.ndarray) -> None:
-        """Sets the joint rates of ``v`` so that the feet are at rest: 0 = J_b v_b + J_leg dq."""
-        J = self.kinematics.contact_jacobian(self.kinematics.positions_at(X_WB, joints))
-        v[6:], *_ = np.linalg.lstsq(J[:, 6:], -J[:, :6] @ v[:6], rcond=1e-6)
-
-    def _reset_offset(self, context: Context, rng: np.random.Generator) -> None:
-        sampling = self.scenario.parameters.start
-        kinematics = self.kinematics
-        xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * sampling.foot_offset_m
-        contacts = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
-        X_WS = planar_pose(fit_stance(contacts, kinematics.nominal_contacts))
-        start = np.append(
-            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * sampling.base_offset_m,
-            rng.uniform(*sampling.base_height_m),
+        parameters = self.scenario.parameters
+        start = calm_start(
+            self.kinematics,
+            rng,
+            half_widths_m=parameters.push.target_offset_m,
+            plan_duration_s=parameters.start.plan_duration_s,
+            elapsed_s=elapsed_s,
         )
-        rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
-        X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start)
-        joints = solve_inverse_kinematics(kinematics, X_WB, contacts, kinematics.posture)
-        v = np.zeros(kinematics.num_velocities)
-        v[:3] = rng.normal(size=3) * sampling.angular_velocity_std_rad_s
-        v[3:6] = rng.normal(size=3) * sampling.velocity_std_m_s
-        self._rest_feet(X_WB, joints, v)
-        joints = joints + rng.normal(size=kinematics.num_joints) * sampling.joint_std_rad
-        goal = np.append(
-            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * sampling.target_offset_m,
-            rng.uniform(*sampling.target_height_m),
-        )
-        plan = interpolate(start, goal, rng.uniform(*sampling.plan_duration_s))
-        self._set(context, rng, X_WB, joints, v, contacts, plan)
+        self._set(context, rng, start)
 
-    def _set(
-        self,
-        context: Context,
-        rng: np.random.Generator,
-        X_WB: RigidTransform,
-        joints: np.ndarray,
-        v: np.ndarray,
-        contacts: np.ndarray,
-        plan: PiecewisePolynomial,
-    ) -> None:
+    def _set(self, context: Context, rng: np.random.Generator, start: Start) -> None:
         kinematics = self.kinematics
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
-        joints = np.clip(joints, kinematics.position_limits[:, 0], kinematics.position_limits[:, 1])
+        joints = np.clip(start.joints, *kinematics.position_limits.T)
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
-        q = kinematics.positions_at(X_WB, joints)
+        q = kinematics.positions_at(start.X_WB, joints)
         self.plant.SetPositionsAndVelocities(
-            plant_context, self.robot_instance, np.concatenate([q, v])
+            plant_context, self.robot_instance, np.concatenate([q, start.v])
         )
         if self.ball is not None:
             self.ball.park(plant_context)
-        stance_pose = fit_stance(contacts, kinematics.nominal_contacts)
+        stance_pose = fit_stance(start.p_WC, kinematics.nominal_contacts)
         self._planner.set_plan(
-            self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose
+            self._planner.GetMyMutableContextFromRoot(context), start.plan, stance_pose
         )
         self._controller.set_foot_positions(
-            self._controller.GetMyMutableContextFromRoot(context), contacts
+            self._controller.GetMyMutableContextFromRoot(context), start.p_WC
         )
         if self._recovery_switch is not None:
             step_planner = self._recovery_switch.step_planner
             step_planner.set_stance(
-                step_planner.GetMyMutableContextFromRoot(context), contacts, stance_pose
+                step_planner.GetMyMutableContextFromRoot(context), start.p_WC, stance_pose
             )
-        for source in self._noise_sources:
-            source.SetRandomContext(
-                source.GetMyMutableContextFromRoot(context),
-                RandomGenerator(int(rng.integers(2**31))),
-            )
+        self._observers.reseed(context, rng)
 
     @property
     def trigger_port(self) -> str:

@@ -1,10 +1,13 @@
 """Robots and scenes as data, and the loader of a robot by name."""
 
 from pathlib import Path
+from urllib.parse import urlparse
+
+from pydrake.multibody.parsing import PackageMap
 
 from drake_safety.control.robot import RobotModel, add_to_package_map, load_robot_file
 
-__all__ = ["add_to_package_map", "load_robot", "robot_names"]
+__all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]
 
 _FOLDER = Path(__file__).parent
 
@@ -28,3 +31,24 @@ def load_robot(name: str) -> RobotModel:
         f"robot '{name}' does not exist; robots are {robot_names()}, or give the path of a "
         "robot.yaml"
     )
+
+
+def robot_files(name: str) -> list[Path]:
+    """The files that decide what a robot is: its ``robot.yaml`` and its model file.
+
+    Args:
+        name: As :func:`load_robot` takes it.
+
+    Raises:
+        ValueError: As :func:`load_robot`.
+    """
+    robot = load_robot(name)
+    folder = Path(robot.source_dir)
+    url = urlparse(robot.urdf)
+    if url.scheme == "package":
+        package_map = PackageMap()
+        add_to_package_map(package_map)
+        model = Path(package_map.GetPath(url.netloc)) / url.path.lstrip("/")
+    else:
+        model = folder / robot.urdf
+    return [Path(name) if name not in robot_names() else folder / "robot.yaml", model]

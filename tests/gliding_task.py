@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
-from drake_safety.simulation.closed_loop import ClosedLoop, check_assessment
+from drake_safety.simulation.closed_loop import ClosedLoop
 
 CONTROL_PERIOD_S = 0.01
 
@@ -85,15 +85,7 @@ class Gliding(ClosedLoop):
         self.output_names = ["x", "y", "z"]
         self.feature_names = ["distance"]
         self.constraint_names = ["right", "left"]
-        if assessment is not None:
-            check_assessment(
-                assessment,
-                scenario=scenario,
-                state_names=self.state_names,
-                output_names=self.output_names,
-                feature_names=self.feature_names,
-                constraint_names=self.constraint_names,
-            )
+        self.check_assessment()
         builder = DiagramBuilder()
         self.mass = builder.AddSystem(Mass(scenario.parameters, scenario.assessment.horizon))
         for i in range(self.mass.num_output_ports()):

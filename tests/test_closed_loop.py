@@ -13,7 +13,6 @@ from drake_safety.simulation.closed_loop import (
     ASSESSMENT_PORTS,
     REQUIRED_PORTS,
     ClosedLoop,
-    check_assessment,
 )
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO, Gliding
@@ -89,7 +88,9 @@ def assessment_for(loop, **changes):
 
 def test_an_assessment_of_the_same_diagram_is_accepted():
     loop = Gliding(gliding())
-    check_assessment(assessment_for(loop), scenario=loop.scenario, **names_of(loop))
+    loop.check_assessment()
+    loop.assessment = assessment_for(loop)
+    loop.check_assessment()
 
 
 @pytest.mark.parametrize(
@@ -107,8 +108,9 @@ def test_an_assessment_of_the_same_diagram_is_accepted():
 )
 def test_an_assessment_of_another_diagram_is_refused_with_both_sides_named(change, message):
     loop = Gliding(gliding())
+    loop.assessment = assessment_for(loop, **change)
     with pytest.raises(ValueError, match=message):
-        check_assessment(assessment_for(loop, **change), scenario=loop.scenario, **names_of(loop))
+        loop.check_assessment()
 
 
 def test_a_task_refuses_a_foreign_assessment_when_it_is_built():

@@ -279,7 +279,7 @@ def test_a_folder_of_a_robot_is_no_python_package():
             "import_module('drake_safety.diagrams.balancing')",
             "diagrams",
         ),
-        (upward_imports, "drake_safety/cli.py", "from drake_safety import Scenario", "own room"),
+        (upward_imports, "drake_safety/cli/a.py", "from drake_safety import Scenario", "own room"),
         (upward_imports, "models/__init__.py", "from drake_safety.control.qp import x", "models"),
         (upward_imports, "diagrams/a.py", "from drake_safety.evaluation import x", "diagrams"),
         (forbidden_imports, "drake_safety/learning/a.py", "import pydrake.math", "learning"),
@@ -315,10 +315,10 @@ def test_each_rule_catches_its_offence(rule, name, source, message):
 @pytest.mark.parametrize(
     ("rule", "name", "source"),
     [
-        (upward_imports, "drake_safety/cli.py", "from drake_safety.evaluation import report"),
+        (upward_imports, "drake_safety/cli/a.py", "from drake_safety.evaluation import report"),
         (upward_imports, "drake_safety/systems/a.py", "from . import b\nfrom ..control import c"),
         (upward_imports, "models/__init__.py", "from drake_safety.control.robot import x"),
-        (upward_imports, "drake_safety/cli.py", "from drake_safety import __version__"),
+        (upward_imports, "drake_safety/cli/a.py", "from drake_safety import __version__"),
         (
             forbidden_imports,
             "drake_safety/learning/embedding.py",

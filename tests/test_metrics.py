@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.metrics import (
+    Bootstrap,
     Figure,
     area_under_curve,
     auc,
     auc_difference,
-    episode_figures,
     median,
     proportion,
     segment_figures,
@@ -71,7 +71,10 @@ def test_the_median_lies_in_its_interval_and_more_values_narrow_it():
 
 def test_the_interval_of_the_median_covers_the_truth_about_as_often_as_promised():
     rng = np.random.default_rng(1)
-    figures = [median(rng.exponential(size=51), num_resamples=300, seed=i) for i in range(200)]
+    figures = [
+        median(rng.exponential(size=51), bootstrap=Bootstrap(num_resamples=300, seed=trial))
+        for trial in range(200)
+    ]
     share = np.mean([figure.low <= np.log(2.0) <= figure.high for figure in figures])
     assert 0.90 <= share <= 0.99
 
@@ -142,9 +145,8 @@ def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
     num_covered = 0
     for trial in range(200):
         label = rng.random(120) < 0.5
-        figure = auc(
-            rng.normal(size=120) + label, label, np.arange(120), num_resamples=200, seed=trial
-        )
+        bootstrap = Bootstrap(num_resamples=200, seed=trial)
+        figure = auc(rng.normal(size=120) + label, label, np.arange(120), bootstrap=bootstrap)
         num_covered += figure.low <= truth <= figure.high
     assert 0.90 <= num_covered / 200 <= 0.99
 
@@ -181,13 +183,10 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
         assert figure.low < figure.value < figure.high
 
 
-def test_episode_figures_look_at_each_episodes_first_segment_alone(segments):
-    score = blurred_truth(segments)
-    elsewhere = np.where(segments.is_first, score, 0.123)
-    figures = episode_figures(segments, score, threshold=0.5)
-    assert figures == episode_figures(segments, elsewhere, threshold=0.5)
+def test_recalls_of_one_segment_an_episode_are_proportions(segments):
     first = segments.take(segments.is_first)
-    score = score[segments.is_first]
+    score = blurred_truth(segments)[segments.is_first]
+    figures = segment_figures(first, score, threshold=0.5)
     unsafe = first.is_unsafe
     assert figures["unsafe_recall"] == proportion(
         int((score[unsafe] > 0.5).sum()), int(unsafe.sum())

@@ -47,6 +47,13 @@ def test_an_own_task_in_an_own_folder_needs_no_line_in_the_package(tmp_path):
     assert isinstance(scenario.make_loop(), Gliding)
 
 
+def test_an_option_that_the_task_does_not_have_is_answered_with_those_it_has():
+    with pytest.raises(ValueError, match=r"'Gliding' has no options \['ball'\]; it has \[\]"):
+        parsed(SCENARIO).make_loop(ball=True)
+    with pytest.raises(ValueError, match=r"'Balancing' has no options .*; it has .*'ball'\]"):
+        load_scenario("laikago_balancing").make_loop(ball=True, target=3)
+
+
 def test_the_number_of_steps_is_the_duration_over_the_step():
     assert parsed(SCENARIO).num_steps == 20
 

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions
+from drake_safety.evaluation.stills import (
+    StillCamera,
+    render_stills,
+    stack_positions,
+    still_times,
+)
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 
 SIZE = {"width": 96, "height": 72}
@@ -79,6 +84,15 @@ def test_stills_show_the_nearest_logged_instants(loop, standing):
     stills = render_stills(loop, [0.0, 0.1], [standing, ball], [0.02, 0.09], **SIZE)
     assert [time for time, _ in stills] == [0.0, 0.1]
     assert [share_of_orange(image) > 0.0 for _, image in stills] == [False, True]
+
+
+def test_still_times_are_logged_instants_about_throws_and_the_first_trigger():
+    time_s = 0.02 * np.arange(101)
+    assert still_times(time_s, [], []) == [0.0, 2.0]
+    times = still_times(time_s, [0.5, 1.96], [0.6, 1.2])
+    np.testing.assert_allclose(times, [0.0, 0.48, 0.66, 0.9, 1.94, 2.0], atol=1e-9)
+    assert set(times) <= set(time_s)
+    assert times == sorted(times)
 
 
 def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):

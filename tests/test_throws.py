@@ -65,8 +65,18 @@ def test_recovery_steps_save_the_robot_without_cheating(recovering):
         assert log.trigger_time_s == pytest.approx(0.32)
         assert not log.has_fallen
         assert log.recovery_active[-1] == 0, "the robot has handed over to balancing"
+        ((start_s, end_s),) = log.recovery_intervals_s
+        assert log.trigger_time_s <= start_s < end_s < log.time_s[-1]
         assert log.margins[-1].min() > 0, "it balances inside its safe set again"
         assert log.violations == dict.fromkeys(log.violations, 0)
+
+
+def test_recovery_intervals_hold_the_active_rows_and_no_other(balancing):
+    log = run_throw(balancing, 0, seed=5, throws=[SOFT], duration_s=0.1)
+    assert log.recovery_intervals_s == []
+    log.recovery_active = np.array([1.0, 1.0, 0.0, 0.0, 1.0, 1.0])
+    t = log.time_s
+    assert log.recovery_intervals_s == [(t[0], t[1]), (t[4], t[5])]
 
 
 def test_footholds_stay_on_their_own_side_and_within_reach(recovering):

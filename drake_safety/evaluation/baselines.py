@@ -84,6 +84,8 @@ class DirectClassifier:
         Raises:
             ValueError: It has not been fitted, or to inputs of another width.
         """
+        from threadpoolctl import threadpool_limits
+
         if not hasattr(self, "model_"):
             raise ValueError(f"DirectClassifier '{self.kind}': it has not been fitted yet")
         x = self._inputs(state, desired_preview, features)
@@ -98,8 +100,6 @@ class DirectClassifier:
             known = x[is_finite]
             if self.kind == "mlp":
                 known = self._standardised(known)
-            from threadpoolctl import threadpool_limits
-
             with threadpool_limits(1):
                 probability[is_finite] = self.model_.predict_proba(known)[:, 1]
         return probability

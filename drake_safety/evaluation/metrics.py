@@ -41,6 +41,56 @@ class Figure:
         return {**finite, "n": int(self.n)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bootstrap:
+    """How an interval is found by drawing the independent samples again, with replacement.
+
+    Attributes:
+        confidence: Of the interval.
+        num_resamples: How often as many samples are drawn.
+        seed: Of the draws.
+    """
+
+    confidence: float = 0.95
+    num_resamples: int = 1000
+    seed: int = 0
+
+    @property
+    def quantiles(self) -> list[float]:
+        """The two shares of the draws that lie below the interval's ends."""
+        return [0.5 - 0.5 * self.confidence, 0.5 + 0.5 * self.confidence]
+
+    def over_episodes(
+        self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
+    ) -> Figure:
+        """A statistic of weighted samples, and its percentiles when whole episodes are drawn again.
+
+        Args:
+            statistic: Takes the weight of each sample, (N,); NaN where it is not defined.
+            episode: Which episode each sample belongs to, (N,).
+        """
+        members = np.unique(episode, return_inverse=True)[1]
+        value = statistic(np.ones(len(members)))
+        num_episodes = int(members.max()) + 1 if members.size else 0
+        if math.isnan(value):
+            return Figure(math.nan, math.nan, math.nan, num_episodes)
+        rng = np.random.default_rng(self.seed)
+        shares = np.full(num_episodes, 1.0 / num_episodes)
+        drawn = np.array(
+            [
+                statistic(rng.multinomial(num_episodes, shares)[members])
+                for _ in range(self.num_resamples)
+            ]
+        )
+        # A draw without one of the classes says nothing.
+        low, high = np.quantile(drawn[~np.isnan(drawn)], self.quantiles)
+        return Figure(value, float(low), float(high), num_episodes)
+
+
+_BOOTSTRAP = Bootstrap()
+_MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
+
+
 def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
     """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
 
@@ -60,9 +110,7 @@ def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
     )
 
 
-def median(
-    values: np.ndarray, *, confidence: float = 0.95, num_resamples: int = 2000, seed: int = 0
-) -> Figure:
+def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Figure:
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values take part: a fall that never comes is later than any other.
@@ -75,13 +123,11 @@ def median(
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
         return Figure(math.nan, math.nan, math.nan, 0)
-    rng = np.random.default_rng(seed)
-    drawn = np.sort(rng.integers(values.size, size=(num_resamples, values.size)), axis=1)
-    resampled = _middle(values[drawn])
+    rng = np.random.default_rng(bootstrap.seed)
+    size = (bootstrap.num_resamples, values.size)
+    drawn = np.sort(rng.integers(values.size, size=size), axis=1)
     # Order statistics, not interpolation, which would subtract infinities.
-    low, high = np.quantile(
-        resampled, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], method="nearest"
-    )
+    low, high = np.quantile(_middle(values[drawn]), bootstrap.quantiles, method="nearest")
     return Figure(float(_middle(values)), float(low), float(high), values.size)
 
 
@@ -115,9 +161,7 @@ def auc(
     is_unsafe: np.ndarray,
     episode: np.ndarray,
     *,
-    confidence: float = 0.95,
-    num_resamples: int = 1000,
-    seed: int = 0,
+    bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Figure:
     """The area under the ROC curve, with an interval from a bootstrap over episodes.
 
@@ -128,9 +172,7 @@ def auc(
         unsafe_score: Unsafe scores, (N,).
         is_unsafe: Labels, (N,).
         episode: Which episode each sample belongs to, (N,).
-        confidence: Of the interval.
-        num_resamples: Bootstrap samples.
-        seed: Of the bootstrap.
+        bootstrap: How the interval is found.
     """
     score, label = _checked("auc", unsafe_score, is_unsafe, episode)
     rank = _ranks(score)
@@ -138,7 +180,7 @@ def auc(
     def area(weight: np.ndarray) -> float:
         return _ranked_area(rank, label, weight)
 
-    return _bootstrap(area, episode, confidence, num_resamples, seed)
+    return bootstrap.over_episodes(area, episode)
 
 
 def auc_difference(
@@ -147,9 +189,7 @@ def auc_difference(
     is_unsafe: np.ndarray,
     episode: np.ndarray,
     *,
-    confidence: float = 0.95,
-    num_resamples: int = 1000,
-    seed: int = 0,
+    bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Figure:
     """By how much one scorer's area exceeds another's on the same samples, resampled in pairs.
 
@@ -158,9 +198,7 @@ def auc_difference(
         other_score: Unsafe scores of the other, (N,).
         is_unsafe: Labels, (N,).
         episode: Which episode each sample belongs to, (N,).
-        confidence: Of the interval.
-        num_resamples: Bootstrap samples.
-        seed: Of the bootstrap.
+        bootstrap: How the interval is found.
     """
     score, label = _checked("auc_difference", unsafe_score, is_unsafe, episode)
     other, _ = _checked("auc_difference", other_score, is_unsafe)
@@ -169,7 +207,7 @@ def auc_difference(
     def difference(weight: np.ndarray) -> float:
         return _ranked_area(rank, label, weight) - _ranked_area(other_rank, label, weight)
 
-    return _bootstrap(difference, episode, confidence, num_resamples, seed)
+    return bootstrap.over_episodes(difference, episode)
 
 
 def segment_figures(
@@ -178,24 +216,21 @@ def segment_figures(
     *,
     threshold: float,
     is_probability: bool = True,
-    confidence: float = 0.95,
-    num_resamples: int = 1000,
-    seed: int = 0,
+    bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> dict[str, Figure]:
     """How well a scorer tells segments that lead to an unsafe end from those that do not.
 
-    The segments of one episode are not independent: every interval is a bootstrap over episodes. A
-    recall without a single error (or hit) has no spread to resample; its interval is then
-    Clopper-Pearson's for as many episodes.
+    The segments of one episode are not independent: every interval is a bootstrap over episodes.
+    Recalls have Clopper-Pearson's interval where that is exact, as each episode has one sample
+    (k = 0 alone: `segments.take(segments.is_first)`), and for as many episodes where there is not
+    a single error (or hit), and so no spread to resample.
 
     Args:
         segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
         unsafe_score: Unsafe score of each, (N,).
         threshold: Above it a segment is judged unsafe.
         is_probability: Whether the scores are probabilities, and there is a Brier score.
-        confidence: Of the intervals.
-        num_resamples: Bootstrap samples.
-        seed: Of the bootstrap.
+        bootstrap: How the intervals are found.
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall`, and `brier` for probabilities.
@@ -203,9 +238,8 @@ def segment_figures(
     Raises:
         ValueError: Not one score a segment, or a probability outside [0, 1].
     """
-    label, episode = segments.is_unsafe, segments.episode
-    score, label = _checked("segment_figures", unsafe_score, label)
-    is_judged_unsafe = score > threshold
+    score, label = _checked("segment_figures", unsafe_score, segments.is_unsafe)
+    episode = segments.episode
 
     def mean(values: np.ndarray, rows: np.ndarray) -> Figure:
         values, members = values[rows].astype(float), episode[rows]
@@ -214,75 +248,27 @@ def segment_figures(
             total = weight.sum()
             return float(weight @ values / total) if total else math.nan
 
-        return _bootstrap(average, members, confidence, num_resamples, seed)
+        return bootstrap.over_episodes(average, members)
 
     def recall(is_right: np.ndarray, rows: np.ndarray) -> Figure:
-        figure = mean(is_right, rows)
-        if figure.value in (0.0, 1.0):
-            return proportion(int(figure.value) * figure.n, figure.n, confidence=confidence)
-        return figure
+        num_right, num_samples = int(is_right[rows].sum()), int(rows.sum())
+        num_episodes = len(np.unique(episode[rows]))
+        confidence = bootstrap.confidence
+        if num_samples == num_episodes:
+            return proportion(num_right, num_samples, confidence=confidence)
+        if num_right in (0, num_samples):
+            count = num_episodes if num_right else 0
+            return proportion(count, num_episodes, confidence=confidence)
+        return mean(is_right, rows)
 
     figures = {
-        "auc": auc(
-            score, label, episode, confidence=confidence, num_resamples=num_resamples, seed=seed
-        ),
-        "safe_recall": recall(~is_judged_unsafe, ~label),
-        "unsafe_recall": recall(is_judged_unsafe, label),
+        "auc": auc(score, label, episode, bootstrap=bootstrap),
+        "safe_recall": recall(score <= threshold, ~label),
+        "unsafe_recall": recall(score > threshold, label),
     }
     if is_probability:
         squared = _squared_error("segment_figures", score, label)
         figures["brier"] = mean(squared, np.ones(len(label), dtype=bool))
-    return figures
-
-
-def episode_figures(
-    segments: Segments,
-    unsafe_score: np.ndarray,
-    *,
-    threshold: float,
-    is_probability: bool = True,
-    confidence: float = 0.95,
-    num_resamples: int = 1000,
-    seed: int = 0,
-) -> dict[str, Figure]:
-    """How well a scorer tells the end of an episode from its beginning: k = 0, its first step.
-
-    An episode has one sample here, so recalls are proportions with Clopper-Pearson intervals.
-
-    Args:
-        segments: The N segments, as `split(episodes, stride=1, ...)` gives them; the first of each
-            episode counts.
-        unsafe_score: Unsafe score of each segment, (N,).
-        threshold: Above it an episode is judged unsafe.
-        is_probability: Whether the scores are probabilities, and there is a Brier score.
-        confidence: Of the intervals.
-        num_resamples: Bootstrap samples.
-        seed: Of the bootstrap.
-
-    Returns:
-        `auc`, `safe_recall`, `unsafe_recall`, and `brier` for probabilities.
-
-    Raises:
-        ValueError: Not one score a segment, or a probability outside [0, 1].
-    """
-    score, label = _checked("episode_figures", unsafe_score, segments.is_unsafe)
-    rows = segments.is_first
-    figures = segment_figures(
-        segments.take(rows),
-        score[rows],
-        threshold=threshold,
-        is_probability=is_probability,
-        confidence=confidence,
-        num_resamples=num_resamples,
-        seed=seed,
-    )
-    score, label = score[rows], label[rows]
-    figures["safe_recall"] = proportion(
-        int(np.sum(score[~label] <= threshold)), int(np.sum(~label)), confidence=confidence
-    )
-    figures["unsafe_recall"] = proportion(
-        int(np.sum(score[label] > threshold)), int(np.sum(label)), confidence=confidence
-    )
     return figures
 
 
@@ -372,27 +358,3 @@ def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> flo
         return math.nan
     # A safe sample below counts one, a tie half.
     return float(unsafe @ (np.cumsum(safe) - 0.5 * safe) / pairs)
-
-
-def _bootstrap(
-    statistic: Callable[[np.ndarray], float],
-    episode: np.ndarray,
-    confidence: float,
-    num_resamples: int,
-    seed: int,
-) -> Figure:
-    """A statistic of weighted samples, and its percentiles when whole episodes are drawn again."""
-    members = np.unique(episode, return_inverse=True)[1]
-    value = statistic(np.ones(len(members)))
-    num_episodes = int(members.max()) + 1 if members.size else 0
-    if math.isnan(value):
-        return Figure(math.nan, math.nan, math.nan, num_episodes)
-    rng = np.random.default_rng(seed)
-    shares = np.full(num_episodes, 1.0 / num_episodes)
-    drawn = np.array(
-        [statistic(rng.multinomial(num_episodes, shares)[members]) for _ in range(num_resamples)]
-    )
-    # A draw without one of the classes says nothing.
-    drawn = drawn[~np.isnan(drawn)]
-    low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
-    return Figure(value, float(low), float(high), num_episodes)

@@ -7,7 +7,7 @@ seen, and nothing is added to its diagram: the renderer lives in a Context of it
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +35,8 @@ _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
+_BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and what it did.
+_AFTER_TRIGGER_S = 0.3  # Feet in the air.
 _ROOM = 0.95  # How much more than the robot's own extent fits into a picture.
 
 
@@ -193,6 +195,27 @@ def stack_positions(loop: ClosedLoop, states: Mapping[str, np.ndarray]) -> np.nd
         for row, values in zip(positions, state[:, :n_q], strict=True):
             plant.SetPositionsInArray(instance, values, row)
     return positions
+
+
+def still_times(
+    time_s: np.ndarray, touch_times_s: Iterable[float], trigger_times_s: Sequence[float]
+) -> list[float]:
+    """Instants worth a picture: calm, each throw, the first recovery step at work, the end.
+
+    Args:
+        time_s: Instants of the log [s], (N,), increasing.
+        touch_times_s: When a ball touches [s].
+        trigger_times_s: When a recovery was triggered [s].
+
+    Returns:
+        Logged instants [s], increasing.
+    """
+    wanted = [float(time_s[0]), float(time_s[-1])]
+    for touch_s in touch_times_s:
+        wanted += [touch_s - _BEFORE_TOUCH_S, touch_s + _AFTER_TOUCH_S]
+    wanted += [trigger_s + _AFTER_TRIGGER_S for trigger_s in trigger_times_s[:1]]
+    rows = {int(np.abs(time_s - instant).argmin()) for instant in wanted}
+    return [float(time_s[row]) for row in sorted(rows)]
 
 
 def render_stills(

@@ -15,9 +15,10 @@ from pydrake.systems.framework import Context
 from drake_safety.control.robot import add_to_package_map
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
-_MAX_TRACES = 30_000
-_LEAST_TRACE_M = 1e-4
-_PARKED = np.array([50.0, 50.0, 0.0])
+_MAX_STEPS = 30_000  # Of sphere tracing.
+_TOUCH_M = 1e-4  # Closer than this is touching, and no step is shorter.
+_BEFORE_M, _BEYOND_M = 2.0, 1.0  # Where the line of flight begins and ends, about its aim.
+_PARKED = np.array([50.0, 50.0, 0.0])  # Far from whatever happens [m].
 
 
 @dataclass(kw_only=True)
@@ -114,21 +115,21 @@ class Ball:
         aim = self._plant.EvalBodyPoseInWorld(context, self._target).translation()
         aim = aim + throw.offset_m * sideways + [0.0, 0.0, throw.height_m]
         # Sphere tracing: the signed distance is a step that cannot overshoot.
-        p = aim - 2.0 * direction
-        for _ in range(_MAX_TRACES):
+        p = aim - _BEFORE_M * direction
+        for _ in range(_MAX_STEPS):
             self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
             query = self._plant.get_geometry_query_input_port().Eval(context)
             distance = min(
                 query.ComputeSignedDistancePairClosestPoints(self._geometry, other).distance
                 for other in self._robot_geometries
             )
-            if distance < 1e-4 or (p - aim) @ direction > 1.0:
+            if distance < _TOUCH_M or (p - aim) @ direction > _BEYOND_M:
                 break
             # A line that grazes a leg would creep along it: a step has a least length.
-            p = p + max(distance, _LEAST_TRACE_M) * direction
+            p = p + max(distance, _TOUCH_M) * direction
         else:
             distance = math.inf
-        if not distance < 1e-4:
+        if not distance < _TOUCH_M:
             self.park(context)
             raise ValueError(f"throw: the line of flight of {throw} misses the robot")
         velocity = throw.speed_m_s * direction - _GRAVITY * lead_s

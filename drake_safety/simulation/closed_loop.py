@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.balls import Throw
     from drake_safety.simulation.scenario import Scenario
 
-REQUIRED_PORTS = (
+RECORDED_PORTS = (
     "state",
     "true_state",
     "output",
@@ -20,10 +21,12 @@ REQUIRED_PORTS = (
     "desired_preview",
     "features",
     "margins",
-    "safe",
 )
+"""Output ports that an episode records, row by row."""
+REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
+"""Output ports that every task exports."""
 ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-RECOVERY_PORTS = ("recovery_active",)
+"""Output ports that a task exports besides when it has an assessment."""
 
 
 class ClosedLoop(Diagram):
@@ -33,7 +36,7 @@ class ClosedLoop(Diagram):
     below, :meth:`reset`, and the names of what the ports carry. Throws and pictures also use the
     plant: ``plant``, ``robot``, ``robot_instance``, ``kinematics``, ``fall_name`` and
     ``trigger_port``, which a task with a ball provides. A subclass wires its systems in
-    ``__init__`` and ends with :meth:`finish`.
+    ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -93,8 +96,36 @@ class ClosedLoop(Diagram):
                 f"task '{type(self).__name__}' exports no port {missing}; it exports {ports}"
             )
 
+    def check_assessment(self) -> None:
+        """Refuses an assessment that was learned from something else.
+
+        To be called when the names of what the ports carry are set, before the assessment is wired.
+
+        Raises:
+            ValueError: Both sides are named.
+        """
+        if self.assessment is None:
+            return
+        info, scenario = self.assessment.info_, self.scenario
+        sides = {
+            "scenario": (info.scenario, scenario.name),
+            "horizon": (info.horizon, scenario.assessment.horizon),
+            "step_s": (info.step_s, scenario.step_s),
+            "state": (list(info.state_names), list(self.state_names)),
+            "output": (list(info.output_names), list(self.output_names)),
+            "features": (list(info.feature_names), list(self.feature_names)),
+            "constraints": (list(info.constraint_names), list(self.constraint_names)),
+            "scenario hash": (info.scenario_hash, scenario.simulation_hash(info.variation)),
+        }
+        for what, (learned, here) in sides.items():
+            if learned != here:
+                raise ValueError(
+                    f"assessment and diagram differ in {what}: the assessment was learned with "
+                    f"{learned}, the diagram has {here}"
+                )
+
     @classmethod
-    def model_files(cls, scenario: Scenario) -> list[str]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that decide what the plant is; part of its hash."""
         del scenario
         return []
@@ -145,36 +176,3 @@ class ClosedLoop(Diagram):
             ValueError: The task was built without a ball.
         """
         raise ValueError(f"task '{type(self).__name__}' has no ball to throw")
-
-
-def check_assessment(
-    assessment: SafetyAssessment,
-    *,
-    scenario: Scenario,
-    state_names: list[str],
-    output_names: list[str],
-    feature_names: list[str],
-    constraint_names: list[str],
-) -> None:
-    """Refuses an assessment that was learned from something else.
-
-    Raises:
-        ValueError: Both sides are named.
-    """
-    info = assessment.info_
-    sides = {
-        "scenario": (info.scenario, scenario.name),
-        "horizon": (info.horizon, scenario.assessment.horizon),
-        "step_s": (info.step_s, scenario.step_s),
-        "state": (list(info.state_names), list(state_names)),
-        "output": (list(info.output_names), list(output_names)),
-        "features": (list(info.feature_names), list(feature_names)),
-        "constraints": (list(info.constraint_names), list(constraint_names)),
-        "scenario hash": (info.scenario_hash, scenario.simulation_hash(info.variation)),
-    }
-    for what, (learned, here) in sides.items():
-        if learned != here:
-            raise ValueError(
-                f"assessment and diagram differ in {what}: the assessment was learned with "
-                f"{learned}, the diagram has {here}"
-            )

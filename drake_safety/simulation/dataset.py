@@ -7,6 +7,7 @@ whole, and a run that was stopped loses at most the episodes it had not flushed.
 library the rows are read by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -14,7 +15,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -117,7 +118,7 @@ class EpisodeWriter:
         table = _to_table(self._pending, self.info)
         columns = [f"{name}.list.element" for name, width in _widths(self.info).items() if width]
         final = self.path / f"episodes-{self._next_shard:05d}.parquet"
-        with _Replacing(final) as temporary:
+        with _replacing(final) as temporary:
             # Byte streams of float64 compress better split by significance; checksums tell a
             # damaged page from a whole one.
             pq.write_table(
@@ -214,31 +215,19 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     return Episodes(info, [episodes[index][0] for index in sorted(episodes)])
 
 
-class _Replacing:
+@contextlib.contextmanager
+def _replacing(final: Path) -> Iterator[Path]:
     """A temporary file beside `final`, renamed to it on success and removed on any exception."""
-
-    def __init__(self, final: Path) -> None:
-        self._final = final
-        # Readers of whole folders (pyarrow, pandas) skip names that start with a dot.
-        self._temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
-
-    def __enter__(self) -> Path:
-        return self._temporary
-
-    def __exit__(
-        self,
-        exception_type: type[BaseException] | None,
-        exception: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            if exception_type is None:
-                # The bytes reach the disk before the name does.
-                with self._temporary.open("rb+") as file:
-                    os.fsync(file.fileno())
-                self._temporary.replace(self._final)
-        finally:
-            self._temporary.unlink(missing_ok=True)
+    # Readers of whole folders (pyarrow, pandas) skip names that start with a dot.
+    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        # The bytes reach the disk before the name does.
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(final)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
@@ -251,7 +240,7 @@ def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> Non
         text = json.dumps(content, indent=2, ensure_ascii=False)
     except TypeError as error:
         raise ValueError(f"{path}: info and extra must be made of JSON types: {error}") from error
-    with _Replacing(path / _INFO_NAME) as temporary:
+    with _replacing(path / _INFO_NAME) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

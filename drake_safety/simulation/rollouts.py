@@ -14,27 +14,24 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
 from drake_safety.simulation.scenario import Scenario
 
-_ROW_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
 _LOGGER = logging.getLogger("drake_safety")
-_BATCH = 4  # Episodes a worker takes at a time.
+_BATCH = 4  # Episodes, or throws, that a worker takes at a time.
 
 Progress = Callable[[int, int], None]
+"""Called with the number done and the number wanted."""
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of episode ``index`` of a set: independent of who runs it, and when."""
+    """The generator of an episode: independent of who runs it, and when.
+
+    Args:
+        seed: Seed of the set.
+        index: Number of the episode in its set.
+    """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
@@ -64,7 +61,7 @@ class Recorder:
         names: Ports to read.
     """
 
-    def __init__(self, loop: ClosedLoop, names: Iterable[str] = _ROW_PORTS):
+    def __init__(self, loop: ClosedLoop, names: Iterable[str] = RECORDED_PORTS):
         self._ports = {name: loop.GetOutputPort(name) for name in names}
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in self._ports}
         self._times: list[float] = []
@@ -76,7 +73,7 @@ class Recorder:
         self._times.append(context.get_time())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The rows, ``time_s`` among them."""
+        """What was recorded: ``time_s`` (N,) [s], and (N, size) for each port by its name."""
         arrays = {name: np.array(rows) for name, rows in self._rows.items()}
         return {"time_s": np.array(self._times), **arrays}
 
@@ -177,17 +174,14 @@ def run_episodes(
     loop = scenario.make_loop(variation, **loop_options)
     info = episodes_info(loop, seed)
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
-    todo = [index for index in range(num_episodes) if index not in done]
+    remaining = [index for index in range(num_episodes) if index not in done]
     if progress is not None:
         progress(len(done), num_episodes)
     finished: list[Episode] = []
     writer = EpisodeWriter(path, info, extra) if path is not None else None
     results = parallel_map(
         _episode_batch,
-        [
-            (scenario, variation, loop_options, seed, todo[i : i + _BATCH])
-            for i in range(0, len(todo), _BATCH)
-        ],
+        [(scenario, variation, loop_options, seed, batch) for batch in batches(remaining)],
         num_workers,
     )
     try:
@@ -208,6 +202,11 @@ def run_episodes(
         stored = [e for e in load_episodes(path) if e.index in done]
         finished += stored
     return Episodes(info, sorted(finished, key=lambda episode: episode.index))
+
+
+def batches(indices: list[int]) -> list[list[int]]:
+    """Cuts a list into what a worker takes at a time."""
+    return [indices[i : i + _BATCH] for i in range(0, len(indices), _BATCH)]
 
 
 def parallel_map(

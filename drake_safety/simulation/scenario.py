@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib
+import inspect
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -12,12 +13,12 @@ from pydrake.common.yaml import yaml_dump_typed
 import drake_safety
 from drake_safety.control.robot import PlantVariation, load_typed
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.simulation.closed_loop import ClosedLoop
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.simulation.closed_loop import ClosedLoop
 
 
 @dataclass(kw_only=True)
@@ -74,7 +75,7 @@ class Scenario:
             )
         return self.variations[name]
 
-    def task_class(self) -> "type[ClosedLoop]":
+    def task_class(self) -> type[ClosedLoop]:
         """The task, imported.
 
         Raises:
@@ -89,7 +90,7 @@ class Scenario:
         assessment: "SafetyAssessment | None" = None,
         meshcat: "Meshcat | None" = None,
         **options: Any,
-    ) -> "ClosedLoop":
+    ) -> ClosedLoop:
         """Builds the task's diagram.
 
         Args:
@@ -99,9 +100,11 @@ class Scenario:
             **options: The task's own, such as ``recovery=False``.
 
         Raises:
-            ValueError: Unknown variation, or an assessment made for something else.
+            ValueError: Unknown variation, an option that the task does not have, or an assessment
+                made for something else.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
+        _check_options(task, options)
         return task(self, variation, assessment=assessment, meshcat=meshcat, **options)
 
     def to_yaml(self) -> str:
@@ -146,7 +149,19 @@ class Scenario:
         return digest.hexdigest()
 
 
-def _import_task(task: str, scenario_name: str) -> "type[ClosedLoop]":
+def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
+    parameters = inspect.signature(task).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    # What every task takes goes through make_loop's own arguments.
+    common = ("scenario", "variation", "assessment", "meshcat")
+    known = [parameter.name for parameter in parameters if parameter.name not in common]
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise ValueError(f"task '{task.__name__}' has no options {unknown}; it has {known}")
+
+
+def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
     module_name, _, class_name = task.partition(":")
     if not (module_name and class_name):
         raise ValueError(
@@ -161,8 +176,6 @@ def _import_task(task: str, scenario_name: str) -> "type[ClosedLoop]":
             f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks "
             f"that come with the package are {task_names()}"
         ) from error
-    from drake_safety.simulation.closed_loop import ClosedLoop
-
     known = {
         name: value
         for name, value in vars(module).items()
@@ -218,7 +231,9 @@ def load_scenario(name: str | Path) -> Scenario:
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
-    return parse_scenario(path.read_text(), name=path.stem, folder=path.resolve().parent)
+    return parse_scenario(
+        path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
+    )
 
 
 def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:

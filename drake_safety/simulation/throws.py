@@ -16,11 +16,13 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
     Recorder,
+    batches,
     episode_rng,
     parallel_map,
     worker_loop,
@@ -28,7 +30,7 @@ from drake_safety.simulation.rollouts import (
 from drake_safety.simulation.scenario import Scenario
 
 _FLIGHT_S = 0.1  # From the ball's appearance to its touch.
-_LATEST_S, _EARLIEST_S = 1.2, 0.4  # When it touches.
+_EARLIEST_S, _LATEST_S = 0.4, 1.2  # When a random ball touches.
 _AFTER_S = 2.5  # What follows the touch.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
@@ -40,17 +42,17 @@ class ThrowLog:
     Attributes:
         index: Number of the throw in its set.
         throw: Mass, speed, direction; ``throw.time_s`` is the touch [s].
-        time_s: (N,).
+        time_s: [s], (N,).
         state: (N, n_s), as the assessor sees it.
         desired_preview: (N, H n_z).
         features: (N, n_f).
         margins: (N, n_c), of the true state.
         plant_state: (N, n_q + n_v) of the robot alone.
-        trigger_time_s: When recovery was triggered; NaN without.
-        fall_time_s: When the robot fell; infinite if it did not.
-        leave_time_s: When it left the safe set; infinite if it did not.
+        trigger_time_s: When recovery was triggered [s]; NaN without.
+        fall_time_s: When the robot fell [s]; infinite if it did not.
+        leave_time_s: When it left the safe set [s]; infinite if it did not.
         recovery_active: (N,), whether a recovery step was under way.
-        violations: Rows in which what must not happen did: see :class:`Limits`.
+        violations: Rows in which what must not happen did: see :class:`ViolationCounter`.
         extra: Other ports that were asked for, (N, size) each.
     """
 
@@ -79,9 +81,17 @@ class ThrowLog:
         """Whether the robot left its safe set."""
         return math.isfinite(self.leave_time_s)
 
+    @property
+    def recovery_intervals_s(self) -> list[tuple[float, float]]:
+        """First and last instant of each recovery step [s]; one under way at the end ends there."""
+        is_first = np.diff(self.recovery_active, prepend=0.0) > 0
+        is_last = np.diff(self.recovery_active, append=0.0) < 0
+        starts, ends = self.time_s[is_first].tolist(), self.time_s[is_last].tolist()
+        return list(zip(starts, ends, strict=True))
 
-class Limits:
-    """Counts what a simulated success must not rest on, at every row of a log.
+
+class ViolationCounter:
+    """Counts the rows of a log in which something happens that no success may rest on.
 
     - ``legs_collide``: two bodies of the robot that are not neighbours penetrate each other;
     - ``joint_position``: a joint more than 0.02 rad beyond a stop;
@@ -95,11 +105,11 @@ class Limits:
     _POSITION_SLACK_RAD = 0.02
     _PENETRATION_M = 5e-3
 
-    def __init__(self, loop: Any):
+    def __init__(self, loop: ClosedLoop):
         self._loop = loop
         plant = loop.plant
         self._bodies = set(plant.GetBodyIndices(loop.robot_instance))
-        self._limits = loop.kinematics.position_limits
+        self._position_limits = loop.kinematics.position_limits
         self._velocity_limits = loop.kinematics.velocity_limits
         # The plant reports the net actuation of the joint for each of its actuators.
         actuators = [
@@ -132,9 +142,10 @@ class Limits:
             ):
                 self.counts["legs_collide"] += 1
                 break
-        q = plant.GetPositions(plant_context, instance)[7:]
-        v = plant.GetVelocities(plant_context, instance)[6:]
-        beyond = np.maximum(self._limits[:, 0] - q, q - self._limits[:, 1]).max()
+        q = plant.GetPositions(plant_context, instance)[NUM_BASE_POSITIONS:]
+        v = plant.GetVelocities(plant_context, instance)[NUM_BASE_VELOCITIES:]
+        lowest, highest = self._position_limits.T
+        beyond = np.maximum(lowest - q, q - highest).max()
         self.counts["joint_position"] += bool(beyond > self._POSITION_SLACK_RAD)
         self.counts["joint_velocity"] += bool(np.any(np.abs(v) > self._velocity_limits))
         effort = plant.get_net_actuation_output_port(instance).Eval(plant_context)
@@ -215,8 +226,9 @@ def run_throw(
     loop.reset_calm(context, rng)
     sampled = loop.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
     throws = [sampled] if throws is None else throws
+    first = throws[0] if throws else sampled
     if duration_s is None:
-        duration_s = throws[0].time_s + _AFTER_S
+        duration_s = first.time_s + _AFTER_S
     probability = None
     if loop.HasInputPort("safety_probability"):
         probability = loop.GetInputPort("safety_probability")
@@ -224,7 +236,7 @@ def run_throw(
     has_recovery = loop.HasOutputPort("recovery_active")
     simulator.Initialize()
     recorder = Recorder(loop, (*_PORTS, *ports, *(("recovery_active",) if has_recovery else ())))
-    limits = Limits(loop)
+    violations = ViolationCounter(loop)
     margins_port = loop.GetOutputPort("margins")
     fall_column = loop.constraint_names.index(loop.fall_name)
     fall_s = leave_s = math.inf
@@ -233,7 +245,7 @@ def run_throw(
         loop, simulator, throws, duration_s=duration_s, log_period_s=log_period_s
     ):
         recorder.record(context)
-        limits.count(context)
+        violations.count(context)
         margins = margins_port.Eval(context)
         if margins.min() < 0:
             leave_s = min(leave_s, time)
@@ -251,13 +263,13 @@ def run_throw(
     extra = {name: arrays.pop(name) for name in ports}
     return ThrowLog(
         index=index,
-        throw=throws[0] if throws else sampled,
+        throw=first,
         **arrays,
         trigger_time_s=triggered_s,
         fall_time_s=fall_s,
         leave_time_s=leave_s,
         recovery_active=active,
-        violations=limits.counts,
+        violations=violations.counts,
         extra=extra,
     )
 
@@ -279,7 +291,7 @@ def run_throws(
         indices: Which throws of the set.
         seed: Seed of the set.
         variation: Which plant.
-        trigger_times_s: Per throw, when recovery is triggered; by default there is none.
+        trigger_times_s: Per throw, when recovery is triggered [s]; by default there is none.
         num_workers: Processes; as many as there are cores by default.
         progress: Called with the number done and the number wanted.
 
@@ -288,11 +300,9 @@ def run_throws(
     """
     options = {"ball": True, "recovery": trigger_times_s is not None}
     times = trigger_times_s or {}
-    size = 4
-    batches = [indices[i : i + size] for i in range(0, len(indices), size)]
     arguments = [
         (scenario, variation, options, seed, [(i, times.get(i, math.nan)) for i in batch])
-        for batch in batches
+        for batch in batches(indices)
     ]
     logs: list[ThrowLog] = []
     for batch in parallel_map(_throw_batch, arguments, num_workers):

@@ -1,0 +1,49 @@
+"""The command ``drake-safety``: train, run and evaluate safety assessments.
+
+One module a command. Another one is a module with a function of the command's name (its arguments
+are the command line, its docstring the help) and a line in `_COMMANDS`.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import typer
+from rich.logging import RichHandler
+
+from drake_safety.cli import evaluate, run, scenarios, train
+from drake_safety.cli.console import console
+
+# In the order in which the help lists them.
+_COMMANDS = (scenarios.scenarios, train.train, run.run, evaluate.evaluate)
+
+app = typer.Typer(
+    help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for _command in _COMMANDS:
+    app.command()(_command)
+
+
+def main() -> None:
+    """Runs the command; what a user did wrong is one line, not a traceback."""
+    handler = RichHandler(console=console, show_path=False)
+    logging.getLogger("drake_safety").addHandler(handler)
+    try:
+        sys.exit(app(standalone_mode=False))
+    except (ValueError, OSError) as error:
+        console.print("error", error, style="red", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except (typer.Abort, KeyboardInterrupt):
+        console.print("stopped; finished episodes are kept", highlight=False)
+        sys.exit(130)
+    except Exception as error:
+        # Typer's own errors (unknown options, wrong types) know how to show themselves.
+        if not hasattr(error, "exit_code") or not hasattr(error, "show"):
+            raise
+        error.show()
+        sys.exit(error.exit_code)

@@ -1,0 +1,5 @@
+"""``python -m drake_safety.cli`` is ``drake-safety``."""
+
+from drake_safety.cli import main
+
+main()

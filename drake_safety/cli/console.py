@@ -1,0 +1,72 @@
+"""What all commands write with: one console, its tables, its progress, its paths."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column, Table
+
+# Square brackets are units here, not markup. A log has no width of its own.
+console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
+
+
+def new_table(*columns: str, title: str | None = None) -> Table:
+    """A table whose cells fold where they do not fit: no figure is cut short."""
+    return Table(*(Column(name, overflow="fold") for name in columns), title=title)
+
+
+def print_path(what: str, path: Path) -> None:
+    """Prints a path whole on one line, so that it can be copied."""
+    console.print(what, str(path), soft_wrap=True, highlight=False)
+
+
+class Stages:
+    """Progress bars, one a stage, that show the time left.
+
+    Args:
+        progress: Where the bars stand.
+    """
+
+    def __init__(self, progress: Progress):
+        self._progress = progress
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, stage: str, done: float, total: float) -> None:
+        """Shows a stage's bar, made at the first call.
+
+        Args:
+            stage: What is under way.
+            done: How much of it is done.
+            total: How much there is.
+        """
+        if stage not in self._tasks:
+            self._tasks[stage] = self._progress.add_task(stage, total=total)
+        self._progress.update(self._tasks[stage], completed=done, total=total)
+
+
+@contextlib.contextmanager
+def open_stages() -> Iterator[Stages]:
+    """Shows the stages of a command for as long as the block runs."""
+    columns = (
+        TextColumn("{task.description:<34}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield Stages(progress)

@@ -1,0 +1,128 @@
+"""``drake-safety train``: simulates the nominal closed loop, and learns Γ from it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drake_safety.cli.arguments import ScenarioArgument, WorkersOption
+from drake_safety.cli.console import Stages, console, new_table, open_stages, print_path
+from drake_safety.cli.provenance import command_line
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+
+if TYPE_CHECKING:
+    from drake_safety.learning.segments import Episodes
+    from drake_safety.simulation.scenario import Scenario
+
+
+def train(
+    scenario: ScenarioArgument,
+    out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
+    episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=1)] = 2048,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = 0,
+    mode: Annotated[
+        str, typer.Option(help="'sharpened', 'paper' (literally the paper's), or 'both'.")
+    ] = "both",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the episodes that are in OUT.")
+    ] = False,
+    workers: WorkersOption = None,
+) -> None:
+    """Simulate the nominal closed loop and learn Γ from it.
+
+    Episodes are kept as they finish: a run that was stopped goes on with --resume.
+    """
+    from drake_safety.simulation.dataset import completed
+    from drake_safety.simulation.rollouts import run_episodes
+    from drake_safety.simulation.scenario import load_scenario
+
+    if mode not in (*MODES, "both"):
+        raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
+    modes = MODES if mode == "both" else (mode,)
+    loaded = load_scenario(scenario)
+    folder = episodes_folder(out)
+    if folder.exists() and completed(folder) and not resume:
+        raise ValueError(
+            f"{folder} already holds {len(completed(folder))} episodes: pass --resume to go on "
+            "with them, or choose another --out"
+        )
+    with open_stages() as stages:
+        data = run_episodes(
+            loaded,
+            episodes,
+            seed=seed,
+            num_workers=workers,
+            path=folder,
+            progress=partial(stages, "nominal episodes"),
+            extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
+        )
+        # The modes are independent: the first is learned here, the others in processes beside.
+        with _worker_processes(len(modes) - 1) as submit:
+            beside = {name: submit(_learn, loaded, name, out) for name in modes[1:]}
+            learned = [_learn(loaded, modes[0], out, data, stages)]
+            for name, result in beside.items():
+                stages(name, 0, 1)
+                learned.append(result.result())
+                stages(name, 1, 1)
+    table = new_table("mode", "segments", "unsafe episodes", "CPU time")
+    unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
+    for name, (num_segments, cpu_s) in zip(modes, learned, strict=True):
+        table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
+    console.print(table)
+    print_path("episodes  ", folder)
+    for name in modes:
+        print_path("assessment", assessment_file(out, name))
+
+
+@contextlib.contextmanager
+def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
+    """Gives what submits a call to a worker process; on an error or Ctrl-C the workers end."""
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    executor = ProcessPoolExecutor(max_workers=max(num_workers, 1))
+    try:
+        yield executor.submit
+    except BaseException:
+        executor.shutdown(wait=False, kill_workers=True)
+        raise
+    executor.shutdown()
+
+
+def _learn(
+    scenario: Scenario,
+    mode: str,
+    out: Path,
+    data: Episodes | None = None,
+    stages: Stages | None = None,
+) -> tuple[int, float]:
+    """Learns and saves one mode.
+
+    Args:
+        scenario: The scenario.
+        mode: The mode.
+        out: The folder of this training.
+        data: The episodes; read from the folder by default, as in a worker process.
+        stages: Shows how far it is.
+
+    Returns:
+        The number of segments and the CPU time [s].
+    """
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.dataset import load_episodes
+
+    def report(stage: str, share: float) -> None:
+        if stages is not None:
+            stages(f"{mode}: {stage}", round(100 * share), 100)
+
+    started = time.process_time()
+    scenario.assessment.mode = mode
+    data = load_episodes(episodes_folder(out)) if data is None else data
+    assessment = SafetyAssessment(scenario.assessment).fit(data, report)
+    assessment.save(assessment_file(out, mode))
+    return assessment.training_points_.shape[1], time.process_time() - started

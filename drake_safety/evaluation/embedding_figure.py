@@ -1,0 +1,229 @@
+"""The map of an assessment: its segments in the plane, the beliefs of its cells, their causes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    INK,
+    SAFE_COLOUR,
+    SERIES_COLOURS,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+    spoken,
+)
+from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.grid import OUTSIDE, Grid
+from drake_safety.learning.segments import Episodes, split
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+    from drake_safety.learning.assessment import SafetyAssessment
+
+_MAX_POINTS = 12000
+_FIRST_CAUSE = 3  # Column of a cell's masses at which those of the causes begin.
+
+
+def embedding_figure(
+    assessment: SafetyAssessment,
+    episodes: Episodes,
+    *,
+    beliefs: np.ndarray | None = None,
+    right: str = "causes",
+) -> Figure:
+    """The map: segments in the embedding, the beliefs of its cells, and their causes.
+
+    Of an ensemble it is the first map.
+
+    Args:
+        assessment: A fitted assessment.
+        episodes: Episodes whose segments are drawn, best ones it has not learned from.
+        beliefs: Beliefs instead of the assessment's own, (K, R*R, 3 + n_c).
+        right: What the right panel shows: "causes", the constraint most likely to be violated, or
+            "uncertainty", mu.
+
+    Raises:
+        ValueError: Unknown `right`.
+    """
+    if right not in ("causes", "uncertainty"):
+        raise ValueError(
+            f"embedding_figure: right is '{right}', expected 'causes' or 'uncertainty'"
+        )
+    cells = (assessment.beliefs_ if beliefs is None else beliefs)[0]
+    grid = assessment.grid_
+    inside = grid.locate(assessment.training_points_[0])
+    count = np.bincount(inside[inside != OUTSIDE], minlength=grid.num_cells)
+    with drawing_style():
+        fig = new_figure(14.0, 4.6)
+        left, middle, last = fig.subplots(1, 3)
+        _draw_segments(fig, left, assessment, episodes)
+        most = 1.0 - assessment.parameters.initial_uncertainty
+        _draw_safety(fig, middle, grid, cells, count, most)
+        if right == "causes":
+            _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
+        else:
+            _draw_uncertainty(fig, last, grid, cells)
+        for axes in (left, middle, last):
+            half = grid.half_width
+            axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
+    return fig
+
+
+def _draw_segments(
+    fig: Figure, axes: Axes, assessment: SafetyAssessment, episodes: Episodes
+) -> None:
+    parameters = assessment.parameters
+    segments = split(episodes, stride=max(parameters.horizon // 2, 1), discount=parameters.discount)
+    # Drawn in random order, so that neither class hides the other.
+    order = np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS]
+    segments = segments.take(order)
+    points = assessment.predict(
+        segments.state, segments.desired_preview, segments.features
+    ).embedding
+    _draw_grid(axes, assessment.grid_)
+    dots = axes.scatter(
+        points[:, 0],
+        points[:, 1],
+        c=segments.score,
+        cmap=_safety_colours().reversed(),
+        vmin=0.0,
+        vmax=1.0,
+        s=5.0,
+        linewidths=0.0,
+        alpha=0.85,
+        rasterized=True,
+    )
+    axes.set_title("Segments in the embedding")
+    axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
+    bar = _add_colour_bar(fig, axes, dots, "unsafety score λ")
+    if bar.solids is not None:
+        bar.solids.set_alpha(1.0)
+
+
+def _draw_safety(
+    fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray, count: np.ndarray, most: float
+) -> None:
+    """Beliefs of safe, over the number of segments each cell was learned from.
+
+    Args:
+        fig: The figure.
+        axes: Where to in it.
+        grid: The grid.
+        cells: Masses of each cell, (R*R, 3 + n_c).
+        count: Segments in each cell, (R*R,).
+        most: The belief of safe that has the bluest colour, if none exceeds it.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    shade = ScalarMappable(Normalize(0.0, max(most, cells[:, SAFE].max())), _safety_colours())
+    is_empty = cells[:, UNCERTAINTY] >= 1.0
+    colours = shade.to_rgba(cells[:, SAFE])
+    _draw_cells(axes, grid, colours, is_empty)
+    brightness = colours[:, :3] @ [0.299, 0.587, 0.114]
+    for (x, y), number, light, empty in zip(
+        grid.centres, count, brightness > 0.6, is_empty, strict=True
+    ):
+        if number:
+            ink = FAINT_INK if empty else INK if light else "white"
+            axes.text(
+                x, y, _short(number), ha="center", va="center_baseline", fontsize=6.5, color=ink
+            )
+    axes.set_title("Belief of each cell: safe")
+    axes.set_xlabel("numbers: segments learned from; hatched: EMPTY")
+    _add_colour_bar(fig, axes, shade, "belief mass of safe")
+
+
+def _draw_causes(
+    fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
+) -> None:
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Patch
+
+    # From the second on: the first is the colour of safe.
+    colours_of_causes = [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(len(names))]
+    palette = np.array([to_rgb(colour) for colour in colours_of_causes])
+    cause = cells[:, _FIRST_CAUSE:].argmax(axis=1)
+    is_empty = cells[:, UNCERTAINTY] >= 1.0
+    # White where nothing is unsafe, the cause's own colour where all that is known is.
+    depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
+    colours = np.column_stack([1.0 - depth * (1.0 - palette[cause]), np.ones(len(cells))])
+    colours[:, :3] *= 0.97
+    _draw_cells(axes, grid, colours, is_empty)
+    axes.set_title("Most likely cause")
+    axes.legend(
+        handles=[Patch(color=c, label=spoken(n)) for c, n in zip(palette, names, strict=True)],
+        title="pale: unlikely",
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        handlelength=1.0,
+        handleheight=1.0,
+    )
+
+
+def _draw_uncertainty(fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    ramp = LinearSegmentedColormap.from_list("unknown", ["#fbfbfc", "#b3a5c9", "#3f2a63"])
+    shade = ScalarMappable(Normalize(0.0, 1.0), ramp)
+    _draw_cells(axes, grid, shade.to_rgba(cells[:, UNCERTAINTY]), cells[:, UNCERTAINTY] >= 1.0)
+    axes.set_title("Belief of each cell: unknown")
+    _add_colour_bar(fig, axes, shade, "uncertainty μ")
+
+
+def _draw_grid(axes: Axes, grid: Grid) -> None:
+    edges = np.linspace(-grid.half_width, grid.half_width, grid.resolution + 1)
+    axes.vlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
+    axes.hlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
+
+
+def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
+    """Squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    corners = grid.centres - 0.5 * grid.cell_length
+    squares = [Rectangle((x, y), grid.cell_length, grid.cell_length) for x, y in corners]
+    filled = [square for square, empty in zip(squares, is_empty, strict=True) if not empty]
+    hollow = [square for square, empty in zip(squares, is_empty, strict=True) if empty]
+    axes.add_collection(
+        PatchCollection(
+            hollow, facecolor="#f1f2f4", edgecolor="#dadde1", linewidth=0.5, hatch="////"
+        )
+    )
+    axes.add_collection(
+        PatchCollection(filled, facecolor=colours[~is_empty], edgecolor="white", linewidth=0.8)
+    )
+    axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
+
+
+def _safety_colours() -> Colormap:
+    """From unsafe (0) over a pale middle to safe (1)."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    stops = ["#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80"]
+    return LinearSegmentedColormap.from_list("safety", stops)
+
+
+def _add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:
+    bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
+    bar.outline.set_visible(False)
+    return bar
+
+
+def _short(count: int) -> str:
+    """A count as short as a cell is narrow: 12345 → 12k."""
+    if count < 1000:
+        return str(count)
+    return f"{count / 1000:.1f}k" if count < 9950 else f"{count / 1000:.0f}k"

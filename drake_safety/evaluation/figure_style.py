@@ -1,0 +1,106 @@
+"""What all pictures share: colours that stay apart for colour-blind eyes, style, and saving.
+
+Blue is safe, vermilion unsafe, grey unknown. A figure belongs to no window, and drawing it leaves
+matplotlib's own settings as they are.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SAFE_COLOUR = "#2b6cb0"
+UNSAFE_COLOUR = "#d1541b"
+UNKNOWN_COLOUR = "#c9ccd1"
+RECOVERY_COLOUR = "#1b9e77"
+FALSE_ALARM_COLOUR = "#c99700"
+BALL_COLOUR = "#e8730c"
+INK = "#22262b"
+FAINT_INK = "#8a9099"
+SERIES_COLOURS = (
+    SAFE_COLOUR,
+    UNSAFE_COLOUR,
+    RECOVERY_COLOUR,
+    "#8e5ea2",
+    FALSE_ALARM_COLOUR,
+    "#4d4d4d",
+)
+"""Curves in one panel, in this order."""
+SERIES_DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+"""Their dashes: curves stay apart in print, too."""
+
+_STYLE: dict[Any, Any] = {
+    "font.size": 10.0,
+    "axes.titlesize": 11.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT_INK,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlecolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.hashsalt": "drake_safety",
+}
+_DPI = 200
+
+
+@contextmanager
+def drawing_style() -> Iterator[None]:
+    """What is drawn or saved inside the block looks alike; settings outside are not touched."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure that belongs to no window.
+
+    Args:
+        width: Its width [inches].
+        height: Its height [inches].
+    """
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(width, height), layout="constrained")
+    fig.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr, call-arg]
+    return fig
+
+
+def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
+    """Writes a figure as PNG, at twice the usual resolution, and as SVG.
+
+    Args:
+        fig: The figure.
+        path: Where to; its suffix is replaced.
+
+    Returns:
+        The two paths, PNG first.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with drawing_style():
+        paths = [path.with_suffix(".png"), path.with_suffix(".svg")]
+        fig.savefig(paths[0], dpi=_DPI)
+        # Without the date, the same figure is the same file.
+        fig.savefig(paths[1], dpi=_DPI, metadata={"Date": None})
+    return paths
+
+
+def spoken(name: str) -> str:
+    """A constraint's name as one reads it: `support_polygon` → support polygon."""
+    return name.replace("_", " ")

@@ -1,0 +1,96 @@
+"""The receiver operating characteristic of scorers, whole and where it matters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    SERIES_COLOURS,
+    SERIES_DASHES,
+    drawing_style,
+    new_figure,
+)
+from drake_safety.evaluation.metrics import area_under_curve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def roc_figure(
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    thresholds: Mapping[str, float] | None = None,
+    corner: float = 0.3,
+) -> Figure:
+    """How many unsafe ends each scorer sees, against how many safe ones it takes for unsafe.
+
+    Args:
+        curves: Per scorer its unsafe scores (N,) and the labels (N,); NaN is the most unsafe.
+        thresholds: Per scorer, the threshold whose point on the curve is marked.
+        corner: Share of either axis that the right panel magnifies.
+    """
+    thresholds = thresholds or {}
+    with drawing_style():
+        fig = new_figure(10.0, 5.0)
+        whole, magnified = fig.subplots(1, 2)
+        for i, (name, (score, label)) in enumerate(curves.items()):
+            score = np.where(np.isnan(score), np.inf, np.asarray(score, dtype=float))
+            false_alarm, unsafe_recall = _operating_points(score, label)
+            area = area_under_curve(score, label)
+            colour = SERIES_COLOURS[i % len(SERIES_COLOURS)]
+            for axes in (whole, magnified):
+                axes.plot(
+                    false_alarm,
+                    unsafe_recall,
+                    color=colour,
+                    linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
+                    linewidth=1.8,
+                    label=f"{name}   {area:.3f}",
+                )
+                if name in thresholds:
+                    is_alarm = score > thresholds[name]
+                    axes.plot(
+                        is_alarm[~label].mean(),
+                        is_alarm[label].mean(),
+                        "o",
+                        color=colour,
+                        markeredgecolor="white",
+                        markersize=8,
+                        clip_on=False,
+                        zorder=5,
+                    )
+        whole.set(xlim=(0, 1), ylim=(0, 1))
+        magnified.set(xlim=(0, corner), ylim=(1.0 - corner, 1.0))
+        frame = [[0, corner, corner, 0, 0], [1 - corner, 1 - corner, 1, 1, 1 - corner]]
+        whole.plot(*frame, color=FAINT_INK, linewidth=0.8)
+        for axes in (whole, magnified):
+            axes.set_aspect("equal")
+            axes.set_xlabel("safe, judged unsafe")
+            axes.grid(color="#eceef0", linewidth=0.7)
+        whole.set_ylabel("unsafe, judged unsafe")
+        whole.set_title("Receiver operating characteristic")
+        magnified.set_title("The corner, magnified")
+        whole.legend(loc="lower right", title="area under the curve", alignment="left")
+    return fig
+
+
+def _operating_points(score: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share of false alarms and unsafe recall of every threshold, from (0, 0) to (1, 1).
+
+    Args:
+        score: Unsafe scores, (N,).
+        label: Whether each is unsafe, (N,).
+
+    Returns:
+        The two shares, one more than there are distinct scores.
+    """
+    rank = np.unique(-score, return_inverse=True)[1]
+    shares = []
+    for members in (~label, label):
+        hits = np.cumsum(np.bincount(rank, weights=members))
+        shares.append(np.concatenate([[0.0], hits / max(hits[-1], 1.0)]))
+    return shares[0], shares[1]

@@ -1,0 +1,292 @@
+"""Gamma over the time of one run, with pictures of the robot at the moments that matter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    BALL_COLOUR,
+    FAINT_INK,
+    INK,
+    RECOVERY_COLOUR,
+    SAFE_COLOUR,
+    SERIES_COLOURS,
+    SERIES_DASHES,
+    UNKNOWN_COLOUR,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+    spoken,
+)
+from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.gridspec import GridSpecBase
+
+    from drake_safety.simulation.balls import Throw
+
+_WIDTH = 12.0  # All sizes are in inches.
+_GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
+_MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT = 2.6, 0.35
+_AXIS_LABEL_HEIGHT = 0.6
+_BALL_HEIGHT = 0.3  # At which a ball is drawn, on the axis of Gamma.
+_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+def timeline_figure(
+    time_s: np.ndarray,
+    gamma: np.ndarray,
+    threshold: float,
+    *,
+    throws: Sequence[Throw] = (),
+    trigger_times_s: Sequence[float] = (),
+    recovery_intervals_s: Sequence[tuple[float, float]] = (),
+    stills: Sequence[tuple[float, np.ndarray]] = (),
+    belief: np.ndarray | None = None,
+    margins: np.ndarray | None = None,
+    constraint_names: Sequence[str] = (),
+) -> Figure:
+    """Gamma over time, with pictures of the robot at the moments that matter.
+
+    Args:
+        time_s: Instants [s], (N,).
+        gamma: Safety probability, held until the next instant, (N,).
+        threshold: Below it a recovery is triggered.
+        throws: Balls, each marked at the instant it touches.
+        trigger_times_s: When a recovery was triggered [s].
+        recovery_intervals_s: (start, end) of each recovery [s].
+        stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
+        belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
+        margins: Signed margins [m], (N, n_c); drawn at the bottom.
+        constraint_names: Names of the columns of `margins`.
+
+    Raises:
+        ValueError: Arrays of different lengths, margins without as many names, or a still outside
+            the time shown.
+    """
+    time_s, gamma = np.asarray(time_s, dtype=float), np.asarray(gamma, dtype=float)
+    for name, values in (("gamma", gamma), ("belief", belief), ("margins", margins)):
+        if values is not None and len(values) != len(time_s):
+            raise ValueError(
+                f"timeline_figure: {name} has {len(values)} rows, expected {len(time_s)}"
+            )
+    if margins is not None and margins.shape[1] != len(constraint_names):
+        raise ValueError(
+            f"timeline_figure: margins have {margins.shape[1]} columns, but the constraints are "
+            f"{list(constraint_names)}"
+        )
+    for instant, _ in stills:
+        if not time_s[0] - 1e-9 <= instant <= time_s[-1] + 1e-9:
+            raise ValueError(
+                f"timeline_figure: a still at {instant} s is outside {time_s[0]}..{time_s[-1]} s"
+            )
+    heights = [_GAMMA_HEIGHT]
+    if belief is not None:
+        heights.append(_BELIEF_HEIGHT)
+    if margins is not None:
+        heights.append(_MARGINS_HEIGHT)
+    with drawing_style():
+        fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
+        gamma_axes, *others = panels
+        _draw_gamma(gamma_axes, time_s, gamma, threshold)
+        remaining = iter(others)
+        if belief is not None:
+            _draw_belief(next(remaining), time_s, belief)
+        if margins is not None:
+            _draw_margins(next(remaining), time_s, margins, constraint_names)
+        for panel in panels:
+            _mark_instants(panel, throws, trigger_times_s)
+        for interval in recovery_intervals_s:
+            _annotate_recovery(gamma_axes, interval)
+        for throw in throws:
+            _annotate_throw(gamma_axes, time_s, throw)
+        for instant in trigger_times_s:
+            _annotate_trigger(gamma_axes, time_s, instant, threshold)
+        for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
+            _draw_still(axes, image, f"({letter})  {instant:.2f} s")
+            row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
+            height = gamma[row] if np.isfinite(gamma[row]) else 0.0
+            _join(fig, axes, gamma_axes, (instant, height))
+        for panel in panels[:-1]:
+            panel.tick_params(labelbottom=False)
+        panels[-1].set_xlabel("time [s]")
+        gamma_axes.set_xlim(time_s[0], time_s[-1])
+        fig.align_ylabels(panels)
+    return fig
+
+
+def _lay_out(
+    heights: Sequence[float], images: Sequence[np.ndarray]
+) -> tuple[Figure, list[Axes], list[Axes]]:
+    """A strip of pictures, if there are any, over panels that share their axis of time.
+
+    Args:
+        heights: Of the panels [inches], top down.
+        images: The pictures, (height, width, 3) each.
+
+    Returns:
+        The figure, the pictures' axes, and the panels' axes.
+    """
+    pictures: list[Axes] = []
+    if images:
+        aspect = max(image.shape[0] / image.shape[1] for image in images)
+        strip_height = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
+        fig = new_figure(_WIDTH, sum(heights) + strip_height + _AXIS_LABEL_HEIGHT)
+        halves = fig.add_gridspec(2, 1, height_ratios=[strip_height, sum(heights)], hspace=0.08)
+        strip = halves[0, 0].subgridspec(1, len(images), wspace=0.03)
+        pictures = [fig.add_subplot(strip[0, i]) for i in range(len(images))]
+        rows: GridSpecBase = halves[1, 0].subgridspec(len(heights), 1, height_ratios=heights)
+    else:
+        fig = new_figure(_WIDTH, sum(heights) + _AXIS_LABEL_HEIGHT)
+        rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
+    panels: list[Axes] = []
+    for i in range(len(heights)):
+        panels.append(fig.add_subplot(rows[i, 0], sharex=panels[0] if panels else None))
+    return fig, pictures, panels
+
+
+def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: float) -> None:
+    axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
+    axes.annotate(
+        f"threshold {threshold:g}",
+        (1.0, threshold),
+        xycoords=("axes fraction", "data"),
+        xytext=(-4, 3),
+        textcoords="offset points",
+        ha="right",
+        color=UNSAFE_COLOUR,
+        fontsize=9,
+    )
+    axes.step(time_s, gamma, where="post", color=SAFE_COLOUR, linewidth=2.0)
+    axes.set_ylim(-0.02, 1.05)
+    axes.set_yticks([0.0, 0.5, 1.0])
+    axes.set_ylabel("safety probability Γ")
+
+
+def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
+    safe = belief[:, SAFE]
+    safe_or_unknown = safe + belief[:, UNCERTAINTY]
+    layers = (
+        ("safe", np.zeros_like(safe), safe, SAFE_COLOUR),
+        ("unknown", safe, safe_or_unknown, UNKNOWN_COLOUR),
+        ("unsafe", safe_or_unknown, np.ones_like(safe), UNSAFE_COLOUR),
+    )
+    for name, lower, upper, colour in layers:
+        axes.fill_between(time_s, lower, upper, step="post", color=colour, linewidth=0, label=name)
+    axes.set(ylim=(0.0, 1.0), yticks=[0.0, 1.0], ylabel="belief")
+    # The legend lists the layers as they lie: top down.
+    handles, labels = axes.get_legend_handles_labels()
+    _add_legend_on_the_right(axes, handles[::-1], labels[::-1])
+
+
+def _draw_margins(
+    axes: Axes, time_s: np.ndarray, margins: np.ndarray, names: Sequence[str]
+) -> None:
+    axes.axhline(0.0, color=FAINT_INK, linewidth=0.8)
+    for i, name in enumerate(names):
+        axes.plot(
+            time_s,
+            100.0 * margins[:, i],
+            # From the third on: the first two are the colours of safe and unsafe.
+            color=SERIES_COLOURS[(2 + i) % len(SERIES_COLOURS)],
+            linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
+            linewidth=1.5,
+            label=spoken(name),
+        )
+    low, high = axes.get_ylim()
+    low = min(low, -0.12 * high)
+    axes.axhspan(low, 0.0, color=UNSAFE_COLOUR, alpha=0.08, linewidth=0)
+    axes.set(ylim=(low, high), ylabel="margin [cm]")
+    _add_legend_on_the_right(axes, *axes.get_legend_handles_labels())
+
+
+def _add_legend_on_the_right(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
+    axes.legend(
+        handles,
+        labels,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        handlelength=1.4,
+        borderaxespad=0.3,
+    )
+
+
+def _mark_instants(axes: Axes, throws: Sequence[Throw], trigger_times_s: Sequence[float]) -> None:
+    for throw in throws:
+        axes.axvline(throw.time_s, color=INK, linewidth=1.0, linestyle=(0, (1, 2)))
+    for instant in trigger_times_s:
+        axes.axvline(instant, color=UNSAFE_COLOUR, linewidth=1.2)
+
+
+def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
+    start, end = interval_s
+    axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
+    axes.annotate(
+        "recovery steps",
+        (0.5 * (start + end), 0.0),
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="center",
+        color=RECOVERY_COLOUR,
+        fontsize=9,
+    )
+
+
+def _annotate_throw(axes: Axes, time_s: np.ndarray, throw: Throw) -> None:
+    # The words stand left of the ball, unless it comes so early that they would not fit.
+    is_early = throw.time_s - time_s[0] < 0.15 * (time_s[-1] - time_s[0])
+    place = (throw.time_s, _BALL_HEIGHT)
+    axes.plot(*place, "o", color=BALL_COLOUR, markersize=9, clip_on=False, zorder=5)
+    axes.annotate(
+        f"{throw.mass_kg:.1f} kg, {throw.speed_m_s:.1f} m/s",
+        place,
+        xytext=(8 if is_early else -8, 0),
+        textcoords="offset points",
+        ha="left" if is_early else "right",
+        va="center",
+        fontsize=9,
+    )
+
+
+def _annotate_trigger(axes: Axes, time_s: np.ndarray, instant_s: float, threshold: float) -> None:
+    is_late = time_s[-1] - instant_s < 0.15 * (time_s[-1] - time_s[0])
+    axes.plot(instant_s, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
+    axes.annotate(
+        "trigger",
+        (instant_s, threshold),
+        xytext=(-7 if is_late else 7, -3),
+        textcoords="offset points",
+        ha="right" if is_late else "left",
+        va="top",
+        color=UNSAFE_COLOUR,
+        fontsize=9,
+    )
+
+
+def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
+    axes.imshow(image, interpolation="antialiased")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title, fontsize=10, pad=4)
+
+
+def _join(fig: Figure, picture: Axes, gamma_axes: Axes, point: tuple[float, float]) -> None:
+    """A line from a picture's lower edge to its point on the curve of Gamma."""
+    from matplotlib.patches import ConnectionPatch
+
+    line = ConnectionPatch(
+        xyA=(0.5, 0.0),
+        coordsA=picture.transAxes,
+        xyB=point,
+        coordsB=gamma_axes.transData,
+        color=FAINT_INK,
+        linewidth=0.9,
+    )
+    line.set_in_layout(False)
+    fig.add_artist(line)
+    gamma_axes.plot(*point, "o", color="white", markeredgecolor=INK, markersize=6, zorder=6)

@@ -1,0 +1,34 @@
+"""The ground that a robot stands on."""
+
+import logging
+
+from pydrake.geometry import HalfSpace
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+
+from drake_safety.control.robot import add_to_package_map
+
+# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
+# is deformable.
+logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
+
+
+def add_ground(plant: MultibodyPlant, friction: float) -> None:
+    """Adds level ground at z = 0 to a plant that is not finalised.
+
+    Args:
+        plant: The plant.
+        friction: Coulomb's coefficient, static and dynamic.
+    """
+    parser = Parser(plant)
+    add_to_package_map(parser.package_map())
+    # What is seen; what is stood on is the half space, which has no edge.
+    parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
+    plant.RegisterCollisionGeometry(
+        plant.world_body(),
+        RigidTransform(),
+        HalfSpace(),
+        "ground",
+        CoulombFriction(friction, friction),
+    )

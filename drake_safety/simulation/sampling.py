@@ -1,0 +1,199 @@
+"""What an episode draws at random: a start on the feet, a plan, and balls that are thrown."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from drake_safety.control.kinematics import (
+    NUM_BASE_VELOCITIES,
+    RobotKinematics,
+    fit_stance,
+    planar_pose,
+)
+from drake_safety.simulation.balls import Throw
+from drake_safety.systems.trajectory_planner import interpolate
+
+
+@dataclass(kw_only=True, eq=False)
+class Start:
+    """How an episode begins.
+
+    Attributes:
+        X_WB: Pose of the base.
+        joints: Joint positions, (n_j,) [rad].
+        v: Velocities, (n_v,) [rad/s, m/s].
+        p_WC: Contact points, where the feet stand, (n_c, 3) [m].
+        plan: Position of the base over time, in the stance frame of the feet, (3,) [m].
+    """
+
+    X_WB: RigidTransform
+    joints: np.ndarray
+    v: np.ndarray
+    p_WC: np.ndarray
+    plan: PiecewisePolynomial
+
+
+@dataclass(kw_only=True)
+class StartSampling:
+    """Random initial states and plans. Offsets are half-widths about the standing posture."""
+
+    foot_offset_m: float = 0.02
+    """Of every contact point, along x and along y."""
+    base_offset_m: list[float] = field(default_factory=lambda: [0.08, 0.05])
+    """Along x and along y of the stance frame."""
+    base_height_m: list[float] = field(default_factory=lambda: [0.36, 0.45])
+    """Lowest and highest height of the base."""
+    tilt_rad: float = 0.1
+    """Half-width of roll, pitch and yaw, each."""
+    velocity_std_m_s: list[float] = field(default_factory=lambda: [0.5, 0.35, 0.1])
+    """Of the base, along x, y and z."""
+    angular_velocity_std_rad_s: float = 0.4
+    joint_std_rad: float = 0.02
+    target_offset_m: list[float] = field(default_factory=lambda: [0.20, 0.11])
+    """Where the plan ends, along x and along y of the stance frame."""
+    target_height_m: list[float] = field(default_factory=lambda: [0.34, 0.46])
+    """Lowest and highest height at which the plan ends."""
+    plan_duration_s: list[float] = field(default_factory=lambda: [0.8, 1.6])
+    """Shortest and longest duration of the planned motion."""
+
+    def __post_init__(self) -> None:
+        for name in ("base_height_m", "target_height_m", "plan_duration_s"):
+            _check_range("start", name, getattr(self, name))
+        for name, size in (("base_offset_m", 2), ("velocity_std_m_s", 3), ("target_offset_m", 2)):
+            _check_size("start", name, getattr(self, name), size)
+
+    def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> Start:
+        """A start with the base anywhere in the ranges and moving, and the feet at rest."""
+        xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * self.foot_offset_m
+        p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
+        X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
+        start = np.append(
+            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.base_offset_m,
+            _between(rng, self.base_height_m),
+        )
+        rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
+        X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start)
+        joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
+        w_WB = rng.normal(size=3) * self.angular_velocity_std_rad_s
+        v_WB = rng.normal(size=3) * self.velocity_std_m_s
+        v = resting_feet(kinematics, X_WB, joints, np.concatenate([w_WB, v_WB]))
+        joints = joints + rng.normal(size=kinematics.num_joints) * self.joint_std_rad
+        goal = np.append(
+            kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.target_offset_m,
+            _between(rng, self.target_height_m),
+        )
+        plan = interpolate(start, goal, _between(rng, self.plan_duration_s))
+        return Start(X_WB=X_WB, joints=joints, v=v, p_WC=p_WC, plan=plan)
+
+
+@dataclass(kw_only=True)
+class PushSampling:
+    """Random balls, and the calm motion during which they are thrown."""
+
+    share: float = 0.25
+    """Share of nominal episodes that begin as a ball hits."""
+    mass_kg: list[float] = field(default_factory=lambda: [2.0, 4.0])
+    """Lowest and highest."""
+    speed_m_s: list[float] = field(default_factory=lambda: [2.0, 11.0])
+    """Lowest and highest."""
+    offset_m: float = 0.0
+    """Half-width of a throw's ``offset_m``."""
+    height_m: float = 0.03
+    """Half-width of a throw's ``height_m``."""
+    target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
+    """Half-widths of where the calm motion starts and ends, about the stance, x and y."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"push: share must be in [0, 1]; got {self.share}")
+        for name in ("mass_kg", "speed_m_s"):
+            _check_range("push", name, getattr(self, name))
+        _check_size("push", "target_offset_m", self.target_offset_m, 2)
+
+    def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
+        """A random ball from any horizontal direction.
+
+        Args:
+            rng: Source of every draw.
+            time_s: When it touches [s].
+        """
+        return Throw(
+            time_s=time_s,
+            mass_kg=_between(rng, self.mass_kg),
+            speed_m_s=_between(rng, self.speed_m_s),
+            direction_rad=rng.uniform(-math.pi, math.pi),
+            offset_m=rng.uniform(-self.offset_m, self.offset_m),
+            height_m=rng.uniform(-self.height_m, self.height_m),
+        )
+
+
+def calm_start(
+    kinematics: RobotKinematics,
+    rng: np.random.Generator,
+    *,
+    half_widths_m: list[float],
+    plan_duration_s: list[float],
+    elapsed_s: float = 0.0,
+) -> Start:
+    """A start in a motion near the standing posture, as if it had been tracked well.
+
+    Args:
+        kinematics: The robot.
+        rng: Source of every draw.
+        half_widths_m: Of where the motion begins and ends, about the stance, (2,) [m].
+        plan_duration_s: Shortest and longest duration of the motion [s].
+        elapsed_s: How long the motion has lasted already [s].
+    """
+    half = np.array([*half_widths_m, 0.0])
+    nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
+    start = nominal + rng.uniform(-half, half)
+    goal = nominal + rng.uniform(-half, half)
+    duration_s = _between(rng, plan_duration_s)
+    plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
+    p_WC = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+    X_WB = RigidTransform(plan.value(0.0).ravel())
+    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
+    V_WB = np.zeros(NUM_BASE_VELOCITIES)
+    if elapsed_s < duration_s:
+        V_WB[3:] = plan.MakeDerivative().value(0.0).ravel()
+    v = resting_feet(kinematics, X_WB, joints, V_WB)
+    return Start(X_WB=X_WB, joints=joints, v=v, p_WC=p_WC, plan=plan)
+
+
+def resting_feet(
+    kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
+) -> np.ndarray:
+    """Velocities in which the base moves and the feet are at rest: 0 = J_b V_WB + J_j dq.
+
+    Args:
+        kinematics: The robot.
+        X_WB: Pose of the base.
+        joints: Joint positions, (n_j,) [rad].
+        V_WB: Spatial velocity of the base, angular first, (6,) [rad/s, m/s].
+
+    Returns:
+        The velocities, (n_v,); joints that move no foot are at rest.
+    """
+    J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
+    J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
+    rates, *_ = np.linalg.lstsq(J_joints, -J_base @ V_WB, rcond=1e-6)
+    return np.concatenate([V_WB, rates])
+
+
+def _check_range(who: str, name: str, bounds: list[float]) -> None:
+    if len(bounds) != 2 or not bounds[0] <= bounds[1]:
+        raise ValueError(f"{who}: {name} must be [lowest, highest]; got {bounds}")
+
+
+def _check_size(who: str, name: str, values: list[float], size: int) -> None:
+    if len(values) != size:
+        raise ValueError(f"{who}: {name} must be {size} numbers, along x, y, ...; got {values}")
+
+
+def _between(rng: np.random.Generator, bounds: list[float]) -> float:
+    low, high = bounds
+    return rng.uniform(low, high)

@@ -1,0 +1,81 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.embedding_figure import embedding_figure
+from drake_safety.learning.beliefs import from_scores, fuse_cells
+from drake_safety.learning.grid import Grid
+from drake_safety.learning.segments import split
+from lip_episodes import make_episodes
+
+
+class StandIn:
+    """An assessment whose embedding is the pendulum's horizontal position."""
+
+    def __init__(self, episodes):
+        self.info_ = episodes.info
+        self.parameters = SimpleNamespace(
+            horizon=episodes.info.horizon, discount=0.99, initial_uncertainty=0.3
+        )
+        self.grid_ = Grid(resolution=6, cell_length=0.1)
+        segments = split(episodes, stride=1, discount=0.99)
+        self.training_points_ = segments.state[None, :, :2]
+        masses = from_scores(segments.score, 0.3, segments.cause, 2)
+        cells = self.grid_.locate(self.training_points_[0])
+        self.beliefs_ = fuse_cells(masses, cells, num_cells=36, min_count=5)[None]
+
+    def predict(self, state, desired_preview, features):
+        return SimpleNamespace(embedding=state[:, :2])
+
+
+@pytest.fixture(scope="module")
+def assessment():
+    return StandIn(make_episodes(60, seed=0))
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return make_episodes(20, seed=5)
+
+
+def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fresh):
+    left, middle, *_ = embedding_figure(assessment, fresh).axes
+    segments = split(fresh, stride=5, discount=0.99)
+    drawn = left.collections[-1]
+    order = np.lexsort(drawn.get_offsets().T)
+    expected = np.lexsort(segments.state[:, :2].T)
+    np.testing.assert_allclose(drawn.get_offsets()[order], segments.state[expected, :2], rtol=1e-12)
+    np.testing.assert_allclose(np.sort(drawn.get_array()), np.sort(segments.score))
+    points = assessment.training_points_[0]
+    inside = np.abs(points).max(axis=1) < assessment.grid_.half_width
+    assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
+
+
+def test_empty_cells_are_hatched_and_the_others_show_their_belief(assessment, fresh):
+    middle = embedding_figure(assessment, fresh).axes[1]
+    hollow, filled = middle.collections[:2]
+    is_empty = assessment.beliefs_[0, :, 2] == 1.0
+    assert 0 < is_empty.sum() < 36
+    assert len(hollow.get_paths()) == is_empty.sum()
+    assert hollow.get_hatch()
+    # Bluer where safer: the blue share grows with the belief.
+    colours = filled.get_facecolor()
+    safest, least = (
+        np.argmax(assessment.beliefs_[0, ~is_empty, 0]),
+        np.argmin(assessment.beliefs_[0, ~is_empty, 0]),
+    )
+    assert colours[safest, 2] > colours[safest, 0]
+    assert colours[least, 0] > colours[least, 2]
+
+
+def test_the_right_panel_shows_causes_or_uncertainty_of_the_beliefs_given(assessment, fresh):
+    vacuous = assessment.beliefs_.copy()
+    vacuous[...] = 0.0
+    vacuous[..., 2] = 1.0
+    right = embedding_figure(assessment, fresh, beliefs=vacuous, right="uncertainty").axes[2]
+    assert len(right.collections[0].get_paths()) == 36
+    legend = embedding_figure(assessment, fresh).axes[2].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["support", "height"]
+    with pytest.raises(ValueError, match="right is 'mu', expected 'causes' or 'uncertainty'"):
+        embedding_figure(assessment, fresh, right="mu")

@@ -1,0 +1,121 @@
+"""Starts, plans and throws lie in their ranges, and feet stand still while the base moves."""
+
+import numpy as np
+import pytest
+
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES
+from drake_safety.simulation.sampling import (
+    PushSampling,
+    StartSampling,
+    calm_start,
+    resting_feet,
+)
+from legged_robots import ROBOT_NAMES, robot_kinematics
+
+
+def sampling_for(kinematics):
+    """The default ranges, about the robot's own height."""
+    height = kinematics.standing_height
+    band = [0.9 * height, height]
+    return StartSampling(base_height_m=band, target_height_m=band, foot_offset_m=0.01)
+
+
+def contact_velocities(kinematics, start):
+    q = kinematics.positions_at(start.X_WB, start.joints)
+    return kinematics.contact_jacobian(q) @ start.v
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_base_moves_and_the_feet_stand_on_the_ground_at_rest(name):
+    kinematics = robot_kinematics(name)
+    sampling = sampling_for(kinematics)
+    sampling.joint_std_rad = 0.0  # It would lift the feet, by design.
+    sampling.foot_offset_m = 0.0  # Points of one foot move on their own: no flat foot fits them.
+    start = sampling.sample(kinematics, np.random.default_rng(0))
+    q = kinematics.positions_at(start.X_WB, start.joints)
+    np.testing.assert_allclose(kinematics.contact_positions(q), start.p_WC, atol=2e-3)
+    np.testing.assert_array_equal(start.p_WC[:, 2], kinematics.foot_radii)
+    assert np.abs(start.v[:NUM_BASE_VELOCITIES]).max() > 0.05
+    np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
+
+
+def test_the_plan_begins_at_the_base_and_ends_in_the_ranges():
+    kinematics = robot_kinematics(ROBOT_NAMES[0])
+    sampling = sampling_for(kinematics)
+    sampling.foot_offset_m = 0.0
+    for seed in range(5):
+        start = sampling.sample(kinematics, np.random.default_rng(seed))
+        # With the feet in their nominal places the stance frame is the world's.
+        np.testing.assert_allclose(
+            start.plan.value(0.0).ravel(), start.X_WB.translation(), atol=1e-9
+        )
+        low, high = sampling.plan_duration_s
+        assert low <= start.plan.end_time() <= high
+        goal = start.plan.value(start.plan.end_time()).ravel()
+        offset = np.abs(goal[:2] - kinematics.nominal_base_offset)
+        assert np.all(offset <= sampling.target_offset_m)
+        assert sampling.target_height_m[0] <= goal[2] <= sampling.target_height_m[1]
+
+
+def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity():
+    kinematics = robot_kinematics(ROBOT_NAMES[0])
+    options = {"half_widths_m": [0.05, 0.03], "plan_duration_s": [1.0, 1.0]}
+    for elapsed_s in (0.0, 0.4, 2.0):
+        rng = np.random.default_rng(1)
+        start = calm_start(kinematics, rng, elapsed_s=elapsed_s, **options)
+        assert start.plan.start_time() == -elapsed_s
+        np.testing.assert_allclose(start.X_WB.translation(), start.plan.value(0.0).ravel())
+        np.testing.assert_array_equal(start.v[:3], 0.0)
+        np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
+        is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
+        assert is_moving == (0.0 < elapsed_s < 1.0)
+
+
+def test_feet_at_rest_need_no_joint_rates_when_the_base_is_at_rest():
+    kinematics = robot_kinematics(ROBOT_NAMES[0])
+    start = sampling_for(kinematics).sample(kinematics, np.random.default_rng(2))
+    v = resting_feet(kinematics, start.X_WB, start.joints, np.zeros(NUM_BASE_VELOCITIES))
+    np.testing.assert_array_equal(v, 0.0)
+
+
+def test_the_same_generator_gives_the_same_start_and_another_one_another():
+    kinematics = robot_kinematics(ROBOT_NAMES[0])
+    sampling = sampling_for(kinematics)
+    one, same, other = (
+        sampling.sample(kinematics, np.random.default_rng(seed)) for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(one.v, same.v)
+    np.testing.assert_array_equal(one.joints, same.joints)
+    assert not np.allclose(one.v, other.v)
+
+
+def test_random_throws_lie_in_their_ranges():
+    push = PushSampling(offset_m=0.05)
+    rng = np.random.default_rng(3)
+    throws = [push.sample(rng, 0.7) for _ in range(200)]
+    for name, (low, high) in {
+        "mass_kg": push.mass_kg,
+        "speed_m_s": push.speed_m_s,
+        "offset_m": (-0.05, 0.05),
+        "height_m": (-push.height_m, push.height_m),
+        "direction_rad": (-np.pi, np.pi),
+    }.items():
+        values = np.array([getattr(throw, name) for throw in throws])
+        assert low <= values.min() and values.max() <= high
+        assert values.max() - values.min() > 0.9 * (high - low)
+    assert {throw.time_s for throw in throws} == {0.7}
+
+
+@pytest.mark.parametrize(
+    ("sampling", "change", "message"),
+    [
+        (StartSampling, {"base_height_m": [0.4]}, r"start: base_height_m must be \[lowest, high"),
+        (StartSampling, {"plan_duration_s": [2, 1]}, r"plan_duration_s must be .*; got \[2, 1\]"),
+        (StartSampling, {"velocity_std_m_s": [0.1]}, "velocity_std_m_s must be 3 numbers"),
+        (PushSampling, {"mass_kg": [1, 2, 3]}, r"push: mass_kg must be .*; got \[1, 2, 3\]"),
+        (PushSampling, {"share": 1.5}, r"push: share must be in \[0, 1\]; got 1.5"),
+    ],
+)
+def test_ranges_that_are_none_are_refused(sampling, change, message):
+    with pytest.raises(ValueError, match=message):
+        sampling(**change)

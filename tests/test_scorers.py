@@ -1,0 +1,62 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.baselines import KINDS
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer, classifier_scorers
+from drake_safety.learning.segments import split
+from lip_episodes import make_episodes
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes(40, seed=3, noise=0.05)
+
+
+class StandIn:
+    """An assessment that takes the first column of what it sees for its belief of safe."""
+
+    def __init__(self, uses_features):
+        self.uses_features = uses_features
+        self.parameters = SimpleNamespace(is_sharpened=uses_features)
+
+    def predict(self, state, desired_preview, features):
+        assert (features is not None) == self.uses_features
+        return SimpleNamespace(safety_probability=state[:, 0], normalized=2.0 * state[:, 0])
+
+
+def test_the_unsafe_score_is_what_the_probability_of_safety_leaves(episodes):
+    segments = split(episodes, stride=1, discount=1.0)
+    blurred, clear = (
+        Scorer(name="position", probability=lambda state, *_: state[:, 0], uses_true_state=is_true)
+        for is_true in (False, True)
+    )
+    np.testing.assert_array_equal(blurred.unsafe_score(segments), 1.0 - segments.state[:, 0])
+    np.testing.assert_array_equal(clear.unsafe_score(segments), 1.0 - segments.true_state[:, 0])
+
+
+@pytest.mark.parametrize("uses_features", [True, False])
+def test_gamma_scores_literally_or_normalised_on_what_its_mode_sees(episodes, uses_features):
+    segments = split(episodes, stride=1, discount=1.0)
+    literal, normalised = (
+        assessment_scorer("gamma", StandIn(uses_features), is_normalized=is_normalized)
+        for is_normalized in (False, True)
+    )
+    # The paper's mode has no noise in its data.
+    assert literal.uses_true_state is not uses_features
+    inputs = (segments.state, segments.desired_preview, segments.features)
+    np.testing.assert_array_equal(
+        2.0 * literal.probability(*inputs), normalised.probability(*inputs)
+    )
+
+
+def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(episodes):
+    reports = []
+    scorers = classifier_scorers(episodes, lambda *report: reports.append(report))
+    assert [scorer.name for scorer in scorers] == list(KINDS)
+    assert [done for _, done, _ in reports] == list(range(len(KINDS) + 1))
+    segments = split(episodes, stride=1, discount=1.0)
+    for scorer in scorers:
+        score = scorer.unsafe_score(segments)
+        assert score[segments.is_unsafe].mean() > score[~segments.is_unsafe].mean()

@@ -1,0 +1,80 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from drake_safety.evaluation.figure_style import RECOVERY_COLOUR
+from drake_safety.evaluation.timeline_figure import timeline_figure
+
+
+@pytest.fixture
+def run():
+    time_s = np.arange(0.0, 2.0, 0.02)
+    gamma = np.where(time_s < 1.0, 0.9, 0.2)
+    belief = np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(len(gamma), 0.3)])
+    margins = np.column_stack([0.1 - 0.1 * time_s, np.full(len(time_s), 0.05)])
+    return {
+        "time_s": time_s,
+        "gamma": gamma,
+        "threshold": 0.6,
+        "throws": [SimpleNamespace(time_s=0.98, mass_kg=3.0, speed_m_s=8.0)],
+        "trigger_times_s": [1.0],
+        "recovery_intervals_s": [(1.0, 1.6)],
+        "stills": [(0.5, np.zeros((6, 8, 3), np.uint8)), (1.2, np.full((6, 8, 3), 255, np.uint8))],
+        "belief": belief,
+        "margins": margins,
+        "constraint_names": ["support_polygon", "height"],
+    }
+
+
+def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
+    fig = timeline_figure(**run)
+    fig.draw_without_rendering()
+    stills, gamma = fig.axes[:2], fig.axes[2]
+    lines = [artist for artist in fig.artists if hasattr(artist, "coords2")]
+    assert len(lines) == 2
+    for line, axes, instant, value in zip(lines, stills, (0.5, 1.2), (0.9, 0.2), strict=True):
+        assert line.coords2 is gamma.transData
+        assert line.coords1 is axes.transAxes
+        np.testing.assert_allclose(line.xy2, (instant, value))
+    assert stills[0].get_title(loc="left") == "(a)  0.50 s"
+    assert [axes.images[0].get_array().max() for axes in stills] == [0, 255]
+
+
+def test_the_timeline_marks_throw_threshold_trigger_and_recovery(run):
+    gamma = timeline_figure(**run).axes[2]
+    labels = [text.get_text() for text in gamma.texts]
+    assert {"threshold 0.6", "3.0 kg, 8.0 m/s", "trigger", "recovery steps"} <= set(labels)
+    marks = [line.get_xydata()[0].tolist() for line in gamma.lines if len(line.get_xydata()) == 1]
+    assert [1.0, 0.6] in marks
+    (span,) = [p for p in gamma.patches if to_hex(p.get_facecolor()) == RECOVERY_COLOUR]
+    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((1.0, 1.6))
+
+
+def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(run):
+    belief, margins = timeline_figure(**run).axes[3:5]
+    tops = [c.get_paths()[0].vertices[:, 1].max() for c in belief.collections]
+    np.testing.assert_allclose(tops, [0.63, 0.93, 1.0])
+    drawn = next(line for line in margins.lines if line.get_label() == "support polygon")
+    np.testing.assert_allclose(drawn.get_ydata()[0], 10.0)
+
+
+def test_the_timeline_needs_no_more_than_gamma(run):
+    fig = timeline_figure(run["time_s"], run["gamma"], 0.6)
+    assert len(fig.axes) == 1
+    gaps = np.where(run["time_s"] < 0.3, np.nan, run["gamma"])
+    timeline_figure(run["time_s"], gaps, 0.6, stills=run["stills"]).draw_without_rendering()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"belief": np.zeros((3, 3))}, "belief has 3 rows, expected 100"),
+        ({"constraint_names": ["height"]}, r"margins have 2 columns, .*\['height'\]"),
+        ({"stills": [(9.0, np.zeros((2, 2, 3)))]}, "a still at 9.0 s is outside"),
+    ],
+)
+def test_the_timeline_refuses_what_does_not_fit(run, change, message):
+    with pytest.raises(ValueError, match=message):
+        timeline_figure(**{**run, **change})
