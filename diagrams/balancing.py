@@ -28,8 +28,8 @@ from drake_safety.control.robot import (
     add_robot,
     add_to_package_map,
     apply_mass_scale,
-    by_pattern,
 )
+from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot

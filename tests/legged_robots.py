@@ -11,7 +11,7 @@ from pathlib import Path
 import yaml
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import RobotModel, load_robot_file
+from drake_safety.control.robot_model import RobotModel, load_robot_file
 from drake_safety.models import load_robot
 
 

@@ -9,15 +9,20 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.control.robot import (
-    Foot,
     PlantVariation,
-    RobotModel,
     add_robot,
     apply_mass_scale,
-    by_pattern,
-    load_robot_file,
     posture_positions,
     servo_joints,
+)
+from drake_safety.control.robot_model import (
+    Foot,
+    ReachingFrame,
+    RobotModel,
+    TaskGains,
+    WholeBody,
+    by_pattern,
+    load_robot_file,
 )
 from drake_safety.models import load_robot, robot_names
 from legged_robots import ROBOT_NAMES, robot_model, write_biped, write_hexapod
@@ -104,6 +109,118 @@ def test_a_foot_on_nothing_is_answered_with_what_exists(tmp_path, key, what):
     feet["left"][key] = "flipper" if key == "body" else ["flipper"]
     with pytest.raises(ValueError, match=f"robot 'biped' has no {what} 'flipper'; it has"):
         plant_of(load_robot_file(edited(path, feet=feet)))
+
+
+def test_whole_body_gains_and_reaching_frames_are_read_by_name(tmp_path):
+    path = edited(
+        write_biped(tmp_path),
+        reaching_frames={"knee": {"body": "left_shin", "point": [0, 0, -0.1], "radius_m": 0.02}},
+        whole_body={"orientation": {"pelvis": {"weight": 7}}, "posture": {"damping": 3.0}},
+    )
+    robot = load_robot_file(path)
+    assert robot.reaching_frame("knee").body == "left_shin"
+    tasks = robot.whole_body.tasks()
+    assert tasks["orientation.pelvis"].weight == 7
+    assert tasks["posture"].damping == 3.0
+    # What the file leaves out is as by default.
+    assert tasks["posture"].weight == WholeBody().posture.weight
+    assert tasks["center_of_mass"] == WholeBody().center_of_mass
+    plant_of(robot)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"whole_body": {"com": {}}}, r"unknown key 'whole_body\.com'.*'center_of_mass'"),
+        (
+            {"whole_body": {"reaching": {"wieght": 1}}},
+            r"unknown key 'whole_body\.reaching\.wieght'.*'weight'",
+        ),
+        (
+            {"whole_body": {"orientation": {"pelvis": {"gain": 1}}}},
+            r"unknown key 'whole_body\.orientation\.pelvis\.gain'.*'stiffness'",
+        ),
+        (
+            {"reaching_frames": {"left": {"bodie": "left_shin"}}},
+            r"unknown key 'reaching_frames\.left\.bodie'.*'body'",
+        ),
+        (
+            {"whole_body": {"orientation": {"pelvis": {"weight": -1}}}},
+            r"whole_body\.orientation\.pelvis\.weight must be finite and not negative; got -1",
+        ),
+        (
+            {"whole_body": {"friction": 0.0}},
+            r"whole_body\.friction must be finite and positive; got 0",
+        ),
+        (
+            {"reaching_frames": {"left": {"body": "left_shin", "point": [0, 1]}}},
+            r"reaching frame 'left': point must be \[x, y, z\]; got \[0.0, 1.0\]",
+        ),
+        ({"mirror": {"(": "x"}}, r"mirror pattern '\(' is not a regular expression"),
+    ],
+)
+def test_whole_body_names_and_values_that_do_not_fit_are_answered_with_what_does(
+    tmp_path, change, message
+):
+    with pytest.raises(ValueError, match=message):
+        load_robot_file(edited(write_biped(tmp_path), **change))
+
+
+def test_gains_of_a_constructor_are_validated_like_those_of_a_file():
+    with pytest.raises(ValueError, match=r"whole_body\.posture\.damping"):
+        WholeBody(posture=TaskGains(damping=float("nan")))
+    with pytest.raises(ValueError, match="reaching frame 'left': radius_m must be finite"):
+        RobotModel(name="mine", reaching_frames={"left": ReachingFrame(radius_m=-1.0)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"whole_body": {"orientation": {"head": {}}}},
+            "robot 'biped' has no body 'head'; it has .*pelvis",
+        ),
+        (
+            {"reaching_frames": {"left": {"body": "hand"}}},
+            "robot 'biped' has no body 'hand'; it has .*pelvis",
+        ),
+        (
+            {"reaching_frames": {"left": {"body": "left_shin", "joints": ["elbow"]}}},
+            "robot 'biped' has no joint 'elbow'; it has .*left_knee",
+        ),
+        ({"mirror": {"arm": "leg"}}, "no joint for mirror pattern 'arm'; it has .*left_knee"),
+        (
+            {"mirror": {"left_(.*)": r"starboard_\1"}},
+            "no joint 'starboard_hip_z', the mirror of 'left_hip_z'; it has .*right_hip_z",
+        ),
+        (
+            {"mirror": {"left_(.*)": r"right_\2"}},
+            "mirror pattern 'left_.*' cannot be replaced by",
+        ),
+        (
+            {"mirror": {"left_(hip_x|knee)": "right_knee"}},
+            "mirror pairs joint 'right_knee' with 'left_hip_x' and with 'left_knee'",
+        ),
+    ],
+)
+def test_tasks_and_hands_of_bodies_and_joints_that_do_not_exist_are_refused_by_the_plant(
+    tmp_path, change, message
+):
+    robot = load_robot_file(edited(write_biped(tmp_path), **change))
+    with pytest.raises(ValueError, match=message):
+        plant_of(robot)
+
+
+def test_an_unknown_hand_is_answered_with_those_that_exist():
+    robot = RobotModel(name="mine", reaching_frames={"left": ReachingFrame()})
+    with pytest.raises(ValueError, match=r"robot 'mine' has no reaching frame 'tail'.*'left'"):
+        robot.reaching_frame("tail")
+
+
+def test_mirroring_pairs_joints_both_ways_and_leaves_the_others_to_themselves():
+    robot = RobotModel(name="mine", mirror={"l_(.*)": r"r_\1"})
+    partners = robot.mirror_partners(["back", "l_arm", "r_arm"])
+    assert partners == {"back": "back", "l_arm": "r_arm", "r_arm": "l_arm"}
 
 
 def test_a_pattern_matches_whole_names_only():

@@ -11,11 +11,11 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_safety.control.robot import (
     PlantVariation,
-    RobotModel,
     add_robot,
     apply_mass_scale,
     posture_positions,
 )
+from drake_safety.control.robot_model import RobotModel
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6
