@@ -1,4 +1,4 @@
-"""A robot is data: what its YAML says enters a plant, and what it misspells is named."""
+"""A robot is data: what its YAML says enters a plant, and names it lacks are refused."""
 
 import numpy as np
 import pytest
@@ -10,28 +10,14 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.control.robot import (
     PlantVariation,
+    actuation_matrix,
     add_robot,
     apply_mass_scale,
     posture_positions,
     servo_joints,
 )
-from drake_safety.control.robot_model import (
-    Foot,
-    ReachingFrame,
-    RobotModel,
-    TaskGains,
-    WholeBody,
-    by_pattern,
-    load_robot_file,
-)
-from drake_safety.models import load_robot, robot_names
-from legged_robots import ROBOT_NAMES, robot_model, write_biped, write_hexapod
-
-
-def edited(path, **changes):
-    """Rewrites keys of a robot.yaml."""
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
-    return path
+from drake_safety.control.robot_model import RobotModel, by_pattern, load_robot_file
+from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
 
 
 def plant_of(robot, variation=None):
@@ -39,52 +25,6 @@ def plant_of(robot, variation=None):
     add_robot(plant, robot, variation)
     plant.Finalize()
     return plant
-
-
-def test_every_robot_of_the_package_loads():
-    for name in robot_names():
-        assert load_robot(name).name == name
-
-
-def test_an_unknown_robot_is_answered_with_those_that_exist():
-    with pytest.raises(ValueError, match=r"robot 'nobody' does not exist.*laikago"):
-        load_robot("nobody")
-
-
-def test_a_missing_robot_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"gone\.yaml' does not exist"):
-        load_robot(str(tmp_path / "gone.yaml"))
-
-
-def test_a_misspelt_key_is_answered_with_the_keys_that_exist(tmp_path):
-    path = edited(write_hexapod(tmp_path), foot_frictoin=0.5)
-    with pytest.raises(ValueError, match=r"unknown key 'foot_frictoin'.*foot_friction"):
-        load_robot_file(path)
-
-
-def test_a_misspelt_nested_key_is_named_with_its_path(tmp_path):
-    path = edited(write_hexapod(tmp_path), joint_gains={".*": {"stiffnes": 3.0}})
-    with pytest.raises(ValueError, match=r"joint_gains\.\.\*\.stiffnes.*'stiffness'"):
-        load_robot_file(path)
-
-
-def test_values_of_a_file_are_validated_like_those_of_a_constructor(tmp_path):
-    with pytest.raises(ValueError, match="foot_friction must be positive; got -1"):
-        RobotModel(name="mine", foot_friction=-1.0)
-    with pytest.raises(ValueError, match="foot_friction must be positive; got -1"):
-        load_robot_file(edited(write_hexapod(tmp_path), foot_friction=-1.0))
-
-
-def test_contact_points_are_triples():
-    with pytest.raises(ValueError, match=r"foot 'left': contact_points must be a list of \[x, y"):
-        RobotModel(name="mine", feet={"left": Foot(contact_points=[[0.0, 0.1]])})
-
-
-def test_a_file_that_is_not_yaml_is_refused(tmp_path):
-    path = tmp_path / "robot.yaml"
-    path.write_text("name: [")
-    with pytest.raises(ValueError, match="is not YAML"):
-        load_robot_file(path)
 
 
 @pytest.mark.parametrize(
@@ -109,68 +49,6 @@ def test_a_foot_on_nothing_is_answered_with_what_exists(tmp_path, key, what):
     feet["left"][key] = "flipper" if key == "body" else ["flipper"]
     with pytest.raises(ValueError, match=f"robot 'biped' has no {what} 'flipper'; it has"):
         plant_of(load_robot_file(edited(path, feet=feet)))
-
-
-def test_whole_body_gains_and_reaching_frames_are_read_by_name(tmp_path):
-    path = edited(
-        write_biped(tmp_path),
-        reaching_frames={"knee": {"body": "left_shin", "point": [0, 0, -0.1], "radius_m": 0.02}},
-        whole_body={"orientation": {"pelvis": {"weight": 7}}, "posture": {"damping": 3.0}},
-    )
-    robot = load_robot_file(path)
-    assert robot.reaching_frame("knee").body == "left_shin"
-    tasks = robot.whole_body.tasks()
-    assert tasks["orientation.pelvis"].weight == 7
-    assert tasks["posture"].damping == 3.0
-    # What the file leaves out is as by default.
-    assert tasks["posture"].weight == WholeBody().posture.weight
-    assert tasks["center_of_mass"] == WholeBody().center_of_mass
-    plant_of(robot)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"whole_body": {"com": {}}}, r"unknown key 'whole_body\.com'.*'center_of_mass'"),
-        (
-            {"whole_body": {"reaching": {"wieght": 1}}},
-            r"unknown key 'whole_body\.reaching\.wieght'.*'weight'",
-        ),
-        (
-            {"whole_body": {"orientation": {"pelvis": {"gain": 1}}}},
-            r"unknown key 'whole_body\.orientation\.pelvis\.gain'.*'stiffness'",
-        ),
-        (
-            {"reaching_frames": {"left": {"bodie": "left_shin"}}},
-            r"unknown key 'reaching_frames\.left\.bodie'.*'body'",
-        ),
-        (
-            {"whole_body": {"orientation": {"pelvis": {"weight": -1}}}},
-            r"whole_body\.orientation\.pelvis\.weight must be finite and not negative; got -1",
-        ),
-        (
-            {"whole_body": {"friction": 0.0}},
-            r"whole_body\.friction must be finite and positive; got 0",
-        ),
-        (
-            {"reaching_frames": {"left": {"body": "left_shin", "point": [0, 1]}}},
-            r"reaching frame 'left': point must be \[x, y, z\]; got \[0.0, 1.0\]",
-        ),
-        ({"mirror": {"(": "x"}}, r"mirror pattern '\(' is not a regular expression"),
-    ],
-)
-def test_whole_body_names_and_values_that_do_not_fit_are_answered_with_what_does(
-    tmp_path, change, message
-):
-    with pytest.raises(ValueError, match=message):
-        load_robot_file(edited(write_biped(tmp_path), **change))
-
-
-def test_gains_of_a_constructor_are_validated_like_those_of_a_file():
-    with pytest.raises(ValueError, match=r"whole_body\.posture\.damping"):
-        WholeBody(posture=TaskGains(damping=float("nan")))
-    with pytest.raises(ValueError, match="reaching frame 'left': radius_m must be finite"):
-        RobotModel(name="mine", reaching_frames={"left": ReachingFrame(radius_m=-1.0)})
 
 
 @pytest.mark.parametrize(
@@ -209,23 +87,6 @@ def test_tasks_and_hands_of_bodies_and_joints_that_do_not_exist_are_refused_by_t
     robot = load_robot_file(edited(write_biped(tmp_path), **change))
     with pytest.raises(ValueError, match=message):
         plant_of(robot)
-
-
-def test_an_unknown_hand_is_answered_with_those_that_exist():
-    robot = RobotModel(name="mine", reaching_frames={"left": ReachingFrame()})
-    with pytest.raises(ValueError, match=r"robot 'mine' has no reaching frame 'tail'.*'left'"):
-        robot.reaching_frame("tail")
-
-
-def test_mirroring_pairs_joints_both_ways_and_leaves_the_others_to_themselves():
-    robot = RobotModel(name="mine", mirror={"l_(.*)": r"r_\1"})
-    partners = robot.mirror_partners(["back", "l_arm", "r_arm"])
-    assert partners == {"back": "back", "l_arm": "r_arm", "r_arm": "l_arm"}
-
-
-def test_a_pattern_matches_whole_names_only():
-    assert by_pattern({"knee": 1.0}, "left_knee", "gains", "mine") is None
-    assert by_pattern({".*knee": 1.0}, "left_knee", "gains", "mine") == 1.0
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -350,3 +211,22 @@ def test_friction_needs_a_robot_twice_as_many_actuators():
     robot = robot_model("biped")
     plain, rough = plant_of(robot), plant_of(robot, PlantVariation(joint_friction_nm=0.1))
     assert rough.num_actuators() == 2 * plain.num_actuators()
+
+
+def test_actuation_follows_the_names_of_the_joints_and_spares_friction():
+    robot = robot_model("biped")
+    plant = plant_of(robot, PlantVariation(joint_friction_nm=0.1))
+    names = sorted(servo_joints(plant, robot))
+    torque = {name: float(i + 1) for i, name in enumerate(names)}
+    actuation = actuation_matrix(plant, robot, names) @ list(torque.values())
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        is_friction = actuator.name().endswith("_friction")
+        expected = 0.0 if is_friction else torque[actuator.joint().name()]
+        assert actuation[int(index)] == expected
+
+
+def test_actuation_of_joints_that_are_not_given_is_refused():
+    robot = robot_model("biped")
+    with pytest.raises(ValueError, match=r"no joint 'right_hip_z'|no joint 'left_hip_z'"):
+        actuation_matrix(plant_of(robot), robot, ["left_knee"])

@@ -106,6 +106,10 @@ class RobotKinematics:
         quaternion = X_WB.rotation().ToQuaternion().wxyz()
         return np.concatenate([quaternion, X_WB.translation(), joints])
 
+    def standing_positions(self) -> np.ndarray:
+        """Position vector (n_q,) of the standing posture, upright at the world's origin."""
+        return self.positions_at(RigidTransform([0.0, 0.0, self.standing_height]), self.posture)
+
     def _set_positions(self, q: np.ndarray) -> None:
         # A position that is not finite would end the process inside the plant.
         if not q.dot(q) < math.inf:

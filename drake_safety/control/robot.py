@@ -64,6 +64,7 @@ class PlantVariation:
                 )
 
 
+_FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
@@ -195,7 +196,7 @@ def add_robot(
     if variation.joint_friction_nm:
         for name in actuated:
             friction = plant.AddJointActuator(
-                f"{name}_friction",
+                f"{name}{_FRICTION_SUFFIX}",
                 plant.GetJointByName(name, instance),
                 variation.joint_friction_nm,
             )
@@ -223,6 +224,36 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
         value = by_pattern(robot.posture, name, "posture", robot.name)
         positions[name] = 0.0 if value is None else float(value)
     return positions
+
+
+def actuation_matrix(
+    plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
+) -> np.ndarray:
+    """Maps joint values onto the robot's actuators, by name; friction actuators get none.
+
+    A plant with dry joint friction needs its desired state connected too (zero, or this matrix
+    twice for position servos): without one Drake disarms the servos that hold the joints.
+
+    Args:
+        plant: The finalised plant.
+        robot: The robot.
+        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
+
+    Returns:
+        (n_u, n_j), in the order of ``plant.get_actuation_input_port(instance)``.
+
+    Raises:
+        ValueError: An actuated joint is not among the names.
+    """
+    instance = plant.GetModelInstanceByName(robot.name)
+    actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
+    matrix = np.zeros((len(actuators), len(joint_names)))
+    for row, actuator in enumerate(actuators):
+        name = actuator.joint().name()
+        _require(name in joint_names, robot, "joint", name, joint_names)
+        if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
+            matrix[row, joint_names.index(name)] = 1.0
+    return matrix
 
 
 def apply_mass_scale(

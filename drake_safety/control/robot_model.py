@@ -76,7 +76,10 @@ class WholeBody:
     contact_damping: float = 40.0
     """Gain K_d of the rows that keep a contact point still, J v̇ = -J̇v - K_d J v [1/s]."""
     regularization: float = 1e-4
-    """Weight of squared accelerations and forces; it makes the solution unique."""
+    """Weight of squared accelerations, of the base too."""
+    force_regularization: float = 1e-2
+    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]: it shares the load
+    out evenly and makes the solution unique; far heavier, and the robot sags."""
     friction: float = 0.5
     """Friction coefficient that the planned contact forces respect; below the ground's own."""
 
@@ -85,7 +88,7 @@ class WholeBody:
             for name in ("weight", "stiffness", "damping"):
                 _check_not_negative(f"whole_body.{task}.{name}", getattr(gains, name))
         _check_not_negative("whole_body.contact_damping", self.contact_damping)
-        for name in ("regularization", "friction"):
+        for name in ("regularization", "force_regularization", "friction"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ValueError(f"whole_body.{name} must be finite and positive; got {value}")
