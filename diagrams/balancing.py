@@ -11,7 +11,8 @@ from pydrake.systems.primitives import MatrixGain
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot import ObservationNoise, add_robot, apply_mass_scale, by_pattern
+from drake_safety.control.robot import ObservationNoise, add_robot, apply_mass_scale
+from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files

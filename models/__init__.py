@@ -5,7 +5,8 @@ from urllib.parse import urlparse
 
 from pydrake.multibody.parsing import PackageMap
 
-from drake_safety.control.robot import RobotModel, add_to_package_map, load_robot_file
+from drake_safety.control.robot import add_to_package_map
+from drake_safety.control.robot_model import RobotModel, load_robot_file
 
 __all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]
 

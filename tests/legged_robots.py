@@ -11,7 +11,7 @@ from pathlib import Path
 import yaml
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import RobotModel, load_robot_file
+from drake_safety.control.robot_model import RobotModel, load_robot_file
 from drake_safety.models import load_robot
 
 
@@ -81,6 +81,7 @@ def write_hexapod(folder: Path) -> Path:
             "joint_gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
             "effort_limits": {".*": 40.0},
             "foot_friction": 0.9,
+            "whole_body": {"orientation": {"body": {"weight": 20.0}}},
         },
     )
 
@@ -125,8 +126,18 @@ def write_biped(folder: Path) -> Path:
             "feet": feet,
             "joint_gains": {".*": {"stiffness": 400.0, "damping": 8.0}},
             "effort_limits": {".*": 80.0},
+            "mirror": {"left_(.*)": r"right_\1"},
+            # It has no arms, so it reaches with its head.
+            "reaching_frames": {"head": {"body": "pelvis", "point": [0.0, 0.0, 0.25]}},
+            "whole_body": {"orientation": {"pelvis": {"weight": 20.0}}},
         },
     )
+
+
+def edited(path, **changes):
+    """Rewrites keys of a robot.yaml."""
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
+    return path
 
 
 ROBOT_NAMES = ("laikago", "hexapod", "biped")

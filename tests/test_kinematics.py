@@ -7,7 +7,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
-from drake_safety.control.robot import PlantVariation, RobotModel, add_robot, load_robot_file
+from drake_safety.control.robot import PlantVariation, add_robot
+from drake_safety.control.robot_model import RobotModel, load_robot_file
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model, write_hexapod
 
 G = 9.81
@@ -35,7 +36,7 @@ def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinemat
     J = kinematics.contact_jacobian(q)
     for _ in range(4):
         v = rng.normal(size=kinematics.num_velocities)
-        kinematics.contact_positions(q)  # Sets the Context whose map turns v into q̇.
+        kinematics.set_positions(q)  # The Context whose map turns v into q̇.
         qdot = kinematics.plant.MapVelocityToQDot(kinematics.context, v)
         step = 1e-6
         ahead = kinematics.contact_positions(q + step * qdot)

@@ -1,468 +1,259 @@
-"""The models agree with the figures their makers published.
+"""The robots' models agree with the figures their makers published.
 
-Published figures: unitreerobotics/unitree_ros, robots/laikago_description/urdf/laikago.urdf.
-Inertias are about the link's centre of mass, in the order ixx, iyy, izz, ixy, ixz, iyz.
+The figures stand in ``laikago_figures.py`` and ``atlas_figures.py``, the mechanics that they are
+put into in ``published_robots.py``: plain numpy over every published link, fixed ones by
+themselves.
 """
 
-import itertools
-from collections.abc import Sequence
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
-from pydrake.geometry import GeometryId, HalfSpace, QueryObject, Role
-from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    RevoluteJoint,
-    RigidBody,
-    RotationalInertia,
-    SpatialInertia,
-    WeldJoint,
-)
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.math import RigidTransform, RotationMatrix
 
-MODELS = Path(__file__).resolve().parent.parent / "models"
-Triple = tuple[float, float, float]
-LinkFigures = tuple[float, Triple, tuple[float, float, float, float, float, float]]
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.models import load_robot, robot_names
+from package_models import PUBLISHED, Scene
 
-LAIKAGO = "package://drake_safety_models/laikago/laikago.urdf"
-
-LEGS = ("FR", "FL", "RR", "RL")
-LINKS = ("hip", "thigh", "calf")
-STANDING = (0.0, 0.67, -1.3)
-FOOT_RADIUS = 0.0265
-FOOT_IN_CALF = (0.0, 0.0, -0.25)
-TOTAL_MASS = 25.433
-
-TRUNK = (
-    13.733,
-    (0.002284, -4.1e-05, 0.025165),
-    (0.073348887, 0.250684593, 0.254469458, 0.00030338, 0.001918218, -7.5402e-05),
-)
-HIP = {
-    "FR": (
-        1.096,
-        (-0.001568, 0.008134, 0.000864),
-        (0.000822113, 0.000983196, 0.000864753, 4.982e-06, -3.672e-05, -2.811e-06),
-    ),
-    "FL": (
-        1.096,
-        (-0.001568, -0.008134, 0.000864),
-        (0.000822113, 0.000983196, 0.000864753, -4.982e-06, -3.672e-05, 2.811e-06),
-    ),
-    "RR": (
-        1.096,
-        (0.001568, 0.008134, 0.000864),
-        (0.000822113, 0.000983196, 0.000864753, -4.982e-06, 3.672e-05, -2.811e-06),
-    ),
-    "RL": (
-        1.096,
-        (0.001568, -0.008134, 0.000864),
-        (0.000822113, 0.000983196, 0.000864753, 4.982e-06, 3.672e-05, 2.811e-06),
-    ),
-}
-RIGHT_THIGH = (
-    1.528,
-    (-0.000482, -0.02001, -0.031996),
-    (0.00991611, 0.009280083, 0.00178256, -1.0388e-05, 0.000250428, 8.511e-05),
-)
-LEFT_THIGH = (
-    1.528,
-    (-0.000482, 0.02001, -0.031996),
-    (0.00991611, 0.009280083, 0.00178256, 1.0388e-05, 0.000250428, -8.511e-05),
-)
-THIGH = {"FR": RIGHT_THIGH, "FL": LEFT_THIGH, "RR": RIGHT_THIGH, "RL": LEFT_THIGH}
-CALF = (
-    0.241,
-    (-0.002196, -0.000381, -0.12338),
-    (0.006181961, 0.006196546, 3.4774e-05, 2.37e-07, -2.985e-06, 5.138e-06),
-)
-FOOT = (0.06, (0.0, 0.0, 0.0), (1.6854e-05, 1.6854e-05, 1.6854e-05, 0.0, 0.0, 0.0))
-
-HIP_ORIGIN = {
-    "FR": (0.21935, -0.0875, 0.0),
-    "FL": (0.21935, 0.0875, 0.0),
-    "RR": (-0.21935, -0.0875, 0.0),
-    "RL": (-0.21935, 0.0875, 0.0),
-}
-THIGH_ORIGIN = {
-    "FR": (0.0, -0.037, 0.0),
-    "FL": (0.0, 0.037, 0.0),
-    "RR": (0.0, -0.037, 0.0),
-    "RL": (0.0, 0.037, 0.0),
-}
-CALF_ORIGIN = (0.0, 0.0, -0.25)
-
-RIGHT_HIP_RANGE = (-1.0471975512, 0.872664625997)
-LEFT_HIP_RANGE = (-0.872664625997, 1.0471975512)
-HIP_RANGE = {
-    "FR": RIGHT_HIP_RANGE,
-    "FL": LEFT_HIP_RANGE,
-    "RR": RIGHT_HIP_RANGE,
-    "RL": LEFT_HIP_RANGE,
-}
-THIGH_RANGE = (-0.523598775598, 3.92699081699)
-CALF_RANGE = (-2.77507351067, -0.610865238198)
-EFFORT = {"hip": 20.0, "thigh": 55.0, "calf": 55.0}
-SPEED = {"hip": 52.4, "thigh": 28.6, "calf": 28.6}
-
-SAMPLED_LOWER = np.array([-0.4, 0.2, -2.0])
-SAMPLED_UPPER = np.array([0.4, 1.3, -0.7])
+ROBOTS = sorted(PUBLISHED)
 
 
-def package_parser(plant: MultibodyPlant) -> Parser:
-    """Returns a parser that knows the models' package and takes every warning for an error."""
-    parser = Parser(plant)
-    parser.SetStrictParsing()
-    parser.package_map().Add("drake_safety_models", str(MODELS))
-    return parser
-
-
-class Scene:
-    """Laikago in the standing pose, the trunk's frame 0.4245 m above a flat ground."""
-
-    def __init__(self) -> None:
-        builder = DiagramBuilder()
-        self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
-        package_parser(self.plant).AddModelsFromUrl(LAIKAGO)
-        self.plant.RegisterCollisionGeometry(
-            self.plant.world_body(),
-            RigidTransform(),
-            HalfSpace(),
-            "ground",
-            CoulombFriction(0.6, 0.6),
-        )
-        self.plant.Finalize()
-        self.diagram = builder.Build()
-        self.root = self.diagram.CreateDefaultContext()
-        self.context = self.plant.GetMyMutableContextFromRoot(self.root)
-        self.set_trunk_height(0.4245)
-        for leg in LEGS:
-            self.set_leg(leg, STANDING)
-
-    def set_trunk_height(self, height: float) -> None:
-        X_WT = RigidTransform([0.0, 0.0, height])
-        self.plant.SetFreeBodyPose(self.context, self.plant.GetBodyByName("trunk"), X_WT)
-
-    def set_leg(self, leg: str, angles: Sequence[float] | np.ndarray) -> None:
-        for link, angle in zip(LINKS, angles, strict=True):
-            self.plant.GetJointByName(f"{leg}_{link}_joint").set_angle(self.context, angle)
-
-    def pose(self, frame: str) -> RigidTransform:
-        return self.plant.GetFrameByName(frame).CalcPoseInWorld(self.context)
-
-    def query(self) -> QueryObject:
-        context = self.scene_graph.GetMyContextFromRoot(self.root)
-        return self.scene_graph.get_query_output_port().Eval(context)
-
-    def geometry_name(self, geometry: GeometryId) -> str:
-        """The geometry's body and name, as in `FR_calf/foot`."""
-        inspector = self.scene_graph.model_inspector()
-        body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-        return f"{body.name()}/{inspector.GetName(geometry).split('::')[-1]}"
-
-    def touching(self) -> set[tuple[str, ...]]:
-        """The sorted names of every pair of geometries that penetrate each other."""
-        return {
-            tuple(sorted((self.geometry_name(pair.id_A), self.geometry_name(pair.id_B))))
-            for pair in self.query().ComputePointPairPenetration()
-        }
+@pytest.fixture(scope="module", params=ROBOTS)
+def name(request) -> str:
+    return request.param
 
 
 @pytest.fixture
-def scene() -> Scene:
-    return Scene()
+def scene(name) -> Scene:
+    return Scene(name)
 
 
-def spatial_inertia(figures: LinkFigures) -> SpatialInertia:
-    mass, p_BBcm_B, moments = figures
-    return SpatialInertia.MakeFromCentralInertia(mass, p_BBcm_B, RotationalInertia(*moments))
+def random_configuration(scene: Scene, rng: np.random.Generator):
+    """A base pose of any orientation and joints anywhere within their limits, set in the scene."""
+    published = scene.published
+    quaternion = rng.normal(size=4)
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    R_WB = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    p_WB = rng.normal(size=3)
+    limits = {joint: published.joints[joint].limits for joint in published.movable}
+    positions = {joint: rng.uniform(lower, upper) for joint, (lower, upper) in limits.items()}
+    scene.set_base(RigidTransform(RotationMatrix(R_WB), p_WB))
+    scene.set_joints(positions)
+    return (R_WB, p_WB), positions
 
 
-def published_plant() -> MultibodyPlant:
-    """The published links one by one, every foot a body of its own, welded to its calf."""
-    plant = MultibodyPlant(0.001)
+def test_every_robot_of_the_package_is_compared_with_its_published_figures():
+    assert robot_names() == ROBOTS
 
-    def add_link(name: str, figures: LinkFigures) -> RigidBody:
-        return plant.AddRigidBody(name, spatial_inertia(figures))
 
-    def add_joint(
-        name: str, parent: RigidBody, p_PJ: Triple, child: RigidBody, axis: Triple
-    ) -> None:
-        origin = FixedOffsetFrame(f"{name}_origin", parent.body_frame(), RigidTransform(p_PJ))
-        plant.AddJoint(
-            RevoluteJoint(name, plant.AddFrame(origin), child.body_frame(), np.array(axis))
+def test_the_robot_weighs_what_is_published(scene):
+    published = scene.published
+    assert scene.plant.CalcTotalMass(scene.context, [scene.instance]) == pytest.approx(
+        published.total_mass, abs=1e-9
+    )
+    # The sum of the copied links, so that none of them was forgotten.
+    copied = sum(link.mass for link in published.links.values())
+    assert copied == pytest.approx(published.total_mass, abs=1e-9)
+
+
+def test_a_body_moves_for_each_published_joint_and_the_base_floats(scene):
+    assert sorted(scene.bodies) == sorted(scene.published.bodies)
+    assert scene.base.is_floating_base_body()
+    num_joints = len(scene.published.movable)
+    assert scene.plant.num_positions() == 7 + num_joints
+    assert scene.plant.num_velocities() == 6 + num_joints
+
+
+def test_each_body_has_the_inertia_of_all_links_that_are_fixed_to_it(scene):
+    for body_name, body in scene.bodies.items():
+        M_BBo_B = body.default_spatial_inertia()
+        mass, moment, inertia = scene.published.body_inertia(body_name)
+        assert M_BBo_B.get_mass() == pytest.approx(mass, rel=1e-13), body_name
+        np.testing.assert_allclose(
+            M_BBo_B.get_mass() * M_BBo_B.get_com(), moment, rtol=0, atol=1e-12, err_msg=body_name
         )
-
-    trunk = add_link("trunk", TRUNK)
-    for leg in LEGS:
-        hip = add_link(f"{leg}_hip", HIP[leg])
-        thigh = add_link(f"{leg}_thigh", THIGH[leg])
-        calf = add_link(f"{leg}_calf", CALF)
-        foot = add_link(f"{leg}_foot", FOOT)
-        add_joint(f"{leg}_hip_joint", trunk, HIP_ORIGIN[leg], hip, (1.0, 0.0, 0.0))
-        add_joint(f"{leg}_thigh_joint", hip, THIGH_ORIGIN[leg], thigh, (0.0, 1.0, 0.0))
-        add_joint(f"{leg}_calf_joint", thigh, CALF_ORIGIN, calf, (0.0, 1.0, 0.0))
-        weld = WeldJoint(
-            f"{leg}_foot_fixed",
-            calf.body_frame(),
-            foot.body_frame(),
-            RigidTransform(FOOT_IN_CALF),
+        np.testing.assert_allclose(
+            M_BBo_B.CalcRotationalInertia().CopyToFullMatrix3(),
+            inertia,
+            rtol=0,
+            atol=1e-12,
+            err_msg=body_name,
         )
-        plant.AddJoint(weld)
-    plant.Finalize()
-    return plant
-
-
-def velocity_order(plant: MultibodyPlant) -> list[int]:
-    """Indices into v: the trunk's six, then the joints leg by leg."""
-    start = plant.GetBodyByName("trunk").floating_velocities_start_in_v()
-    joints = [plant.GetJointByName(f"{leg}_{link}_joint") for leg in LEGS for link in LINKS]
-    return [*range(start, start + 6), *(joint.velocity_start() for joint in joints)]
-
-
-def test_laikago_weighs_what_is_published(scene: Scene) -> None:
-    assert scene.plant.CalcTotalMass(scene.context) == pytest.approx(TOTAL_MASS, abs=1e-9)
-
-
-def test_each_body_has_its_published_mass_and_the_calf_carries_the_foot(scene: Scene) -> None:
-    expected = {"trunk": 13.733}
-    for leg in LEGS:
-        expected |= {f"{leg}_hip": 1.096, f"{leg}_thigh": 1.528, f"{leg}_calf": 0.241 + 0.06}
-    laikago = scene.plant.GetModelInstanceByName("laikago")
-    bodies = [scene.plant.get_body(index) for index in scene.plant.GetBodyIndices(laikago)]
-    masses = {body.name(): body.default_mass() for body in bodies}
-    assert masses == pytest.approx(expected, abs=1e-12)
-
-
-def test_trunk_hips_and_thighs_have_their_published_inertias(scene: Scene) -> None:
-    published = {"trunk": TRUNK}
-    for leg in LEGS:
-        published |= {f"{leg}_hip": HIP[leg], f"{leg}_thigh": THIGH[leg]}
-    for name, figures in published.items():
-        M_BBo_B = scene.plant.GetBodyByName(name).default_spatial_inertia().CopyToFullMatrix6()
-        expected = spatial_inertia(figures).CopyToFullMatrix6()
-        np.testing.assert_allclose(M_BBo_B, expected, rtol=0.0, atol=1e-14, err_msg=name)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_mass_matrix_equals_that_of_the_published_links_with_welded_feet(
-    scene: Scene, seed: int
-) -> None:
-    published = published_plant()
-    context = published.CreateDefaultContext()
-    rng = np.random.default_rng(seed)
-    X_WT = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, size=3)), rng.normal(size=3))
-    scene.plant.SetFreeBodyPose(scene.context, scene.plant.GetBodyByName("trunk"), X_WT)
-    published.SetFreeBodyPose(context, published.GetBodyByName("trunk"), X_WT)
-    for leg in LEGS:
-        angles = rng.uniform(SAMPLED_LOWER, SAMPLED_UPPER)
-        scene.set_leg(leg, angles)
-        for link, angle in zip(LINKS, angles, strict=True):
-            published.GetJointByName(f"{leg}_{link}_joint").set_angle(context, angle)
-    ours = velocity_order(scene.plant)
-    theirs = velocity_order(published)
+def test_mass_matrix_equals_that_of_the_published_links_each_by_itself(scene, seed):
+    X_WB, positions = random_configuration(scene, np.random.default_rng(seed))
+    order = scene.velocity_order()
     np.testing.assert_allclose(
-        scene.plant.CalcMassMatrix(scene.context)[np.ix_(ours, ours)],
-        published.CalcMassMatrix(context)[np.ix_(theirs, theirs)],
+        scene.plant.CalcMassMatrix(scene.context)[np.ix_(order, order)],
+        scene.published.mass_matrix(X_WB, positions),
         rtol=0.0,
         atol=1e-10,
     )
 
 
-@pytest.mark.parametrize("leg", LEGS)
-def test_joints_stop_move_and_push_as_published(scene: Scene, leg: str) -> None:
-    ranges = {"hip": HIP_RANGE[leg], "thigh": THIGH_RANGE, "calf": CALF_RANGE}
-    for link in LINKS:
-        joint = scene.plant.GetJointByName(f"{leg}_{link}_joint")
-        assert joint.position_lower_limit() == ranges[link][0]
-        assert joint.position_upper_limit() == ranges[link][1]
-        assert joint.velocity_lower_limit() == -SPEED[link]
-        assert joint.velocity_upper_limit() == SPEED[link]
-        assert joint.default_damping() == 0.0
-        actuator = scene.plant.GetJointActuatorByName(f"{leg}_{link}_joint")
-        assert actuator.joint().name() == joint.name()
-        assert actuator.effort_limit() == EFFORT[link]
-
-
-def test_actuators_are_the_twelve_joints_leg_by_leg(scene: Scene) -> None:
-    names = [
-        scene.plant.get_joint_actuator(index).name()
-        for index in scene.plant.GetJointActuatorIndices()
-    ]
-    assert names == [f"{leg}_{link}_joint" for leg in LEGS for link in LINKS]
-
-
-def test_standing_pose_rests_on_its_feet_at_the_published_height(scene: Scene) -> None:
-    scene.set_trunk_height(0.0)
-    soles = [scene.pose(f"{leg}_foot").translation()[2] - FOOT_RADIUS for leg in LEGS]
-    assert soles == pytest.approx([-0.4245] * 4, abs=0.001)
-    by_hand = 0.25 * np.cos(0.67) + 0.25 * np.cos(0.67 - 1.3) + FOOT_RADIUS
-    assert soles == pytest.approx([-by_hand] * 4, abs=1e-12)
-
-
-def test_foot_frames_are_the_centres_of_the_foot_spheres(scene: Scene) -> None:
-    inspector = scene.scene_graph.model_inspector()
-    for leg in LEGS:
-        calf = scene.plant.GetBodyByName(f"{leg}_calf")
-        (foot,) = [
-            geometry
-            for geometry in scene.plant.GetCollisionGeometriesForBody(calf)
-            if scene.geometry_name(geometry) == f"{leg}_calf/foot"
-        ]
-        assert inspector.GetShape(foot).radius() == FOOT_RADIUS
-        p_BF = inspector.GetPoseInFrame(foot).translation()
-        np.testing.assert_allclose(p_BF, FOOT_IN_CALF, rtol=0.0, atol=1e-12)
-        X_BF = scene.plant.GetFrameByName(f"{leg}_foot").GetFixedPoseInBodyFrame()
-        assert X_BF.IsNearlyEqualTo(RigidTransform(FOOT_IN_CALF), 1e-12)
-
-
-def test_left_legs_mirror_right_legs(scene: Scene) -> None:
-    mirror = np.diag([1.0, -1.0, 1.0])
-    rng = np.random.default_rng(0)
-    for right, left in (("FR", "FL"), ("RR", "RL")):
-        for _ in range(10):
-            hip, thigh, calf = rng.uniform(SAMPLED_LOWER, SAMPLED_UPPER)
-            scene.set_leg(right, (hip, thigh, calf))
-            scene.set_leg(left, (-hip, thigh, calf))
-            for frame in (*LINKS, "foot"):
-                X_WR = scene.pose(f"{right}_{frame}")
-                X_WL = scene.pose(f"{left}_{frame}")
-                p_expected = mirror @ X_WR.translation()
-                R_expected = mirror @ X_WR.rotation().matrix() @ mirror
-                np.testing.assert_allclose(X_WL.translation(), p_expected, rtol=0.0, atol=1e-12)
-                np.testing.assert_allclose(
-                    X_WL.rotation().matrix(), R_expected, rtol=0.0, atol=1e-12
-                )
-
-
-def test_only_the_four_feet_touch_the_ground_when_standing(scene: Scene) -> None:
-    scene.set_trunk_height(0.423)
-    assert scene.touching() == {(f"{leg}_calf/foot", "world/ground") for leg in LEGS}
-
-
-def test_nothing_touches_in_the_standing_pose(scene: Scene) -> None:
-    scene.set_trunk_height(1.0)
-    assert scene.touching() == set()
-
-
-def test_a_leg_never_touches_itself_or_the_trunk_where_legs_are_sampled(scene: Scene) -> None:
-    scene.set_trunk_height(1.0)
-    hips = np.linspace(SAMPLED_LOWER[0], SAMPLED_UPPER[0], 5)
-    thighs = np.linspace(SAMPLED_LOWER[1], SAMPLED_UPPER[1], 6)
-    calves = np.linspace(SAMPLED_LOWER[2], SAMPLED_UPPER[2], 6)
-    for leg in LEGS:
-        for angles in itertools.product(hips, thighs, calves):
-            scene.set_leg(leg, angles)
-            own = {
-                pair
-                for pair in scene.touching()
-                if all(name.startswith((leg, "trunk")) for name in pair)
-            }
-            assert own == set(), angles
-        scene.set_leg(leg, STANDING)
-
-
-def test_only_a_leg_with_itself_and_the_trunk_with_hips_and_thighs_are_filtered(
-    scene: Scene,
-) -> None:
-    candidates = {
-        frozenset(scene.geometry_name(geometry).split("/")[0] for geometry in pair)
-        for pair in scene.scene_graph.model_inspector().GetCollisionCandidates()
-    }
-    links = [f"{leg}_{link}" for leg in LEGS for link in LINKS]
-    expected = {
-        frozenset(pair) for pair in itertools.combinations(links, 2) if pair[0][:2] != pair[1][:2]
-    }
-    expected |= {frozenset(("trunk", f"{leg}_calf")) for leg in LEGS}
-    expected |= {frozenset(("world", link)) for link in ("trunk", *links)}
-    assert candidates == expected
-
-
-def test_the_calf_ends_short_of_its_foot(scene: Scene) -> None:
-    inspector = scene.scene_graph.model_inspector()
-    shapes = {
-        scene.geometry_name(geometry): geometry
-        for geometry in scene.plant.GetCollisionGeometriesForBody(
-            scene.plant.GetBodyByName("FR_calf")
-        )
-    }
-    shin, foot = shapes["FR_calf/shin"], shapes["FR_calf/foot"]
-    capsule = inspector.GetShape(shin)
-    shin_end = (
-        inspector.GetPoseInFrame(shin).translation()[2] - capsule.length() / 2 - capsule.radius()
-    )
-    foot_top = inspector.GetPoseInFrame(foot).translation()[2] + FOOT_RADIUS
-    assert shin_end > foot_top
-    assert capsule.radius() < FOOT_RADIUS
-
-
-@pytest.mark.parametrize(("right", "left"), [("FR", "FL"), ("RR", "RL")])
-def test_feet_brought_together_collide(scene: Scene, right: str, left: str) -> None:
-    scene.set_trunk_height(1.0)
-    leg_length = 0.25 * np.cos(0.67) + 0.25 * np.cos(0.67 - 1.3)
-    # The foot is under the trunk's centre line: 0.0875 + 0.037 cos(hip) = leg_length sin(hip).
-    hip = np.arcsin(0.0875 / np.hypot(leg_length, 0.037)) + np.arctan2(0.037, leg_length)
-    scene.set_leg(right, (hip, *STANDING[1:]))
-    scene.set_leg(left, (-hip, *STANDING[1:]))
-    assert scene.pose(f"{right}_foot").translation()[1] == pytest.approx(0.0, abs=1e-12)
-    assert (f"{left}_calf/foot", f"{right}_calf/foot") in scene.touching()
-
-
-def test_a_front_foot_reaching_back_collides_with_the_hind_leg(scene: Scene) -> None:
-    scene.set_trunk_height(1.0)
-    scene.set_leg("FR", (0.0, 1.3, -0.7))
-    scene.set_leg("RR", (0.0, 0.2, -2.0))
-    assert any(
-        first.startswith("FR") and second.startswith("RR") for first, second in scene.touching()
-    )
-
-
-def test_feet_grip_and_the_rest_slides_as_published(scene: Scene) -> None:
-    inspector = scene.scene_graph.model_inspector()
-    laikago = scene.plant.GetModelInstanceByName("laikago")
-    for index in scene.plant.GetBodyIndices(laikago):
-        body = scene.plant.get_body(index)
-        for geometry in scene.plant.GetCollisionGeometriesForBody(body):
-            friction = inspector.GetProximityProperties(geometry).GetProperty(
-                "material", "coulomb_friction"
+@pytest.mark.parametrize("seed", range(5))
+def test_every_frame_is_where_the_published_joints_carry_it(scene, seed):
+    X_WB, positions = random_configuration(scene, np.random.default_rng(100 + seed))
+    compared = []
+    for link, (R_WL, p_WL) in scene.published.poses(X_WB, positions).items():
+        if scene.plant.HasFrameNamed(link, scene.instance):
+            X_WL = scene.pose(link)
+            np.testing.assert_allclose(X_WL.translation(), p_WL, rtol=0, atol=1e-12, err_msg=link)
+            np.testing.assert_allclose(
+                X_WL.rotation().matrix(), R_WL, rtol=0, atol=1e-12, err_msg=link
             )
-            expected = 0.6 if scene.geometry_name(geometry).endswith("/foot") else 0.2
-            assert friction.static_friction() == expected
-            assert friction.dynamic_friction() == expected
+            compared.append(link)
+    assert set(scene.bodies) <= set(compared)
 
 
-def test_every_signed_distance_within_the_robot_can_be_computed(scene: Scene) -> None:
-    scene.set_trunk_height(1.0)
-    query = scene.query()
-    for id_A, id_B in scene.scene_graph.model_inspector().GetCollisionCandidates():
-        names = {scene.geometry_name(id_A), scene.geometry_name(id_B)}
-        if "world/ground" not in names:
-            assert query.ComputeSignedDistancePairClosestPoints(id_A, id_B).distance > 0.0, names
+def test_joints_stop_move_push_and_damp_as_published(scene):
+    for joint_name in scene.published.movable:
+        figures = scene.published.joints[joint_name]
+        joint = scene.plant.GetJointByName(joint_name)
+        assert joint.position_lower_limit() == figures.limits[0], joint_name
+        assert joint.position_upper_limit() == figures.limits[1], joint_name
+        assert joint.velocity_lower_limit() == -figures.speed, joint_name
+        assert joint.velocity_upper_limit() == figures.speed, joint_name
+        assert joint.default_damping() == figures.damping, joint_name
+        actuator = scene.plant.GetJointActuatorByName(joint_name)
+        assert actuator.joint().name() == joint_name
+        assert actuator.effort_limit() == figures.effort, joint_name
 
 
-def test_the_ball_is_a_solid_sphere_of_two_kilograms() -> None:
-    plant = MultibodyPlant(0.001)
-    package_parser(plant).AddModelsFromUrl("package://drake_safety_models/scenes/ball.sdf")
-    plant.Finalize()
-    ball = plant.GetBodyByName("ball").default_spatial_inertia()
-    assert ball.get_mass() == 2.0
-    np.testing.assert_array_equal(ball.get_com(), np.zeros(3))
-    moment = 2.0 / 5.0 * 2.0 * 0.08**2
-    np.testing.assert_allclose(
-        ball.CalcRotationalInertia().CopyToFullMatrix3(), moment * np.eye(3), rtol=0.0, atol=1e-15
+def test_actuators_are_the_joints_in_the_order_of_the_velocities(scene):
+    plant = scene.plant
+    names = [plant.get_joint_actuator(index).name() for index in plant.GetJointActuatorIndices()]
+    starts = [plant.GetJointByName(joint_name).velocity_start() for joint_name in names]
+    assert sorted(names) == sorted(scene.published.movable)
+    assert starts == sorted(starts)
+
+
+def test_robot_yaml_stands_in_the_published_posture_at_the_published_height(name):
+    published = PUBLISHED[name]
+    kinematics = RobotKinematics(load_robot(name))
+    expected = [published.posture.get(joint, 0.0) for joint in kinematics.joint_names]
+    np.testing.assert_allclose(kinematics.posture, expected, rtol=0, atol=1e-15)
+    assert kinematics.standing_height == pytest.approx(
+        published.standing_height, abs=published.standing_height_tolerance
     )
 
 
-def test_the_ground_is_only_to_be_seen() -> None:
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
-    package_parser(plant).AddModelsFromUrl("package://drake_safety_models/scenes/ground.urdf")
-    plant.Finalize()
-    inspector = scene_graph.model_inspector()
-    assert plant.num_velocities() == 0
-    assert inspector.NumGeometriesWithRole(Role.kProximity) == 0
-    assert inspector.NumGeometriesWithRole(Role.kIllustration) > 0
+def test_standing_all_soles_are_level_and_the_weight_is_between_them(name):
+    kinematics = RobotKinematics(load_robot(name))
+    q = kinematics.positions_at(
+        RigidTransform([0.0, 0.0, kinematics.standing_height]), kinematics.posture
+    )
+    p_WC = kinematics.contact_positions(q)
+    np.testing.assert_allclose(p_WC[:, 2], kinematics.foot_radii, rtol=0, atol=1e-12)
+    p_WCm = kinematics.center_of_mass(q)[:2]
+    # The contact points are the corners of a rectangle along x and y.
+    assert (p_WC[:, :2].min(axis=0) < p_WCm).all()
+    assert (p_WCm < p_WC[:, :2].max(axis=0)).all()
+
+
+def test_standing_every_joint_is_within_its_limits_and_its_torque(name):
+    kinematics = RobotKinematics(load_robot(name))
+    limits = kinematics.position_limits
+    assert (limits[:, 0] <= kinematics.posture).all()
+    assert (kinematics.posture <= limits[:, 1]).all()
+    q = kinematics.positions_at(
+        RigidTransform([0.0, 0.0, kinematics.standing_height]), kinematics.posture
+    )
+    torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
+    for joint_name, torque in zip(kinematics.joint_names, torques, strict=True):
+        assert abs(torque) < PUBLISHED[name].joints[joint_name].effort, joint_name
+
+
+def partners_of(published, names) -> dict[str, str]:
+    """Each name's partner on the other side; what stands in the middle is its own."""
+    pattern, template = published.partner
+    partners = {}
+    for one in names:
+        if match := re.fullmatch(pattern, one):
+            other = match.expand(template)
+            partners |= {one: other, other: one}
+    return {one: partners.get(one, one) for one in names}
+
+
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+def mirror_signs(scene: Scene, partners: dict[str, str]) -> dict[str, float]:
+    """By joint, its partner's angle in the mirrored posture, as a multiple of its own.
+
+    A rotation about an axis is mirrored into one about the axis' mirror image, the other way.
+    """
+    published = scene.published
+    zero = dict.fromkeys(published.movable, 0.0)
+    poses = published.poses((np.eye(3), np.zeros(3)), zero)
+
+    def axis(joint_name: str) -> np.ndarray:
+        joint = published.joints[joint_name]
+        return poses[joint.child][0] @ joint.axis
+
+    signs = {one: -float(axis(other) @ MIRROR @ axis(one)) for one, other in partners.items()}
+    assert {round(abs(sign), 9) for sign in signs.values()} == {1.0}
+    return {one: np.sign(sign) for one, sign in signs.items()}
+
+
+@pytest.mark.parametrize("mirrored", [name for name in ROBOTS if load_robot(name).mirror])
+def test_a_robot_yaml_that_mirrors_pairs_the_joints_of_the_two_sides(mirrored):
+    published = PUBLISHED[mirrored]
+    expected = partners_of(published, published.movable)
+    assert load_robot(mirrored).mirror_partners(published.movable) == expected
+    assert any(one != other for one, other in expected.items())
+
+
+def test_a_mirrored_posture_puts_every_body_where_its_partner_was(scene):
+    published = scene.published
+    partners = partners_of(published, published.movable)
+    signs = mirror_signs(scene, partners)
+    bodies = partners_of(published, published.bodies)
+    rng = np.random.default_rng(0)
+    offsets: dict[str, np.ndarray] = {}
+    scene.set_base(RigidTransform())
+    for trial in range(10):
+        positions = {
+            joint: 0.0 if trial == 0 else rng.uniform(*published.joints[joint].limits)
+            for joint in published.movable
+        }
+        scene.set_joints(positions)
+        poses = {body: scene.pose(body) for body in bodies}
+        scene.set_joints({partners[j]: signs[j] * angle for j, angle in positions.items()})
+        for one, other in bodies.items():
+            X_WP = scene.pose(other)
+            np.testing.assert_allclose(
+                X_WP.translation(), MIRROR @ poses[one].translation(), rtol=0, atol=1e-9
+            )
+            # Axes need not be each other's mirror images, but stay fixed to one another.
+            R_WM = MIRROR @ poses[one].rotation().matrix() @ MIRROR
+            R_PM = X_WP.rotation().matrix().T @ R_WM
+            np.testing.assert_allclose(
+                R_PM, offsets.setdefault(one, R_PM), rtol=0, atol=1e-9, err_msg=one
+            )
+
+
+def test_the_two_sides_have_mirrored_limits_and_equal_motors_and_masses(scene):
+    published = scene.published
+    partners = partners_of(published, published.movable)
+    signs = mirror_signs(scene, partners)
+    plant = scene.plant
+    for one, other in partners.items():
+        joint, mirrored = plant.GetJointByName(one), plant.GetJointByName(other)
+        ends = sorted(
+            signs[one] * end for end in (joint.position_lower_limit(), joint.position_upper_limit())
+        )
+        assert ends == [mirrored.position_lower_limit(), mirrored.position_upper_limit()], one
+        motors = [plant.GetJointActuatorByName(j).effort_limit() for j in (one, other)]
+        assert motors[0] == motors[1], one
+        assert joint.velocity_upper_limit() == mirrored.velocity_upper_limit(), one
+    for one, other in partners_of(published, published.bodies).items():
+        assert scene.bodies[one].default_mass() == scene.bodies[other].default_mass(), one

@@ -1,4 +1,4 @@
-"""A robot is data: what its YAML says enters a plant, and what it misspells is named."""
+"""A robot is data: what its YAML says enters a plant, and names it lacks are refused."""
 
 import numpy as np
 import pytest
@@ -9,24 +9,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.control.robot import (
-    Foot,
     PlantVariation,
-    RobotModel,
+    actuation_matrix,
     add_robot,
     apply_mass_scale,
-    by_pattern,
-    load_robot_file,
     posture_positions,
     servo_joints,
 )
-from drake_safety.models import load_robot, robot_names
-from legged_robots import ROBOT_NAMES, robot_model, write_biped, write_hexapod
-
-
-def edited(path, **changes):
-    """Rewrites keys of a robot.yaml."""
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
-    return path
+from drake_safety.control.robot_model import RobotModel, by_pattern, load_robot_file
+from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
 
 
 def plant_of(robot, variation=None):
@@ -34,52 +25,6 @@ def plant_of(robot, variation=None):
     add_robot(plant, robot, variation)
     plant.Finalize()
     return plant
-
-
-def test_every_robot_of_the_package_loads():
-    for name in robot_names():
-        assert load_robot(name).name == name
-
-
-def test_an_unknown_robot_is_answered_with_those_that_exist():
-    with pytest.raises(ValueError, match=r"robot 'nobody' does not exist.*laikago"):
-        load_robot("nobody")
-
-
-def test_a_missing_robot_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"gone\.yaml' does not exist"):
-        load_robot(str(tmp_path / "gone.yaml"))
-
-
-def test_a_misspelt_key_is_answered_with_the_keys_that_exist(tmp_path):
-    path = edited(write_hexapod(tmp_path), foot_frictoin=0.5)
-    with pytest.raises(ValueError, match=r"unknown key 'foot_frictoin'.*foot_friction"):
-        load_robot_file(path)
-
-
-def test_a_misspelt_nested_key_is_named_with_its_path(tmp_path):
-    path = edited(write_hexapod(tmp_path), joint_gains={".*": {"stiffnes": 3.0}})
-    with pytest.raises(ValueError, match=r"joint_gains\.\.\*\.stiffnes.*'stiffness'"):
-        load_robot_file(path)
-
-
-def test_values_of_a_file_are_validated_like_those_of_a_constructor(tmp_path):
-    with pytest.raises(ValueError, match="foot_friction must be positive; got -1"):
-        RobotModel(name="mine", foot_friction=-1.0)
-    with pytest.raises(ValueError, match="foot_friction must be positive; got -1"):
-        load_robot_file(edited(write_hexapod(tmp_path), foot_friction=-1.0))
-
-
-def test_contact_points_are_triples():
-    with pytest.raises(ValueError, match=r"foot 'left': contact_points must be a list of \[x, y"):
-        RobotModel(name="mine", feet={"left": Foot(contact_points=[[0.0, 0.1]])})
-
-
-def test_a_file_that_is_not_yaml_is_refused(tmp_path):
-    path = tmp_path / "robot.yaml"
-    path.write_text("name: [")
-    with pytest.raises(ValueError, match="is not YAML"):
-        load_robot_file(path)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +51,42 @@ def test_a_foot_on_nothing_is_answered_with_what_exists(tmp_path, key, what):
         plant_of(load_robot_file(edited(path, feet=feet)))
 
 
-def test_a_pattern_matches_whole_names_only():
-    assert by_pattern({"knee": 1.0}, "left_knee", "gains", "mine") is None
-    assert by_pattern({".*knee": 1.0}, "left_knee", "gains", "mine") == 1.0
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"whole_body": {"orientation": {"head": {}}}},
+            "robot 'biped' has no body 'head'; it has .*pelvis",
+        ),
+        (
+            {"reaching_frames": {"left": {"body": "hand"}}},
+            "robot 'biped' has no body 'hand'; it has .*pelvis",
+        ),
+        (
+            {"reaching_frames": {"left": {"body": "left_shin", "joints": ["elbow"]}}},
+            "robot 'biped' has no joint 'elbow'; it has .*left_knee",
+        ),
+        ({"mirror": {"arm": "leg"}}, "no joint for mirror pattern 'arm'; it has .*left_knee"),
+        (
+            {"mirror": {"left_(.*)": r"starboard_\1"}},
+            "no joint 'starboard_hip_z', the mirror of 'left_hip_z'; it has .*right_hip_z",
+        ),
+        (
+            {"mirror": {"left_(.*)": r"right_\2"}},
+            "mirror pattern 'left_.*' cannot be replaced by",
+        ),
+        (
+            {"mirror": {"left_(hip_x|knee)": "right_knee"}},
+            "mirror pairs joint 'right_knee' with 'left_hip_x' and with 'left_knee'",
+        ),
+    ],
+)
+def test_tasks_and_hands_of_bodies_and_joints_that_do_not_exist_are_refused_by_the_plant(
+    tmp_path, change, message
+):
+    robot = load_robot_file(edited(write_biped(tmp_path), **change))
+    with pytest.raises(ValueError, match=message):
+        plant_of(robot)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -233,3 +211,22 @@ def test_friction_needs_a_robot_twice_as_many_actuators():
     robot = robot_model("biped")
     plain, rough = plant_of(robot), plant_of(robot, PlantVariation(joint_friction_nm=0.1))
     assert rough.num_actuators() == 2 * plain.num_actuators()
+
+
+def test_actuation_follows_the_names_of_the_joints_and_spares_friction():
+    robot = robot_model("biped")
+    plant = plant_of(robot, PlantVariation(joint_friction_nm=0.1))
+    names = sorted(servo_joints(plant, robot))
+    torque = {name: float(i + 1) for i, name in enumerate(names)}
+    actuation = actuation_matrix(plant, robot, names) @ list(torque.values())
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        is_friction = actuator.name().endswith("_friction")
+        expected = 0.0 if is_friction else torque[actuator.joint().name()]
+        assert actuation[int(index)] == expected
+
+
+def test_actuation_of_joints_that_are_not_given_is_refused():
+    robot = robot_model("biped")
+    with pytest.raises(ValueError, match=r"no joint 'right_hip_z'|no joint 'left_hip_z'"):
+        actuation_matrix(plant_of(robot), robot, ["left_knee"])

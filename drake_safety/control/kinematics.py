@@ -12,11 +12,11 @@ from scipy.linalg.lapack import dposv
 
 from drake_safety.control.robot import (
     PlantVariation,
-    RobotModel,
     add_robot,
     apply_mass_scale,
     posture_positions,
 )
+from drake_safety.control.robot_model import RobotModel
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6
@@ -109,7 +109,16 @@ class RobotKinematics:
         quaternion = X_WB.rotation().ToQuaternion().wxyz()
         return np.concatenate([quaternion, X_WB.translation(), joints])
 
-    def _set_positions(self, q: np.ndarray) -> None:
+    def standing_positions(self) -> np.ndarray:
+        """Position vector (n_q,) of the standing posture, upright at the world's origin."""
+        return self.positions_at(RigidTransform([0.0, 0.0, self.standing_height]), self.posture)
+
+    def set_positions(self, q: np.ndarray) -> None:
+        """Sets the scratch Context, for what this class does not offer.
+
+        Raises:
+            ValueError: The positions (n_q,) are not finite.
+        """
         # A position that is not finite would end the process inside the plant.
         if not q.dot(q) < math.inf:
             raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
@@ -121,7 +130,7 @@ class RobotKinematics:
         key = q.tobytes()
         if key == self._last_contacts[0]:
             return self._last_contacts[1]
-        self._set_positions(q)
+        self.set_positions(q)
         p_WC = self._contacts()
         p_WC.flags.writeable = False
         self._last_contacts = (key, p_WC)
@@ -129,12 +138,12 @@ class RobotKinematics:
 
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
         """Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
-        self._set_positions(q)
+        self.set_positions(q)
         return self._jacobian()
 
     def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """:meth:`contact_positions` and :meth:`contact_jacobian` for the price of one pose."""
-        self._set_positions(q)
+        self.set_positions(q)
         return self._contacts(), self._jacobian()
 
     def _contacts(self) -> np.ndarray:
@@ -173,7 +182,7 @@ class RobotKinematics:
         if J is None:
             J = self.contact_jacobian(q)  # Sets the positions.
         else:
-            self._set_positions(q)
+            self.set_positions(q)
         g = self.plant.CalcGravityGeneralizedForces(self.context)
         if not is_stance.all():
             if not is_stance.any():
@@ -191,7 +200,7 @@ class RobotKinematics:
 
     def center_of_mass(self, q: np.ndarray) -> np.ndarray:
         """Centre of mass in the world, (3,) [m]."""
-        self._set_positions(q)
+        self.set_positions(q)
         return self.plant.CalcCenterOfMassPositionInWorld(self.context)
 
 

@@ -1,14 +1,10 @@
-"""A robot as data: the schema of ``robot.yaml``, and how it enters a MultibodyPlant."""
+"""How a robot.yaml enters a MultibodyPlant, and what may differ from the published robot."""
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
-import yaml
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import (
     AddContactMaterial,
     ProximityProperties,
@@ -26,66 +22,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
-_Value = TypeVar("_Value")
-
-
-@dataclass(kw_only=True)
-class Foot:
-    """One foot: the points that touch the ground, and the joints of its leg."""
-
-    body: str = ""
-    """Body that carries the contact points."""
-    contact_points: list[list[float]] = field(default_factory=list)
-    """Centres of the contact spheres in the body's frame, each (3,) [m]."""
-    radius_m: float = 0.0
-    """Radius of the contact spheres [m]."""
-    joints: list[str] = field(default_factory=list)
-    """Joints of the leg, from the base to the foot."""
-
-
-@dataclass(kw_only=True)
-class JointGains:
-    """Gains of a joint's position servo, which Drake integrates implicitly."""
-
-    stiffness: float = 0.0
-    """Proportional gain [N·m/rad]."""
-    damping: float = 0.0
-    """Derivative gain [N·m·s/rad]."""
-
-
-@dataclass(kw_only=True)
-class RobotModel:
-    """The schema of ``robot.yaml``: all that controllers and safe sets need to know of a robot."""
-
-    name: str = ""
-    urdf: str = ""
-    """``package://…`` or a path beside the YAML file; any format that Drake's Parser reads."""
-    base: str = ""
-    """Floating base body."""
-    posture: dict[str, float] = field(default_factory=dict)
-    """Standing joint positions [rad], by regular expression over joint names."""
-    feet: dict[str, Foot] = field(default_factory=dict)
-    joint_gains: dict[str, JointGains] = field(default_factory=dict)
-    """Position servo gains, by regular expression over joint names."""
-    effort_limits: dict[str, float] = field(default_factory=dict)
-    """Effort limits [N·m] of actuators that the model file lacks, by regular expression."""
-    foot_friction: float = 0.8
-    """Coulomb friction coefficient of the contact points."""
-    source_dir: str = ""
-    """Folder of the YAML file; filled in by the loader."""
-
-    def __post_init__(self) -> None:
-        for name, foot in self.feet.items():
-            points = np.asarray(foot.contact_points, dtype=float)
-            if points.ndim != 2 or points.shape[1] != 3:
-                raise ValueError(
-                    f"robot '{self.name}', foot '{name}': contact_points must be a list of "
-                    f"[x, y, z]; got {foot.contact_points}"
-                )
-        if not self.foot_friction > 0:
-            raise ValueError(
-                f"robot '{self.name}': foot_friction must be positive; got {self.foot_friction}"
-            )
+from drake_safety.control.robot_model import RobotModel, by_pattern
 
 
 @dataclass(kw_only=True)
@@ -127,88 +64,8 @@ class PlantVariation:
                 )
 
 
+_FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
-
-
-def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
-    """Reads a YAML mapping into a dataclass of dataclasses, every one of them validated.
-
-    Drake's loader assigns a file's values to an object made of defaults, so that
-    ``__post_init__`` never sees them: it runs again here, innermost dataclass first.
-
-    Args:
-        schema: The dataclass.
-        raw: What the YAML holds.
-        who: Whose data it is, for messages.
-
-    Raises:
-        ValueError: An unknown key, a value of another type, or one that validation refuses.
-    """
-    for misfit in _misfits(schema, raw, ()):
-        raise ValueError(f"{who}: {misfit}")
-    try:
-        value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw, sort_keys=False))
-        _validate(value)
-    except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
-        raise ValueError(f"{who}: {error}") from error
-    return value
-
-
-def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
-    """What a schema of nested dataclasses does not know, with what it knows there."""
-    if is_dataclass(schema):
-        hints = get_type_hints(schema)
-        known = [entry.name for entry in fields(schema)]
-        if not isinstance(raw, dict):
-            where = f"'{'.'.join(path)}'" if path else "this"
-            yield f"{where} must be a mapping with keys of {known}; got {raw}"
-            return
-        for key, value in raw.items():
-            if key in known:
-                yield from _misfits(hints[key], value, (*path, key))
-            else:
-                yield f"unknown key '{'.'.join((*path, str(key)))}'; keys there are {known}"
-    elif isinstance(raw, dict | list):
-        items = raw.items() if isinstance(raw, dict) else enumerate(raw)
-        for inner in get_args(schema):
-            if is_dataclass(inner):
-                for key, value in items:
-                    yield from _misfits(inner, value, (*path, str(key)))
-
-
-def _validate(value: Any) -> None:
-    if isinstance(value, dict | list):
-        for item in value.values() if isinstance(value, dict) else value:
-            _validate(item)
-    elif is_dataclass(value):
-        for entry in fields(value):
-            _validate(getattr(value, entry.name))
-        if hasattr(value, "__post_init__"):
-            value.__post_init__()
-
-
-def load_robot_file(path: str | Path) -> RobotModel:
-    """Reads a ``robot.yaml``.
-
-    Args:
-        path: The YAML file.
-
-    Returns:
-        The robot, its ``source_dir`` set to the file's folder.
-
-    Raises:
-        ValueError: The file does not exist or does not fit the schema.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"robot file '{path}' does not exist")
-    try:
-        raw = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"robot file '{path}' is not YAML: {error}") from error
-    robot = load_typed(RobotModel, raw, f"robot file '{path}'")
-    robot.source_dir = str(path.resolve().parent)
-    return robot
 
 
 def models_package_xml() -> Path:
@@ -226,18 +83,6 @@ def add_to_package_map(package_map: PackageMap) -> None:
     """Makes ``package://drake_safety_models/…`` known to a parser's package map."""
     if not package_map.Contains("drake_safety_models"):
         package_map.AddPackageXml(str(models_package_xml()))
-
-
-def by_pattern(patterns: dict[str, _Value], name: str, what: str, robot_name: str) -> _Value | None:
-    """The value of the only pattern that matches ``name`` in full; None when none does.
-
-    Raises:
-        ValueError: Two patterns match.
-    """
-    found = [key for key in patterns if re.fullmatch(key, name)]
-    if len(found) > 1:
-        raise ValueError(f"robot '{robot_name}': {what} of joint '{name}' matches {found}")
-    return patterns[found[0]] if found else None
 
 
 def _require(exists: bool, robot: RobotModel, what: str, name: str, known: list[str]) -> None:
@@ -318,6 +163,13 @@ def add_robot(
         _require(foot.body in bodies, robot, "body", foot.body, bodies)
         for joint_name in foot.joints:
             _require(joint_name in joints, robot, "joint", joint_name, joints)
+    for frame in robot.reaching_frames.values():
+        _require(frame.body in bodies, robot, "body", frame.body, bodies)
+        for joint_name in frame.joints:
+            _require(joint_name in joints, robot, "joint", joint_name, joints)
+    for body_name in robot.whole_body.orientation:
+        _require(body_name in bodies, robot, "body", body_name, bodies)
+    robot.mirror_partners(servo_joints(plant, robot))
 
     actuated = {
         plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i)
@@ -344,7 +196,7 @@ def add_robot(
     if variation.joint_friction_nm:
         for name in actuated:
             friction = plant.AddJointActuator(
-                f"{name}_friction",
+                f"{name}{_FRICTION_SUFFIX}",
                 plant.GetJointByName(name, instance),
                 variation.joint_friction_nm,
             )
@@ -372,6 +224,36 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
         value = by_pattern(robot.posture, name, "posture", robot.name)
         positions[name] = 0.0 if value is None else float(value)
     return positions
+
+
+def actuation_matrix(
+    plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
+) -> np.ndarray:
+    """Maps joint values onto the robot's actuators, by name; friction actuators get none.
+
+    A plant with dry joint friction needs its desired state connected too (zero, or this matrix
+    twice for position servos): without one Drake disarms the servos that hold the joints.
+
+    Args:
+        plant: The finalised plant.
+        robot: The robot.
+        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
+
+    Returns:
+        (n_u, n_j), in the order of ``plant.get_actuation_input_port(instance)``.
+
+    Raises:
+        ValueError: An actuated joint is not among the names.
+    """
+    instance = plant.GetModelInstanceByName(robot.name)
+    actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
+    matrix = np.zeros((len(actuators), len(joint_names)))
+    for row, actuator in enumerate(actuators):
+        name = actuator.joint().name()
+        _require(name in joint_names, robot, "joint", name, joint_names)
+        if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
+            matrix[row, joint_names.index(name)] = 1.0
+    return matrix
 
 
 def apply_mass_scale(

@@ -1,0 +1,241 @@
+"""What the whole-body programs of one robot have in common: its tasks, feet and limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RotationMatrix
+from pydrake.multibody.tree import Frame, RigidBody
+
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics, fit_stance
+
+EQUALITY = 5
+"""daqp's word, in ``sense``, for a row whose bounds are equal."""
+
+_COINCIDENT_M = 1e-6  # Contact points nearer than this to a line, or to each other, lie on it.
+
+
+_REST = np.zeros(3)
+_REST.flags.writeable = False
+
+
+@dataclass(kw_only=True)
+class PointReference:
+    """Where a point goes, in the world frame."""
+
+    position: np.ndarray
+    """(3,) [m]."""
+    rate: np.ndarray = field(default_factory=lambda: _REST)
+    """(3,) [m/s]."""
+    acceleration: np.ndarray = field(default_factory=lambda: _REST)
+    """Feedforward (3,) [m/s²]."""
+
+
+@dataclass(kw_only=True)
+class WholeBodyReference:
+    """What the tasks follow."""
+
+    center_of_mass: PointReference
+    orientations: list[RotationMatrix]
+    """R_WB of every body with an orientation task, in the order of ``model.body_names``."""
+    posture: np.ndarray
+    """Joint positions (n_j,) [rad]."""
+    is_stance: np.ndarray
+    """Whether each foot stands, (n_feet,)."""
+    reaching: PointReference | None = None
+    """Where the hand goes; a model with a hand needs it, one without never reads it."""
+
+
+class Hand:
+    """The point that reaches."""
+
+    def __init__(self, body: RigidBody, point: list[float]):
+        self.body = body
+        self.frame: Frame = body.body_frame()
+        self.point = np.array(point, dtype=float)
+
+
+class StandingFoot:
+    """A foot's contact points, and the motions of the foot that standing still forbids.
+
+    Rows for every point of a rigid foot would be redundant, and contradict each other as soon as
+    it turns: the motion of the points' centre and the turns that move any of them are enough,
+    six rows for a sole, five for an edge, three for a point.
+    """
+
+    def __init__(self, body: RigidBody, points: np.ndarray):
+        self.body = body
+        self.frame: Frame = body.body_frame()
+        self.points = points  # (3, n)
+        self.num_points = points.shape[1]
+        self.center = points.mean(axis=1)
+        _, spread, directions = np.linalg.svd((points - self.center[:, np.newaxis]).T)
+        dimensions = int(np.sum(spread > _COINCIDENT_M))
+        self.num_rows = {0: 3, 1: 5}.get(dimensions, 6)
+        self.edge_turns: np.ndarray | None = directions[1:] if dimensions == 1 else None
+        """In the body's frame, (2, 3): the axes across an edge."""
+
+
+class WholeBodyModel:
+    """Frames, gains and limits of one robot's program; which hand reaches is chosen here.
+
+    Args:
+        kinematics: The robot as the controller believes it to be.
+        hand: Name of the reaching frame; None leaves the reaching task out.
+
+    Raises:
+        ValueError: The robot has no feet, or no such hand.
+    """
+
+    def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
+        robot, plant = kinematics.robot, kinematics.plant
+        if not robot.feet:
+            raise ValueError(f"robot '{robot.name}' has no feet to stand on")
+        self.kinematics = kinematics
+        self.parameters = parameters = robot.whole_body
+        self.num_joints = kinematics.num_joints
+        self.num_velocities = kinematics.num_velocities
+        self.mass = kinematics.total_mass
+        self.gravity = plant.gravity_field().gravity_vector()
+        self.hand: Hand | None = None
+        if hand is not None:
+            frame = robot.reaching_frame(hand)
+            self.hand = Hand(plant.GetBodyByName(frame.body), frame.point)
+        self.body_names = list(parameters.orientation)
+        self.bodies = [plant.GetBodyByName(name) for name in self.body_names]
+        self.feet = [
+            StandingFoot(plant.GetBodyByName(foot.body), points)
+            for foot, points in zip(robot.feet.values(), kinematics.foot_points, strict=True)
+        ]
+        tasks = [parameters.center_of_mass, *parameters.orientation.values()]
+        if hand is not None:
+            tasks.append(parameters.reaching)
+        # Three rows a task: the centre of mass, the bodies in their order, the hand.
+        self.num_task_rows = 3 * len(tasks)
+        gains = np.array([[task.weight, task.stiffness, task.damping] for task in tasks])
+        self.weight, self.stiffness, self.damping = np.repeat(gains, 3, axis=0).T.copy()
+        self.base_turns = np.eye(3, self.num_velocities)
+        self.torque_limits = self._torque_limits()
+        self._stances: dict[bytes, Stance] = {}
+
+    def _torque_limits(self) -> np.ndarray:
+        """Largest torque of every joint (n_j,) [N·m]; zero for a joint without an actuator."""
+        plant = self.kinematics.plant
+        limits = np.zeros(self.num_joints)
+        for index in plant.GetJointActuatorIndices():
+            actuator = plant.get_joint_actuator(index)
+            joint = self.kinematics.joint_names.index(actuator.joint().name())
+            limits[joint] = actuator.effort_limit()
+        return limits
+
+    def stance(self, is_stance: np.ndarray) -> Stance:
+        """What all programs with these feet standing have in common."""
+        key = np.asarray(is_stance, dtype=bool).tobytes()
+        if key not in self._stances:
+            self._stances[key] = Stance(self, is_stance)
+        return self._stances[key]
+
+    def reference(self, q: np.ndarray, *, posture: np.ndarray | None = None) -> WholeBodyReference:
+        """To stand where the feet of ``q`` are: upright, the centre of mass over the stance.
+
+        The centre of mass keeps the height it has at ``q``, the bodies take the orientations of
+        the standing posture turned to where the feet point, and a hand stays where it is.
+
+        Args:
+            q: Positions (n_q,).
+            posture: Joint positions (n_j,) [rad]; the robot's standing posture by default.
+        """
+        kinematics = self.kinematics
+        x, y, yaw = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
+        reference = WholeBodyReference(
+            center_of_mass=PointReference(
+                position=np.array([x, y, kinematics.center_of_mass(q)[2]])
+            ),
+            orientations=[],
+            posture=np.array(kinematics.posture if posture is None else posture, dtype=float),
+            is_stance=np.ones(len(self.feet), bool),
+        )
+        if self.hand is not None:
+            reference.reaching = PointReference(position=self.reaching_position(q))
+        kinematics.set_positions(kinematics.standing_positions())
+        R_WS = RotationMatrix.MakeZRotation(yaw)
+        for body in self.bodies:
+            R_SB = body.EvalPoseInWorld(kinematics.context).rotation()
+            reference.orientations.append(R_WS @ R_SB)
+        return reference
+
+    def check_reference(self, reference: WholeBodyReference) -> None:
+        """Refuses a reference that is not one of this robot.
+
+        Raises:
+            ValueError: A part is missing, not finite, or of another size than the robot.
+        """
+        who = f"robot '{self.kinematics.robot.name}': the whole-body reference"
+        for name, entries in (
+            ("posture", self.kinematics.joint_names),
+            ("is_stance", self.kinematics.foot_names),
+            ("orientations", self.body_names),
+        ):
+            size = len(getattr(reference, name))
+            if size != len(entries):
+                raise ValueError(f"{who} must have {name} for {entries}; got {size} entries")
+        if self.hand is not None and reference.reaching is None:
+            raise ValueError(f"{who} must say where the hand goes; got no reaching")
+        for point in (reference.center_of_mass, reference.reaching or reference.center_of_mass):
+            values = np.concatenate([point.position, point.rate, point.acceleration])
+            if values.shape != (9,) or not np.isfinite(values).all():
+                raise ValueError(f"{who}'s points must be three finite numbers each; got {point}")
+        if not np.isfinite(reference.posture).all():
+            raise ValueError(f"{who}'s posture must be finite; got {reference.posture}")
+
+    def reaching_position(self, q: np.ndarray) -> np.ndarray:
+        """World position of the reaching point, (3,) [m].
+
+        Raises:
+            ValueError: No hand was chosen.
+        """
+        kinematics = self.kinematics
+        if self.hand is None:
+            raise ValueError(
+                f"robot '{kinematics.robot.name}': no hand was chosen of "
+                f"{list(kinematics.robot.reaching_frames)}"
+            )
+        kinematics.set_positions(q)
+        return self.hand.body.EvalPoseInWorld(kinematics.context) @ self.hand.point
+
+
+class Stance:
+    """Sizes and constant entries of the programs with the same feet standing.
+
+    The rows are the equations of motion (n_v), the feet's stillness, then the friction pyramids;
+    the columns v̇ (n_v), then the forces of the standing feet's points (3 each).
+    """
+
+    def __init__(self, model: WholeBodyModel, is_stance: np.ndarray):
+        n_v, parameters = model.num_velocities, model.parameters
+        self.feet = [foot for foot, stands in zip(model.feet, is_stance, strict=True) if stands]
+        num_points = sum(foot.num_points for foot in self.feet)
+        num_still = sum(foot.num_rows for foot in self.feet)
+        self.still_rows = slice(n_v, n_v + num_still)
+        self.num_variables = n_v + 3 * num_points
+        num_rows = n_v + num_still + 4 * num_points
+
+        # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z; together they say f_z ≥ 0.
+        mu = parameters.friction
+        pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
+        self.A = np.zeros((num_rows, self.num_variables))
+        self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
+        # Without torques of its own the base is a joint whose limit is zero.
+        limits = np.concatenate([np.zeros(NUM_BASE_VELOCITIES), model.torque_limits])
+        self.lower, self.upper = np.full(num_rows, -math.inf), np.zeros(num_rows)
+        self.lower[:n_v], self.upper[:n_v] = -limits, limits
+        self.sense = np.zeros(num_rows, np.int32)
+        self.sense[:n_v][limits == 0.0] = EQUALITY
+        self.sense[self.still_rows] = EQUALITY
+
+        diagonal = np.full(self.num_variables, parameters.regularization)
+        diagonal[n_v:] = parameters.force_regularization
+        diagonal[NUM_BASE_VELOCITIES:n_v] += parameters.posture.weight
+        self.H = np.diag(diagonal)

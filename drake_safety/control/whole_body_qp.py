@@ -1,0 +1,238 @@
+"""Whole-body control as one quadratic program: accelerations and contact forces, not torques."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import daqp
+import numpy as np
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
+from drake_safety.control.observation import rotation_vector
+from drake_safety.control.whole_body_model import (
+    PointReference,
+    Stance,
+    WholeBodyModel,
+    WholeBodyReference,
+)
+
+SOLVED = 0
+"""Status of a solution that is one; daqp's own exit flags, all negative, stand for the others."""
+
+_BOUNDLESS = 1e12  # No state or set point of a robot has a squared norm of this size.
+_ORIGIN = np.zeros(3)
+_FIRST, _LAST = slice(0, 3), slice(-3, None)
+
+
+@dataclass(kw_only=True)
+class WholeBodyQP:
+    """Minimise ½ xᵀHx + gᵀx subject to lower ≤ Ax ≤ upper, with x = [v̇; f/m].
+
+    Forces are divided by the robot's mass m: all of x are accelerations then, the
+    regularisation weighs them alike, and no entry of H depends on how heavy the robot is.
+    The first n_v rows are the equations of motion, whose value is the generalised force less
+    its bias: zero for the floating base, a torque within its limits for a joint.
+    """
+
+    H: np.ndarray
+    g: np.ndarray
+    A: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    sense: np.ndarray
+    """``EQUALITY`` for the rows of A whose bounds are equal, else 0."""
+    bias: np.ndarray
+    """Coriolis and gravity terms h of the equations of motion M v̇ + h = S τ + Jᵀf, (n_v,)."""
+    mass: float
+    """m [kg]."""
+
+
+@dataclass(kw_only=True)
+class WholeBodySolution:
+    """A solution of the program; meaningless unless its status is ``SOLVED``."""
+
+    vdot: np.ndarray
+    """(n_v,)."""
+    forces: np.ndarray
+    """Of the standing feet's contact points, in the world, (n_points, 3) [N]."""
+    torques: np.ndarray
+    """(n_j,) [N·m]."""
+    status: int
+
+
+class _TaskRows:
+    """Rows of the stacked tasks: wanted acceleration J v̇ + J̇v, three to a task."""
+
+    def __init__(self, num_rows: int, num_velocities: int):
+        self.J = np.empty((num_rows, num_velocities))
+        self.Jdot_v = np.empty(num_rows)
+        self.error, self.rate, self.feedforward = np.zeros((3, num_rows))
+
+    def follow(self, rows: slice, point: PointReference, p: np.ndarray) -> None:
+        """Sets the rows of a point at ``p``."""
+        self.error[rows] = point.position - p
+        self.rate[rows] = point.rate
+        self.feedforward[rows] = point.acceleration
+
+
+def build_qp(
+    model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
+) -> WholeBodyQP:
+    """The quadratic program of one instant.
+
+    Args:
+        model: Whose program.
+        q: Positions (n_q,).
+        v: Velocities (n_v,).
+        reference: What the tasks follow.
+
+    Raises:
+        ValueError: A state or a point that is not finite, or as large as no robot's.
+    """
+    _check(model, q, v, reference)
+    plant, context = model.kinematics.plant, model.kinematics.context
+    plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+    M = plant.CalcMassMatrix(context)
+    C = plant.CalcBiasTerm(context)
+    # The base's translational rows of M v̇ + C are the rate of the linear momentum: divided by
+    # the mass they are the centre of mass's Jacobian and bias, and gravity acts along them.
+    J_com = M[3:NUM_BASE_VELOCITIES] / model.mass
+    Jdot_v_com = C[3:NUM_BASE_VELOCITIES] / model.mass
+    bias = C - model.mass * (model.gravity @ J_com)
+
+    stance = model.stance(reference.is_stance)
+    A, lower, upper = stance.A.copy(), stance.lower.copy(), stance.upper.copy()
+    n_v = model.num_velocities
+    A[:n_v, :n_v] = M
+    lower[:n_v] -= bias
+    upper[:n_v] -= bias
+    _add_contacts(model, stance, v, A, lower, upper)
+
+    tasks = _TaskRows(model.num_task_rows, n_v)
+    tasks.J[:3], tasks.Jdot_v[:3] = J_com, Jdot_v_com
+    # The base's columns of J_com hold [p]x of the centre of mass seen from the base.
+    p_com = q[4:7] + (J_com[1, 2], J_com[2, 0], J_com[0, 1])
+    tasks.follow(_FIRST, reference.center_of_mass, p_com)
+    _set_orientations(model, reference, tasks)
+    _set_hand(model, reference, tasks)
+
+    J = tasks.J
+    wanted = tasks.feedforward - tasks.Jdot_v
+    wanted += model.stiffness * tasks.error + model.damping * (tasks.rate - J @ v)
+    weighted = model.weight[:, np.newaxis] * J
+    H, g = stance.H.copy(), np.zeros(stance.num_variables)
+    H[:n_v, :n_v] += J.T @ weighted
+    posture = model.parameters.posture
+    g[NUM_BASE_VELOCITIES:n_v] = posture.weight * (
+        posture.stiffness * (q[NUM_BASE_POSITIONS:] - reference.posture)
+        + posture.damping * v[NUM_BASE_VELOCITIES:]
+    )
+    g[:n_v] -= wanted @ weighted
+    return WholeBodyQP(
+        H=H, g=g, A=A, lower=lower, upper=upper, sense=stance.sense, bias=bias, mass=model.mass
+    )
+
+
+def _check(
+    model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
+) -> None:
+    # A state that is not finite, or has no orientation, would end the process inside the plant.
+    size = q.dot(q) + v.dot(v)
+    for point in (reference.center_of_mass, reference.reaching):
+        if point is not None:
+            size += point.position.dot(point.position) + point.rate.dot(point.rate)
+    if not size < _BOUNDLESS or not q[:4].dot(q[:4]) > 1 / _BOUNDLESS:
+        raise ValueError(
+            f"robot '{model.kinematics.robot.name}': state and set points must be finite; got "
+            f"positions {q}, velocities {v} and set points {reference}"
+        )
+
+
+def _add_contacts(
+    model: WholeBodyModel,
+    stance: Stance,
+    v: np.ndarray,
+    A: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> None:
+    """The forces' part of the equations of motion, and the rows that keep the feet still."""
+    plant, context = model.kinematics.plant, model.kinematics.context
+    world, n_v, kv = model.kinematics.world_frame, model.num_velocities, JacobianWrtVariable.kV
+    Jdot_v = np.empty(stance.still_rows.stop - n_v)
+    row, column = n_v, n_v
+    for foot in stance.feet:
+        J = plant.CalcJacobianTranslationalVelocity(
+            context, kv, foot.frame, foot.points, world, world
+        )
+        A[:n_v, column : column + len(J)] = -model.mass * J.T
+        column += len(J)
+        J_foot = plant.CalcJacobianSpatialVelocity(
+            context, kv, foot.frame, foot.center, world, world
+        )
+        foot_bias = plant.CalcBiasSpatialAcceleration(
+            context, kv, foot.frame, foot.center, world, world
+        ).get_coeffs()
+        if foot.edge_turns is not None:
+            turns_W = foot.edge_turns @ foot.body.EvalPoseInWorld(context).rotation().matrix().T
+            J_foot = np.concatenate([turns_W @ J_foot[:3], J_foot[3:]])
+            foot_bias = np.concatenate([turns_W @ foot_bias[:3], foot_bias[3:]])
+        stop = row + foot.num_rows
+        A[row:stop, :n_v] = J_foot[-foot.num_rows :]
+        Jdot_v[row - n_v : stop - n_v] = foot_bias[-foot.num_rows :]
+        row = stop
+    # A foot's velocity decays: J v̇ = -J̇v - K_d J v.
+    rows = stance.still_rows
+    lower[rows] = upper[rows] = -Jdot_v - model.parameters.contact_damping * (A[rows, :n_v] @ v)
+
+
+def _set_orientations(
+    model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows
+) -> None:
+    plant, context = model.kinematics.plant, model.kinematics.context
+    world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
+    row = 3
+    for body, R_WBd in zip(model.bodies, reference.orientations, strict=True):
+        rows = slice(row, row + 3)
+        row += 3
+        if body is model.kinematics.base:
+            tasks.J[rows], tasks.Jdot_v[rows] = model.base_turns, 0.0
+        else:
+            frame = body.body_frame()
+            tasks.J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
+            tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
+                context, kv, frame, _ORIGIN, world, world
+            ).rotational()
+        R_WB = body.EvalPoseInWorld(context).rotation()
+        tasks.error[rows] = rotation_vector(R_WBd.multiply(R_WB.inverse()))
+
+
+def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows) -> None:
+    if model.hand is None or reference.reaching is None:
+        return
+    plant, context = model.kinematics.plant, model.kinematics.context
+    world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
+    body, frame, p = model.hand.body, model.hand.frame, model.hand.point
+    tasks.J[-3:] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
+    tasks.Jdot_v[-3:] = plant.CalcBiasTranslationalAcceleration(
+        context, kv, frame, p, world, world
+    )[:, 0]
+    tasks.follow(_LAST, reference.reaching, body.EvalPoseInWorld(context).multiply(p))
+
+
+def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
+    """Solves the program exactly, by daqp's dual active-set method.
+
+    It always starts cold: the same program has the same solution to the last bit.
+    """
+    n_v = len(qp.bias)
+    x, _, flag, _ = daqp.solve(qp.H, qp.g, qp.A, qp.upper, qp.lower, qp.sense)
+    is_solved = flag == 1 and x.dot(x) < math.inf
+    return WholeBodySolution(
+        vdot=x[:n_v],
+        forces=qp.mass * x[n_v:].reshape(-1, 3),
+        torques=(qp.A[NUM_BASE_VELOCITIES:n_v] @ x + qp.bias[NUM_BASE_VELOCITIES:]),
+        status=SOLVED if is_solved else min(int(flag), -1),
+    )

@@ -1,0 +1,76 @@
+"""Figures of Laikago as published, every fixed link by itself.
+
+Source: unitreerobotics/unitree_ros, robots/laikago_description/urdf/laikago.urdf.
+"""
+
+from published_robots import PublishedRobot, read_fixed, read_joints, read_links
+
+# Mass, centre of mass, and about it ixx iyy izz ixy ixz iyz. All axes are the link's own.
+_LINKS = """
+trunk 13.733 0.002284 -4.1e-05 0.025165 0.073348887 0.250684593 0.254469458 0.00030338 0.001918218 -7.5402e-05
+FR_hip 1.096 -0.001568 0.008134 0.000864 0.000822113 0.000983196 0.000864753 4.982e-06 -3.672e-05 -2.811e-06
+FR_thigh 1.528 -0.000482 -0.02001 -0.031996 0.00991611 0.009280083 0.00178256 -1.0388e-05 0.000250428 8.511e-05
+FR_calf 0.241 -0.002196 -0.000381 -0.12338 0.006181961 0.006196546 3.4774e-05 2.37e-07 -2.985e-06 5.138e-06
+FR_foot 0.06 0 0 0 1.6854e-05 1.6854e-05 1.6854e-05 0 0 0
+FL_hip 1.096 -0.001568 -0.008134 0.000864 0.000822113 0.000983196 0.000864753 -4.982e-06 -3.672e-05 2.811e-06
+FL_thigh 1.528 -0.000482 0.02001 -0.031996 0.00991611 0.009280083 0.00178256 1.0388e-05 0.000250428 -8.511e-05
+FL_calf 0.241 -0.002196 -0.000381 -0.12338 0.006181961 0.006196546 3.4774e-05 2.37e-07 -2.985e-06 5.138e-06
+FL_foot 0.06 0 0 0 1.6854e-05 1.6854e-05 1.6854e-05 0 0 0
+RR_hip 1.096 0.001568 0.008134 0.000864 0.000822113 0.000983196 0.000864753 -4.982e-06 3.672e-05 -2.811e-06
+RR_thigh 1.528 -0.000482 -0.02001 -0.031996 0.00991611 0.009280083 0.00178256 -1.0388e-05 0.000250428 8.511e-05
+RR_calf 0.241 -0.002196 -0.000381 -0.12338 0.006181961 0.006196546 3.4774e-05 2.37e-07 -2.985e-06 5.138e-06
+RR_foot 0.06 0 0 0 1.6854e-05 1.6854e-05 1.6854e-05 0 0 0
+RL_hip 1.096 0.001568 -0.008134 0.000864 0.000822113 0.000983196 0.000864753 4.982e-06 3.672e-05 2.811e-06
+RL_thigh 1.528 -0.000482 0.02001 -0.031996 0.00991611 0.009280083 0.00178256 1.0388e-05 0.000250428 -8.511e-05
+RL_calf 0.241 -0.002196 -0.000381 -0.12338 0.006181961 0.006196546 3.4774e-05 2.37e-07 -2.985e-06 5.138e-06
+RL_foot 0.06 0 0 0 1.6854e-05 1.6854e-05 1.6854e-05 0 0 0
+"""  # noqa: E501
+
+# Parent, child, origin, roll pitch yaw, axis, lower and upper limit, effort, speed, damping.
+_JOINTS = """
+FR_hip_joint trunk FR_hip 0.21935 -0.0875 0 0 0 0 1 0 0 -1.0471975512 0.872664625997 20 52.4 0
+FR_thigh_joint FR_hip FR_thigh 0 -0.037 0 0 0 0 0 1 0 -0.523598775598 3.92699081699 55 28.6 0
+FR_calf_joint FR_thigh FR_calf 0 0 -0.25 0 0 0 0 1 0 -2.77507351067 -0.610865238198 55 28.6 0
+FL_hip_joint trunk FL_hip 0.21935 0.0875 0 0 0 0 1 0 0 -0.872664625997 1.0471975512 20 52.4 0
+FL_thigh_joint FL_hip FL_thigh 0 0.037 0 0 0 0 0 1 0 -0.523598775598 3.92699081699 55 28.6 0
+FL_calf_joint FL_thigh FL_calf 0 0 -0.25 0 0 0 0 1 0 -2.77507351067 -0.610865238198 55 28.6 0
+RR_hip_joint trunk RR_hip -0.21935 -0.0875 0 0 0 0 1 0 0 -1.0471975512 0.872664625997 20 52.4 0
+RR_thigh_joint RR_hip RR_thigh 0 -0.037 0 0 0 0 0 1 0 -0.523598775598 3.92699081699 55 28.6 0
+RR_calf_joint RR_thigh RR_calf 0 0 -0.25 0 0 0 0 1 0 -2.77507351067 -0.610865238198 55 28.6 0
+RL_hip_joint trunk RL_hip -0.21935 0.0875 0 0 0 0 1 0 0 -0.872664625997 1.0471975512 20 52.4 0
+RL_thigh_joint RL_hip RL_thigh 0 0.037 0 0 0 0 0 1 0 -0.523598775598 3.92699081699 55 28.6 0
+RL_calf_joint RL_thigh RL_calf 0 0 -0.25 0 0 0 0 1 0 -2.77507351067 -0.610865238198 55 28.6 0
+"""
+
+# Child, parent, origin, roll pitch yaw. Links that are not in the table above have no mass.
+_FIXED = """
+FR_thigh_shoulder FR_hip 0 -0.059 0 0 0 0
+FR_foot FR_calf 0 0 -0.25 0 0 0
+FL_thigh_shoulder FL_hip 0 0.059 0 0 0 0
+FL_foot FL_calf 0 0 -0.25 0 0 0
+RR_thigh_shoulder RR_hip 0 -0.059 0 0 0 0
+RR_foot RR_calf 0 0 -0.25 0 0 0
+RL_thigh_shoulder RL_hip 0 0.059 0 0 0 0
+RL_foot RL_calf 0 0 -0.25 0 0 0
+"""
+
+_LEGS = ("FR", "FL", "RR", "RL")
+
+LAIKAGO = PublishedRobot(
+    base="trunk",
+    links=read_links(_LINKS),
+    joints=read_joints(_JOINTS) | read_fixed(_FIXED),
+    total_mass=25.433,
+    posture={
+        f"{leg}_{link}_joint": angle
+        for leg in _LEGS
+        for link, angle in (("hip", 0.0), ("thigh", 0.67), ("calf", -1.3))
+    },
+    standing_height=0.4245,
+    standing_height_tolerance=1e-3,
+    contact_centres={f"{leg}_calf": [[0.0, 0.0, -0.25]] for leg in _LEGS},
+    contact_radius=0.0265,
+    foot_friction=0.6,  # xacro/gazebo.xacro of the same repository, and so is the other one.
+    other_friction=0.2,
+    partner=(r"(F|R)L_(.*)", r"\1R_\2"),
+)

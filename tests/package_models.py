@@ -1,0 +1,126 @@
+"""The package's robots as plants on flat ground, for the tests of models."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import GeometryId, HalfSpace, QueryObject
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
+
+from atlas_figures import ATLAS
+from drake_safety.models import load_robot
+from laikago_figures import LAIKAGO
+
+MODELS = Path(__file__).resolve().parent.parent / "models"
+PUBLISHED = {"laikago": LAIKAGO, "atlas": ATLAS}
+
+
+def package_parser(plant: MultibodyPlant) -> Parser:
+    """Returns a parser that knows the models' package and takes every warning for an error."""
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    parser.package_map().Add("drake_safety_models", str(MODELS))
+    return parser
+
+
+class Scene:
+    """A robot of the package in its published standing posture on a flat ground.
+
+    Args:
+        name: The robot.
+        *scenes: Files of ``models/scenes``; what they leave free is welded to the world's origin.
+    """
+
+    def __init__(self, name: str, *scenes: str, time_step: float = 0.001) -> None:
+        self.published = PUBLISHED[name]
+        self.robot = load_robot(name)
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, time_step)
+        parser = package_parser(self.plant)
+        (self.instance,) = parser.AddModelsFromUrl(self.robot.urdf)
+        for scene in scenes:
+            (instance,) = parser.AddModelsFromUrl(f"package://drake_safety_models/scenes/{scene}")
+            body = self.plant.get_body(self.plant.GetBodyIndices(instance)[0])
+            self.plant.WeldFrames(self.plant.world_frame(), body.body_frame())
+        self.plant.RegisterCollisionGeometry(
+            self.plant.world_body(),
+            RigidTransform(),
+            HalfSpace(),
+            "ground",
+            CoulombFriction(0.8, 0.8),
+        )
+        self.plant.Finalize()
+        self.diagram = builder.Build()
+        self.root = self.diagram.CreateDefaultContext()
+        self.context = self.plant.GetMyMutableContextFromRoot(self.root)
+        self.base = self.plant.GetBodyByName(self.published.base, self.instance)
+        self.bodies = {
+            self.plant.get_body(index).name(): self.plant.get_body(index)
+            for index in self.plant.GetBodyIndices(self.instance)
+        }
+        self.set_base(RigidTransform([0.0, 0.0, self.published.standing_height]))
+        self.set_joints(dict.fromkeys(self.published.movable, 0.0) | dict(self.published.posture))
+
+    def set_base(self, X_WB: RigidTransform) -> None:
+        self.plant.SetFreeBodyPose(self.context, self.base, X_WB)
+
+    def set_base_height(self, height: float) -> None:
+        self.set_base(RigidTransform([0.0, 0.0, height]))
+
+    def set_joints(self, positions: Mapping[str, float]) -> None:
+        for name, position in positions.items():
+            self.plant.GetJointByName(name, self.instance).set_angle(self.context, position)
+
+    def pose(self, frame: str) -> RigidTransform:
+        return self.plant.GetFrameByName(frame, self.instance).CalcPoseInWorld(self.context)
+
+    def velocity_order(self) -> list[int]:
+        """Indices into v: the base's six, then the published joints in their order."""
+        start = self.base.floating_velocities_start_in_v()
+        joints = [self.plant.GetJointByName(name) for name in self.published.movable]
+        return [*range(start, start + 6), *(joint.velocity_start() for joint in joints)]
+
+    def query(self) -> QueryObject:
+        context = self.scene_graph.GetMyContextFromRoot(self.root)
+        return self.scene_graph.get_query_output_port().Eval(context)
+
+    def geometry_name(self, geometry: GeometryId) -> str:
+        """The geometry's body and name, as in `FR_calf/foot`."""
+        inspector = self.scene_graph.model_inspector()
+        body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+        return f"{body.name()}/{inspector.GetName(geometry).split('::')[-1]}"
+
+    def collision_geometries(self) -> dict[str, GeometryId]:
+        """The robot's collision geometries by name, as in `FR_calf/foot`."""
+        return {
+            self.geometry_name(geometry): geometry
+            for body in self.bodies.values()
+            for geometry in self.plant.GetCollisionGeometriesForBody(body)
+        }
+
+    def contact_spheres(self) -> dict[str, GeometryId]:
+        """Those of them that stand at a contact point of robot.yaml."""
+        inspector = self.scene_graph.model_inspector()
+        points = {
+            foot.body: np.array(foot.contact_points).reshape(-1, 3)
+            for foot in self.robot.feet.values()
+        }
+        return {
+            name: geometry
+            for name, geometry in self.collision_geometries().items()
+            if (body := name.split("/")[0]) in points
+            and np.linalg.norm(
+                points[body] - inspector.GetPoseInFrame(geometry).translation(), axis=1
+            ).min()
+            < 1e-9
+        }
+
+    def touching(self) -> set[tuple[str, ...]]:
+        """The sorted names of every pair of geometries that penetrate each other."""
+        return {
+            tuple(sorted((self.geometry_name(pair.id_A), self.geometry_name(pair.id_B))))
+            for pair in self.query().ComputePointPairPenetration()
+        }

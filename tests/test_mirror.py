@@ -1,0 +1,146 @@
+"""The mirror: reflecting twice is nothing, and the mirrored robot is where its image is."""
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.observation import stance_state
+from drake_safety.control.robot_model import load_robot_file
+from drake_safety.models import load_robot, robot_names
+from legged_robots import robot_kinematics, write_biped, write_hexapod
+
+SYMMETRIC = [name for name in robot_names() if load_robot(name).mirror]
+
+
+@pytest.fixture(params=[*SYMMETRIC, "biped"])
+def kinematics(request):
+    return robot_kinematics(request.param)
+
+
+def random_state(kinematics, rng, planted=True):
+    """A state somewhere in the world; with planted feet its stance is the standing one."""
+    joints = kinematics.posture.copy()
+    if not planted:
+        joints += rng.uniform(-0.3, 0.3, kinematics.num_joints)
+    X_WB = RigidTransform(RollPitchYaw(rng.uniform(-0.5, 0.5, 3)), rng.normal(size=3))
+    q = kinematics.positions_at(X_WB, joints)
+    return q, rng.normal(size=kinematics.num_velocities)
+
+
+def same_points(p, others):
+    """Whether each point of one set is in the other."""
+    distance = np.linalg.norm(p[:, np.newaxis] - others, axis=-1)
+    return distance.min(axis=0).max() < 1e-6 and distance.min(axis=1).max() < 1e-6
+
+
+def test_the_robots_of_the_package_that_have_two_sides_say_so():
+    assert "laikago" in SYMMETRIC
+
+
+def test_reflecting_twice_changes_nothing(kinematics):
+    mirror, rng = Mirror(kinematics), np.random.default_rng(0)
+    q, v = random_state(kinematics, rng, planted=False)
+    stance = rng.normal(size=3)
+    twice = mirror.plant_state(*mirror.plant_state(q, v, stance), stance)
+    np.testing.assert_allclose(twice[0], q, atol=1e-12)
+    np.testing.assert_allclose(twice[1], v, atol=1e-12)
+    s = stance_state(kinematics, q, v)
+    np.testing.assert_array_equal(mirror.stance_state(mirror.stance_state(s)), s)
+    p = rng.normal(size=(4, 3))
+    np.testing.assert_array_equal(mirror.points(mirror.points(p)), p)
+
+
+def test_reflecting_the_robot_reflects_its_feet_and_hands(kinematics):
+    mirror, rng = Mirror(kinematics), np.random.default_rng(1)
+    for _ in range(5):
+        q, v = random_state(kinematics, rng, planted=False)
+        stance = np.array([*rng.normal(size=2), rng.uniform(-3, 3)])
+        mirrored, _ = mirror.plant_state(q, v, stance)
+        X_WS = planar_pose(stance)
+
+        def reflected(p_W, X_WS=X_WS):
+            return (X_WS @ mirror.points((X_WS.inverse() @ p_W.T).T).T).T
+
+        feet = kinematics.contact_positions(q)
+        assert same_points(kinematics.contact_positions(mirrored), reflected(feet))
+        for name in kinematics.robot.reaching_frames:
+            hand = hand_position(kinematics, q, name)
+            other = hand_position(kinematics, mirrored, mirror.hand(name))
+            np.testing.assert_allclose(other, reflected(hand), atol=1e-6)
+
+
+def hand_position(kinematics, q, name):
+    frame = kinematics.robot.reaching_frames[name]
+    kinematics.plant.SetPositions(kinematics.context, q)
+    X_WB = kinematics.plant.GetBodyByName(frame.body).EvalPoseInWorld(kinematics.context)
+    return X_WB @ np.array([frame.point]).T[:, 0]
+
+
+def test_reflecting_the_velocities_reflects_the_velocities_of_the_feet(kinematics):
+    mirror, rng = Mirror(kinematics), np.random.default_rng(2)
+    q, v = random_state(kinematics, rng, planted=False)
+    mirrored_q, mirrored_v = mirror.plant_state(q, v, np.zeros(3))
+    feet = kinematics.contact_positions(q)
+    rates = (kinematics.contact_jacobian(q) @ v).reshape(-1, 3)
+    mirrored_feet = kinematics.contact_positions(mirrored_q)
+    mirrored_rates = (kinematics.contact_jacobian(mirrored_q) @ mirrored_v).reshape(-1, 3)
+    reflected = np.concatenate([mirror.points(feet), mirror.points(rates)], axis=1)
+    assert same_points(np.concatenate([mirrored_feet, mirrored_rates], axis=1), reflected)
+
+
+def test_the_state_of_the_mirrored_robot_is_the_mirrored_state(kinematics):
+    mirror = Mirror(kinematics)
+    for planted in (True, False):
+        q, v = random_state(kinematics, np.random.default_rng(3), planted)
+        mirrored = stance_state(kinematics, *mirror.plant_state(q, v))
+        expected = mirror.stance_state(stance_state(kinematics, q, v))
+        np.testing.assert_allclose(mirrored, expected, atol=1e-6)
+
+
+def test_the_mirrored_robot_stands_in_the_same_stance(kinematics):
+    q, v = random_state(kinematics, np.random.default_rng(4), planted=False)
+    mirrored, _ = Mirror(kinematics).plant_state(q, v)
+    stances = [
+        fit_stance(kinematics.contact_positions(p), kinematics.nominal_contacts)
+        for p in (q, mirrored)
+    ]
+    np.testing.assert_allclose(stances[0], stances[1], atol=1e-6)
+
+
+def test_the_standing_posture_is_its_own_reflection(kinematics):
+    np.testing.assert_allclose(
+        Mirror(kinematics).joints(kinematics.posture), kinematics.posture, atol=1e-9
+    )
+
+
+def test_many_states_are_reflected_as_one_by_one(kinematics):
+    mirror, rng = Mirror(kinematics), np.random.default_rng(5)
+    states = rng.normal(size=(3, 2, 12 + 2 * kinematics.num_joints))
+    together = mirror.stance_state(states)
+    np.testing.assert_array_equal(together[2, 1], mirror.stance_state(states[2, 1]))
+
+
+@pytest.mark.parametrize(
+    ("mirror", "message"),
+    [
+        ({}, "pairs joint 'swing_0' with 'swing_0', which is not its reflection"),
+        ({"(.*)_0": r"\1_1"}, "pairs joint 'swing_0' with 'swing_1', which is not its reflection"),
+    ],
+)
+def test_joints_that_are_not_each_others_reflection_are_refused(tmp_path, mirror, message):
+    path = write_hexapod(tmp_path)
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"mirror": mirror}))
+    with pytest.raises(ValueError, match=message):
+        Mirror(RobotKinematics(load_robot_file(path)))
+
+
+def test_a_hand_without_a_partner_is_answered_with_the_hands_there_are(tmp_path):
+    path = write_biped(tmp_path)
+    change = {"reaching_frames": {"left": {"body": "left_shin", "joints": ["left_knee"]}}}
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    mirror = Mirror(RobotKinematics(load_robot_file(path)))
+    with pytest.raises(ValueError, match=r"joints \['right_knee'\] opposite hand 'left'; there"):
+        mirror.hand("left")

@@ -1,0 +1,152 @@
+"""The scenes: ground, ball, bookshelf and what stands on it."""
+
+import numpy as np
+import pytest
+from pydrake.geometry import Box, Role, Sphere
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import UnitInertia
+from pydrake.systems.framework import DiagramBuilder
+
+from package_models import MODELS, Scene, package_parser
+
+SCENES = "package://drake_safety_models/scenes"
+TARGETS = ("blue_box", "red_can")
+# Source: junhyeokahn/PyPnC, robot_model/bookcase/bookshelf.urdf.
+BOARD_SIZE = (0.3, 2.0, 0.05)
+BOARD_HEIGHTS = (0.025, 0.325, 0.625, 0.925, 1.225, 1.475)
+
+
+def test_the_ball_is_a_solid_sphere_of_two_kilograms():
+    plant = MultibodyPlant(0.001)
+    package_parser(plant).AddModelsFromUrl(f"{SCENES}/ball.sdf")
+    plant.Finalize()
+    ball = plant.GetBodyByName("ball").default_spatial_inertia()
+    assert ball.get_mass() == 2.0
+    np.testing.assert_array_equal(ball.get_com(), np.zeros(3))
+    moment = 2.0 / 5.0 * 2.0 * 0.08**2
+    np.testing.assert_allclose(
+        ball.CalcRotationalInertia().CopyToFullMatrix3(), moment * np.eye(3), rtol=0.0, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("scene", ["ground.urdf", "blue_box.sdf", "red_can.sdf"])
+def test_ground_and_targets_are_only_to_be_seen(scene):
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    package_parser(plant).AddModelsFromUrl(f"{SCENES}/{scene}")
+    plant.Finalize()
+    inspector = scene_graph.model_inspector()
+    assert inspector.NumGeometriesWithRole(Role.kProximity) == 0
+    assert inspector.NumGeometriesWithRole(Role.kIllustration) > 0
+
+
+def test_the_ground_does_not_move():
+    plant = MultibodyPlant(0.001)
+    package_parser(plant).AddModelsFromUrl(f"{SCENES}/ground.urdf")
+    plant.Finalize()
+    assert plant.num_velocities() == 0
+
+
+def welded(*names: str):
+    """A plant and scene graph with models welded to the world's origin, and their bodies."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    bodies = []
+    for name in names:
+        (instance,) = package_parser(plant).AddModelsFromUrl(f"{SCENES}/{name}")
+        (index,) = plant.GetBodyIndices(instance)
+        bodies.append(plant.get_body(index))
+        plant.WeldFrames(plant.world_frame(), bodies[-1].body_frame())
+    plant.Finalize()
+    return plant, scene_graph, bodies
+
+
+def test_the_bookshelf_can_be_touched_at_its_boards_and_nowhere_else():
+    plant, scene_graph, (shelf,) = welded("bookshelf.urdf")
+    inspector = scene_graph.model_inspector()
+    boards = plant.GetCollisionGeometriesForBody(shelf)
+    heights = []
+    for board in boards:
+        shape = inspector.GetShape(board)
+        assert isinstance(shape, Box)
+        np.testing.assert_array_equal(shape.size(), BOARD_SIZE)
+        X_BG = inspector.GetPoseInFrame(board)
+        assert X_BG.rotation().IsNearlyIdentity(0.0)
+        np.testing.assert_array_equal(X_BG.translation()[:2], np.zeros(2))
+        heights.append(X_BG.translation()[2])
+    assert sorted(heights) == list(BOARD_HEIGHTS)
+    assert plant.num_velocities() == 0
+
+
+def test_each_board_of_the_bookshelf_is_seen_where_it_is_touched():
+    plant, scene_graph, (shelf,) = welded("bookshelf.urdf")
+    inspector = scene_graph.model_inspector()
+    seen = [
+        (inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry).size())
+        for geometry in plant.GetVisualGeometriesForBody(shelf)
+    ]
+    for board in plant.GetCollisionGeometriesForBody(shelf):
+        X_BG, size = inspector.GetPoseInFrame(board), inspector.GetShape(board).size()
+        assert any(
+            X_BS.IsExactlyEqualTo(X_BG) and np.array_equal(seen_size, size)
+            for X_BS, seen_size in seen
+        )
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_whose_centre_is_six_centimetres_above_a_board_stands_on_it(target):
+    plant, scene_graph, (body,) = welded(f"{target}.sdf")
+    inspector = scene_graph.model_inspector()
+    halves = []
+    for geometry in plant.GetVisualGeometriesForBody(body):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        p_BG = inspector.GetPoseInFrame(geometry).translation() + box.pose().translation()
+        halves.append(np.abs(p_BG) + box.half_width())
+    half = np.max(halves, axis=0)
+    assert half[2] == pytest.approx(0.06, abs=2e-3)
+    # It fits on a board and under the next one.
+    assert 2 * half[2] < np.diff(BOARD_HEIGHTS).min() - BOARD_SIZE[2]
+    assert (2 * half[:2] < BOARD_SIZE[:2]).all()
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_has_the_inertia_of_a_solid_of_its_size(target):
+    plant, scene_graph, (body,) = welded(f"{target}.sdf")
+    inspector = scene_graph.model_inspector()
+    shape = inspector.GetShape(plant.GetVisualGeometriesForBody(body)[0])
+    M_BBo_B = body.default_spatial_inertia()
+    if isinstance(shape, Box):
+        unit = UnitInertia.SolidBox(0.1, 0.1, 0.12)
+    else:
+        unit = UnitInertia.SolidCylinder(shape.radius(), 0.12, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(
+        M_BBo_B.get_unit_inertia().CopyToFullMatrix3(), unit.CopyToFullMatrix3(), rtol=0.01
+    )
+
+
+def test_distances_from_hands_and_forearms_to_the_boards_can_be_computed():
+    atlas = Scene("atlas", "bookshelf.urdf")
+    inspector = atlas.scene_graph.model_inspector()
+    shapes = atlas.collision_geometries()
+    shelf = atlas.plant.GetBodyByName("bookshelf")
+    query = atlas.query()
+    for board in atlas.plant.GetCollisionGeometriesForBody(shelf):
+        for name in ("l_hand/hand", "r_hand/hand", "l_ufarm/forearm", "r_ufarm/forearm"):
+            pair = query.ComputeSignedDistancePairClosestPoints(shapes[name], board)
+            X_WB = query.GetPoseInWorld(board)
+            if isinstance(inspector.GetShape(shapes[name]), Sphere):
+                p = X_WB.inverse() @ query.GetPoseInWorld(shapes[name]).translation()
+                outside = np.maximum(np.abs(p) - np.array(BOARD_SIZE) / 2, 0.0)
+                radius = inspector.GetShape(shapes[name]).radius()
+                assert pair.distance == pytest.approx(np.linalg.norm(outside) - radius, abs=1e-9)
+            else:
+                assert np.isfinite(pair.distance)
+
+
+@pytest.mark.parametrize("name", ["laikago", "atlas"])
+def test_no_body_of_a_robot_shares_its_name_with_a_scene(name):
+    files = [path.name for path in (MODELS / "scenes").iterdir() if path.suffix != ".md"]
+    scene = Scene(name, *(file for file in files if file != "ground.urdf"))
+    for body in scene.bodies:
+        # By name alone, which fails where two models have one of that name.
+        assert scene.plant.GetBodyByName(body).model_instance() == scene.instance

@@ -1,0 +1,393 @@
+"""The whole-body program: mechanics hold, limits are kept, tasks are followed, solvers agree."""
+
+import copy
+import functools
+
+import numpy as np
+import pytest
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.observation import quaternion_of
+from drake_safety.control.robot import PlantVariation
+from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
+from drake_safety.control.whole_body_qp import SOLVED, build_qp, solve_qp
+from drake_safety.models import robot_names
+from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
+
+NAMES = sorted({*ROBOT_NAMES, *robot_names()})
+G = 9.81
+
+
+@functools.cache
+def whole_body_model(name):
+    """A robot's model; with its first hand, if it has any."""
+    return WholeBodyModel(
+        robot_kinematics(name), next(iter(robot_kinematics(name).robot.reaching_frames), None)
+    )
+
+
+@pytest.fixture(params=NAMES)
+def model(request):
+    return whole_body_model(request.param)
+
+
+def moving_state(model, rng, size=1.0):
+    """A state near standing that moves, feet included."""
+    kinematics = model.kinematics
+    X_WB = RigidTransform(
+        RollPitchYaw(0.02 * size * rng.normal(size=3)), [0, 0, kinematics.standing_height]
+    )
+    joints = kinematics.posture + 0.02 * size * rng.normal(size=model.num_joints)
+    v = 0.05 * size * rng.normal(size=model.num_velocities)
+    return kinematics.positions_at(X_WB, joints), v
+
+
+def random_program(model, rng, size=1.0):
+    q, v = moving_state(model, rng, size)
+    reference = model.reference(model.kinematics.standing_positions())
+    reference.center_of_mass.position += 0.01 * size * rng.normal(size=3)
+    reference.center_of_mass.rate = 0.05 * size * rng.normal(size=3)
+    if reference.reaching is not None:
+        reference.reaching.position += 0.03 * size * rng.normal(size=3)
+        reference.reaching.rate = 0.1 * size * rng.normal(size=3)
+    return q, v, reference
+
+
+def solved(model, q, v, reference):
+    solution = solve_qp(build_qp(model, q, v, reference))
+    assert solution.status == SOLVED
+    return solution
+
+
+def clarabel_torques(qp, tolerance):
+    """Joint torques of the same program by Drake's Clarabel."""
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(len(qp.g))
+    program.AddQuadraticCost(qp.H, qp.g, x, is_convex=True)
+    is_equality = qp.sense == EQUALITY
+    program.AddLinearEqualityConstraint(qp.A[is_equality], qp.lower[is_equality], x)
+    program.AddLinearConstraint(
+        qp.A[~is_equality], qp.lower[~is_equality], qp.upper[~is_equality], x
+    )
+    options = SolverOptions()
+    for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
+        options.SetOption(ClarabelSolver.id(), name, tolerance)
+    result = ClarabelSolver().Solve(program, None, options)
+    assert result.is_success()
+    n_v = len(qp.bias)
+    return qp.A[6:n_v] @ result.GetSolution(x) + qp.bias[6:]
+
+
+def test_the_torques_are_those_of_inverse_dynamics_and_the_base_has_none(model):
+    """Drake's own inverse dynamics, which shares no line with how the program is built."""
+    rng = np.random.default_rng(0)
+    kinematics = model.kinematics
+    plant, context = kinematics.plant, kinematics.context
+    for _ in range(5):
+        q, v, reference = random_program(model, rng)
+        solution = solved(model, q, v, reference)
+        J = kinematics.contact_jacobian(q)
+        plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+        forces = MultibodyForces(plant)
+        forces.mutable_generalized_forces()[:] = (
+            plant.CalcGravityGeneralizedForces(context) + J.T @ solution.forces.ravel()
+        )
+        needed = plant.CalcInverseDynamics(context, solution.vdot, forces)
+        np.testing.assert_allclose(needed[:6], 0.0, atol=1e-8)
+        np.testing.assert_allclose(needed[6:], solution.torques, atol=1e-8)
+
+
+def test_torques_and_forces_keep_their_limits(model):
+    rng = np.random.default_rng(1)
+    is_at_a_limit = False
+    for size in (0.3, 1.0, 3.0, 6.0):
+        for _ in range(5):
+            solution = solve_qp(build_qp(model, *random_program(model, rng, size)))
+            if solution.status != SOLVED:
+                continue
+            excess = np.abs(solution.torques) - model.torque_limits
+            f_x, f_y, f_z = solution.forces.T
+            slack = model.parameters.friction * f_z - np.maximum(np.abs(f_x), np.abs(f_y))
+            assert excess.max() < 1e-3
+            assert slack.min() > -1e-3
+            assert f_z.min() > -1e-3
+            is_at_a_limit |= max(excess.max(), -slack.min()) > -1e-3
+    assert is_at_a_limit
+
+
+def test_the_torques_are_those_of_an_interior_point_solver(model):
+    rng = np.random.default_rng(2)
+    for size in (0.0, 0.3, 1.0):
+        qp = build_qp(model, *random_program(model, rng, size))
+        np.testing.assert_allclose(
+            solve_qp(qp).torques, clarabel_torques(qp, 1e-10), rtol=0, atol=1e-3
+        )
+
+
+def test_the_same_program_has_the_same_solution_to_the_last_bit(model):
+    rng = np.random.default_rng(3)
+    qp = build_qp(model, *random_program(model, rng))
+    first = solve_qp(qp)
+    for _ in range(3):
+        solve_qp(build_qp(model, *random_program(model, rng, 3.0)))
+    np.testing.assert_array_equal(solve_qp(qp).torques, first.torques)
+
+
+def standing_still(model):
+    """At rest with the centre of mass where it should be."""
+    q = model.kinematics.standing_positions()
+    reference = model.reference(q)
+    reference.center_of_mass.position = model.kinematics.center_of_mass(q)
+    return q, np.zeros(model.num_velocities), reference
+
+
+def test_standing_where_it_should_a_robot_stays_and_the_ground_carries_its_weight(model):
+    solution = solved(model, *standing_still(model))
+    np.testing.assert_allclose(solution.vdot, 0.0, atol=0.02)
+    weight = model.mass * G
+    np.testing.assert_allclose(solution.forces.sum(axis=0) / weight, [0, 0, 1], atol=2e-3)
+
+
+def rate_of_change(model, q, v, vdot, quantity, step=1e-5):
+    """Time derivative of a quantity of (q, v) along a motion of given acceleration."""
+    kinematics = model.kinematics
+
+    def after(time):
+        kinematics.set_positions(q)  # The Context whose map turns v into q̇.
+        kinematics.plant.SetPositions(kinematics.context, q)
+        qdot = kinematics.plant.MapVelocityToQDot(kinematics.context, v + 0.5 * time * vdot)
+        return quantity(q + time * qdot, v + time * vdot)
+
+    return (after(step) - after(-step)) / (2 * step)
+
+
+def test_a_standing_foot_loses_its_velocity_at_the_rate_of_the_contact_damping(model):
+    kinematics = model.kinematics
+    q, v, reference = random_program(model, np.random.default_rng(4))
+    solution = solved(model, q, v, reference)
+
+    def foot_rates(q, v):
+        rates = (kinematics.contact_jacobian(q) @ v).reshape(-1, 3)
+        return np.array([rates[points].mean(axis=0) for points in kinematics.foot_slices])
+
+    changes = rate_of_change(model, q, v, solution.vdot, foot_rates)
+    damping = model.parameters.contact_damping
+    np.testing.assert_allclose(changes, -damping * foot_rates(q, v), rtol=1e-3, atol=1e-3)
+
+
+def test_a_sole_loses_its_turning_and_an_edge_may_turn_about_itself():
+    robot = copy.deepcopy(robot_model("biped"))
+    robot.feet["left"].contact_points = [[-0.06, 0.0, -0.05], [0.1, 0.0, -0.05]]
+    model = WholeBodyModel(RobotKinematics(robot))
+    kinematics = model.kinematics
+    bodies = [kinematics.plant.GetBodyByName(foot.body) for foot in robot.feet.values()]
+    q, v, reference = random_program(model, np.random.default_rng(5))
+    solution = solved(model, q, v, reference)
+
+    def turning(q, v):
+        kinematics.plant.SetPositionsAndVelocities(kinematics.context, np.concatenate([q, v]))
+        return np.array(
+            [body.EvalSpatialVelocityInWorld(kinematics.context).rotational() for body in bodies]
+        )
+
+    left, right = rate_of_change(model, q, v, solution.vdot, turning)
+    w_left, w_right = turning(q, v)
+    damping = model.parameters.contact_damping
+    np.testing.assert_allclose(right, -damping * w_right, rtol=1e-3, atol=1e-3)
+    edge = bodies[0].EvalPoseInWorld(kinematics.context).rotation().matrix()[:, 0]
+    across = np.eye(3) - np.outer(edge, edge)
+    np.testing.assert_allclose(across @ left, -damping * across @ w_left, rtol=1e-3, atol=1e-2)
+    assert abs(edge @ left + damping * edge @ w_left) > 0.1
+
+
+def only(model, task):
+    """The same model with one task that outweighs all others."""
+    robot = copy.deepcopy(model.kinematics.robot)
+    for gains in (
+        robot.whole_body.center_of_mass,
+        robot.whole_body.reaching,
+        robot.whole_body.posture,
+    ):
+        gains.weight = 1e-3
+    for gains in robot.whole_body.orientation.values():
+        gains.weight = 1e-3
+    gains = robot.whole_body.tasks()[task]
+    gains.weight, gains.stiffness, gains.damping = 1e3, 64.0, 11.0
+    hand = next(iter(robot.reaching_frames), None)
+    return WholeBodyModel(RobotKinematics(robot), hand if task == "reaching" else None)
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if robot_kinematics(n).robot.reaching_frames])
+@pytest.mark.parametrize("task", ["center_of_mass", "reaching"])
+def test_a_point_accelerates_by_feedforward_and_the_gains_times_its_errors(name, task):
+    model = only(whole_body_model(name), task)
+    kinematics = model.kinematics
+    q, v = moving_state(model, np.random.default_rng(6), size=0.2)
+    reference = model.reference(q)
+    wanted = PointReference(
+        position=np.array([0.002, -0.001, 0.003]),
+        rate=np.array([0.01, 0.02, -0.02]),
+        acceleration=np.array([0.05, -0.1, 0.1]),
+    )
+    position = kinematics.center_of_mass if task == "center_of_mass" else model.reaching_position
+
+    def rate(q, v):
+        return rate_of_change(model, q, v, np.zeros_like(v), lambda q, v: position(q))
+
+    wanted.position = wanted.position + position(q)
+    setattr(reference, task, wanted)
+    solution = solved(model, q, v, reference)
+    acceleration = rate_of_change(model, q, v, solution.vdot, rate, step=1e-4)
+    expected = (
+        wanted.acceleration
+        + 64.0 * (wanted.position - position(q))
+        + 11.0 * (wanted.rate - rate(q, v))
+    )
+    np.testing.assert_allclose(acceleration, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bodies_turn_towards_their_orientation(name):
+    whole = whole_body_model(name)
+    for body_name in whole.body_names:
+        model = only(whole, f"orientation.{body_name}")
+        kinematics = model.kinematics
+        body = kinematics.plant.GetBodyByName(body_name)
+        q, v = moving_state(model, np.random.default_rng(7), size=0.2)
+        reference = model.reference(q)
+        turn = np.array([0.01, -0.02, 0.005])
+        kinematics.plant.SetPositions(kinematics.context, q)
+        R_WB = body.EvalPoseInWorld(kinematics.context).rotation()
+        angle = np.linalg.norm(turn)
+        R_turn = RotationMatrix(AngleAxis(angle, turn / angle))
+        reference.orientations[model.body_names.index(body_name)] = R_turn @ R_WB
+
+        def turning(q, v, body=body, kinematics=kinematics):
+            kinematics.plant.SetPositionsAndVelocities(kinematics.context, np.concatenate([q, v]))
+            return body.EvalSpatialVelocityInWorld(kinematics.context).rotational()
+
+        solution = solved(model, q, v, reference)
+        acceleration = rate_of_change(model, q, v, solution.vdot, turning)
+        expected = 64.0 * turn - 11.0 * turning(q, v)
+        np.testing.assert_allclose(acceleration, expected, atol=0.02)
+
+
+def test_in_the_air_joints_follow_the_posture():
+    whole = whole_body_model("hexapod")
+    model = only(whole, "posture")
+    q, v = moving_state(model, np.random.default_rng(8), size=0.2)
+    reference = model.reference(q)
+    reference.is_stance = np.zeros(len(model.feet), bool)
+    solution = solved(model, q, v, reference)
+    assert solution.forces.shape == (0, 3)
+    expected = 64.0 * (reference.posture - q[7:]) - 11.0 * v[6:]
+    np.testing.assert_allclose(solution.vdot[6:], expected, atol=0.01)
+
+
+def test_a_foot_that_does_not_stand_takes_no_force_and_may_move():
+    model = whole_body_model("hexapod")
+    q, v, reference = standing_still(model)
+    reference.is_stance[2] = False
+    v[:] = 0.0
+    reference.posture = reference.posture.copy()
+    leg = [model.kinematics.joint_names.index(f"{name}_2") for name in ("swing", "lift", "knee")]
+    reference.posture[leg] += [0.0, -0.2, 0.0]
+    solution = solved(model, q, v, reference)
+    assert len(solution.forces) == 5
+    assert abs(solution.vdot[6 + leg[1]]) > 1.0
+    J = model.kinematics.contact_jacobian(q).reshape(6, 3, -1)
+    others = np.delete(J, 2, axis=0).reshape(15, -1)
+    np.testing.assert_allclose(others @ solution.vdot, 0.0, atol=1e-6)
+
+
+def test_a_lighter_robot_moves_alike_with_torques_and_forces_in_proportion():
+    robot = robot_model("biped")
+    full = WholeBodyModel(RobotKinematics(robot), "head")
+    light = WholeBodyModel(RobotKinematics(robot, PlantVariation(mass_scale=0.8)), "head")
+    problem = random_program(full, np.random.default_rng(9), size=0.3)
+    heavy_one, light_one = solved(full, *problem), solved(light, *problem)
+    assert np.abs(heavy_one.torques).max() < full.torque_limits.min()
+    np.testing.assert_allclose(light_one.vdot, heavy_one.vdot, atol=1e-6)
+    np.testing.assert_allclose(light_one.torques, 0.8 * heavy_one.torques, atol=1e-6)
+    np.testing.assert_allclose(light_one.forces, 0.8 * heavy_one.forces, atol=1e-5)
+
+
+def test_the_torques_do_not_depend_on_place_or_heading(model):
+    """The friction pyramid points along the world's axes, so by quarter turns."""
+    kinematics = model.kinematics
+    q, v, reference = random_program(model, np.random.default_rng(10), size=0.3)
+    X = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [3.0, -2.0, 0.0])
+    turn = X.rotation().matrix()
+    X_WB = RigidTransform(RotationMatrix(quaternion_of(q)), q[4:7])
+    moved_q = kinematics.positions_at(X @ X_WB, q[7:])
+    moved_v = np.concatenate([turn @ v[:3], turn @ v[3:6], v[6:]])
+    moved = copy.deepcopy(reference)
+    for point in filter(None, (moved.center_of_mass, moved.reaching)):
+        point.position, point.rate = X @ point.position, turn @ point.rate
+    moved.orientations = [X.rotation() @ R for R in reference.orientations]
+    np.testing.assert_allclose(
+        solved(model, moved_q, moved_v, moved).torques,
+        solved(model, q, v, reference).torques,
+        atol=1e-5,
+    )
+
+
+def test_a_mirrored_robot_needs_the_mirrored_torques():
+    """The biped is symmetric in its masses too."""
+    model = whole_body_model("biped")
+    mirror = Mirror(model.kinematics)
+    q, v, reference = random_program(model, np.random.default_rng(11), size=0.3)
+    mirrored_q, mirrored_v = mirror.plant_state(q, v, np.zeros(3))
+    mirrored = copy.deepcopy(reference)
+    for point in (mirrored.center_of_mass, mirrored.reaching):
+        point.position, point.rate = mirror.points(point.position), mirror.points(point.rate)
+    np.testing.assert_allclose(
+        solved(model, mirrored_q, mirrored_v, mirrored).torques,
+        mirror.joints(solved(model, q, v, reference).torques),
+        atol=1e-6,
+    )
+
+
+def test_a_joint_without_an_actuator_gets_no_torque():
+    robot = copy.deepcopy(robot_model("biped"))
+    robot.effort_limits = {"(?!left_ankle_x).*": 80.0}
+    model = WholeBodyModel(RobotKinematics(robot))
+    passive = model.kinematics.joint_names.index("left_ankle_x")
+    solution = solved(model, *random_program(model, np.random.default_rng(12), size=0.3))
+    assert abs(solution.torques[passive]) < 1e-8
+    assert np.abs(np.delete(solution.torques, passive)).min() > 1e-6
+
+
+def test_a_program_that_no_torque_can_satisfy_says_so():
+    model = whole_body_model("biped")
+    q, v, reference = standing_still(model)
+    assert solve_qp(build_qp(model, q, v, reference)).status == SOLVED
+    v[6:] = 200.0  # No ankle can stop a foot that spins so fast.
+    assert solve_qp(build_qp(model, q, v, reference)).status < 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
+@pytest.mark.parametrize("where", ["quaternion", "position", "velocity", "reaching", "rate"])
+def test_a_state_or_set_point_that_is_not_finite_is_refused_not_fatal(value, where):
+    model = whole_body_model("biped")
+    q, v, reference = standing_still(model)
+    if where in ("reaching", "rate"):
+        name = "position" if where == "reaching" else "rate"
+        setattr(reference.reaching, name, np.array([0.0, value, 0.0]))
+    else:
+        (v if where == "velocity" else q)[5 if where == "position" else 3] = value
+    with pytest.raises(ValueError, match="robot 'biped': state and set points must be finite"):
+        build_qp(model, q, v, reference)
+
+
+def test_a_state_without_orientation_is_refused():
+    model = whole_body_model("biped")
+    q, v, reference = standing_still(model)
+    q[:4] = 0.0
+    with pytest.raises(ValueError, match="robot 'biped': state and set points must be finite"):
+        build_qp(model, q, v, reference)
