@@ -1,11 +1,8 @@
 """Robots and scenes as data, and the loader of a robot by name."""
 
 from pathlib import Path
-from urllib.parse import urlparse
 
-from pydrake.multibody.parsing import PackageMap
-
-from drake_safety.control.robot import add_to_package_map
+from drake_safety.control.robot import add_to_package_map, model_file
 from drake_safety.control.robot_model import RobotModel, load_robot_file
 
 __all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]
@@ -45,11 +42,5 @@ def robot_files(name: str) -> list[Path]:
     """
     robot = load_robot(name)
     folder = Path(robot.source_dir)
-    url = urlparse(robot.urdf)
-    if url.scheme == "package":
-        package_map = PackageMap()
-        add_to_package_map(package_map)
-        model = Path(package_map.GetPath(url.netloc)) / url.path.lstrip("/")
-    else:
-        model = folder / robot.urdf
+    model = model_file(robot.urdf, robot.source_dir)
     return [Path(name) if name not in robot_names() else folder / "robot.yaml", model]

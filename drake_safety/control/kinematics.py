@@ -16,7 +16,7 @@ from drake_safety.control.robot import (
     apply_mass_scale,
     posture_positions,
 )
-from drake_safety.control.robot_model import RobotModel
+from drake_safety.control.robot_model import ReachingFrame, RobotModel
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6
@@ -197,6 +197,12 @@ class RobotKinematics:
         _, weights, _ = dposv(gram, -g[:NUM_BASE_VELOCITIES])
         forces = A.T @ weights
         return -g[NUM_BASE_VELOCITIES:] - J[:, NUM_BASE_VELOCITIES:].T @ forces
+
+    def reaching_position(self, q: np.ndarray, frame: ReachingFrame) -> np.ndarray:
+        """World position of the point that reaches, (3,) [m]."""
+        self.set_positions(q)
+        body = self.plant.GetBodyByName(frame.body)
+        return body.EvalPoseInWorld(self.context) @ np.array(frame.point)
 
     def center_of_mass(self, q: np.ndarray) -> np.ndarray:
         """Centre of mass in the world, (3,) [m]."""

@@ -11,7 +11,9 @@ from drake_safety.control.kinematics import RobotKinematics, fit_stance
 _GRAVITY = 9.81
 _NUM_DIRECTIONS = 8
 _ANGLES = 2 * np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS
-_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # (2, 8)
+DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+"""Unit vectors all around, (2, 8)."""
+DIRECTION_NAMES = [f"{round(math.degrees(angle))}deg" for angle in _ANGLES]
 
 
 def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
@@ -123,9 +125,8 @@ class BalanceSafeSet:
         self.kinematics = kinematics
         self.limits = limits
         self._cos_fall_tilt = math.cos(limits.fall_tilt_rad)
-        directions = [f"{round(math.degrees(a))}deg" for a in _ANGLES]
         points = ("base", "capture_point", "goal")
-        self.feature_names = [f"{p}_margin_{d}" for p in points for d in directions]
+        self.feature_names = [f"{p}_margin_{d}" for p in points for d in DIRECTION_NAMES]
         self.feature_names += [f"{p}_support_distance" for p in points]
         self.feature_names += ["plan_support_distance", "plan_height_margin", "goal_height"]
         self.feature_names += [f"clearance_{i}" for i in range(kinematics.num_contacts)]
@@ -196,7 +197,7 @@ class BalanceSafeSet:
         velocity = R_SW @ v[3:5]
         capture_point = base + velocity * math.sqrt(max(height, 0.05) / _GRAVITY)
         goal = preview[-1, :2]
-        reach = (contacts[is_support] @ _DIRECTIONS).max(axis=0)
+        reach = (contacts[is_support] @ DIRECTIONS).max(axis=0)
         corners = convex_hull(contacts[is_support])
         points = np.stack([base, capture_point, goal])
         qw, qx, qy, qz = q[:4]
@@ -206,7 +207,7 @@ class BalanceSafeSet:
         heights = preview[:, 2].tolist()
         return np.concatenate(
             [
-                (reach - points @ _DIRECTIONS).ravel(),
+                (reach - points @ DIRECTIONS).ravel(),
                 [signed_distance_to_polygon(p, corners) for p in points.tolist()],
                 [
                     min(signed_distance_to_polygon(p, corners) for p in preview[:, :2].tolist()),

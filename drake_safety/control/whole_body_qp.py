@@ -188,6 +188,30 @@ def _add_contacts(
     lower[rows] = upper[rows] = -Jdot_v - model.parameters.contact_damping * (A[rows, :n_v] @ v)
 
 
+def task_errors(
+    model: WholeBodyModel, q: np.ndarray, reference: WholeBodyReference
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks, at rest.
+
+    Args:
+        model: Whose tasks; its scratch Context has the positions ``q`` afterwards.
+        q: Positions (n_q,).
+        reference: What the tasks follow.
+    """
+    kinematics = model.kinematics
+    kinematics.set_positions(q)
+    plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
+    tasks = _TaskRows(model.num_task_rows, model.num_velocities)
+    tasks.J[_FIRST] = plant.CalcJacobianCenterOfMassTranslationalVelocity(
+        context, JacobianWrtVariable.kV, world, world
+    )
+    p_com = plant.CalcCenterOfMassPositionInWorld(context)
+    tasks.follow(_FIRST, reference.center_of_mass, p_com)
+    _set_orientations(model, reference, tasks)
+    _set_hand(model, reference, tasks)
+    return tasks.J, tasks.error
+
+
 def _set_orientations(
     model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows
 ) -> None:

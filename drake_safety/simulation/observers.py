@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
@@ -22,6 +23,7 @@ class Observers:
         kinematics: The robot.
         plant_state: Port of its true state.
         period_s: Time between two draws of noise [s].
+        **options: Of every `StateObserver`.
     """
 
     def __init__(
@@ -30,11 +32,13 @@ class Observers:
         kinematics: RobotKinematics,
         plant_state: OutputPort,
         period_s: float,
+        **options: Any,
     ):
         self._builder = builder
         self._kinematics = kinematics
         self._plant_state = plant_state
         self._period_s = period_s
+        self._options = options
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
 
@@ -48,7 +52,9 @@ class Observers:
         key = (noise.position, noise.velocity)
         if key in self._observers:
             return self._observers[key]
-        observer = self._builder.AddNamedSystem(name, StateObserver(self._kinematics, noise))
+        observer = self._builder.AddNamedSystem(
+            name, StateObserver(self._kinematics, noise, **self._options)
+        )
         self._builder.Connect(self._plant_state, observer.GetInputPort("plant_state"))
         if key != (0.0, 0.0):
             noise_port = observer.GetInputPort("noise")

@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import add_noise, stance_state, state_names
 from drake_safety.control.robot import ObservationNoise
 
@@ -31,17 +32,31 @@ class StateObserver(LeafSystem):
         kinematics: The robot.
         noise: Standard deviations that scale the standard normal ``noise`` input, which has
             2 n_v entries: for positions (tangent space), then for velocities.
+        hand: Name of the reaching frame whose position is the output z_k; the base's by default.
+        mirror: If given, the state s_k is that of the robot's mirror image.
+
+    Raises:
+        ValueError: The robot has no such reaching frame.
     """
 
-    def __init__(self, kinematics: RobotKinematics, noise: ObservationNoise | None = None):
+    def __init__(
+        self,
+        kinematics: RobotKinematics,
+        noise: ObservationNoise | None = None,
+        *,
+        hand: str | None = None,
+        mirror: Mirror | None = None,
+    ):
         super().__init__()
+        self._mirror = mirror
+        self._hand = None if hand is None else kinematics.robot.reaching_frame(hand)
         self._kinematics = kinematics
         self._noise = noise or ObservationNoise()
         self._is_exact = self._noise.position == 0 and self._noise.velocity == 0
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
         self._n_q = n_q
         self.state_names = state_names(kinematics)
-        self.output_names = ["base_x", "base_y", "base_z"]
+        self.output_names = [f"{'base' if hand is None else 'hand'}_{axis}" for axis in "xyz"]
         self._state_port = self.DeclareVectorInputPort("plant_state", n_q + n_v)
         self._noise_port = self.DeclareVectorInputPort("noise", 2 * n_v)
         measured = self.DeclareVectorOutputPort(
@@ -63,9 +78,15 @@ class StateObserver(LeafSystem):
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         measured = self._measured_port.Eval(context)
-        output.SetFromVector(
-            stance_state(self._kinematics, measured[: self._n_q], measured[self._n_q :])
-        )
+        state = stance_state(self._kinematics, measured[: self._n_q], measured[self._n_q :])
+        output.SetFromVector(state if self._mirror is None else self._mirror.stance_state(state))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._measured_port.Eval(context)[4:7])
+        measured = self._measured_port.Eval(context)
+        if self._hand is None:
+            output.SetFromVector(measured[4:7])
+        elif np.isfinite(measured).all():
+            q = measured[: self._n_q]
+            output.SetFromVector(self._kinematics.reaching_position(q, self._hand))
+        else:
+            output.SetFromVector(np.full(3, np.nan))

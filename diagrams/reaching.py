@@ -1,0 +1,390 @@
+"""Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+
+from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.obstacles import Clearance, Obstacle, add_obstacles, filter_collisions
+from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
+from drake_safety.control.robot import (
+    ObservationNoise,
+    actuation_matrix,
+    add_robot,
+    apply_mass_scale,
+    model_file,
+)
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.models import load_robot, robot_files
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.ground import add_ground
+from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.safety_monitor import SafetyMonitor
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
+from drake_safety.systems.whole_body_controller import WholeBodyController
+
+_NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
+_MAX_TRIES = 100
+
+
+@dataclass(kw_only=True)
+class PostureSampling:
+    """Random standing postures. Half-widths about the standing one, unless it says otherwise."""
+
+    base_offset_m: list[float] = field(default_factory=lambda: [0.02, 0.02])
+    """Along x and along y."""
+    base_lowering_m: float = 0.08
+    """How far at most the base is lowered."""
+    tilt_rad: float = 0.03
+    """Of roll, pitch and yaw of the base, each."""
+    joint_offset_rad: float = 0.1
+    """Of every joint that belongs to no leg."""
+    clearance_m: float = 0.02
+    """Least distance of the arms to an obstacle."""
+
+
+@dataclass(kw_only=True)
+class TargetSampling:
+    """The box that targets of the trained hand are drawn from, in the world [m].
+
+    The other hand's targets come from its mirror image.
+    """
+
+    x_m: list[float] = field(default_factory=lambda: [0.45, 1.0])
+    y_m: list[float] = field(default_factory=lambda: [-0.3, 1.3])
+    z_m: list[float] = field(default_factory=lambda: [0.5, 1.6])
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m", "z_m"):
+            bounds = getattr(self, name)
+            if len(bounds) != 2 or not bounds[0] < bounds[1]:
+                raise ValueError(f"target: {name} must be [lowest, highest]; got {bounds}")
+
+    @property
+    def box(self) -> np.ndarray:
+        """Lowest and highest corner, (2, 3) [m]."""
+        return np.array([self.x_m, self.y_m, self.z_m], dtype=float).T
+
+
+@dataclass(kw_only=True)
+class ReachingParameters:
+    """The task's part of the scenario file."""
+
+    hand: str = ""
+    """The hand that episodes are recorded of, a reaching frame of the robot; its first one by
+    default."""
+    plan_duration_s: float = 3.0
+    """Duration of the planned motion [s]."""
+    monitor_period_s: float = 0.02
+    """Time between two looks at the margins [s]."""
+    clearance_range_m: float = 0.1
+    """Distances to obstacles beyond this count as this [m]."""
+    safe_set: ReachingLimits = field(default_factory=ReachingLimits)
+    start: PostureSampling = field(default_factory=PostureSampling)
+    target: TargetSampling = field(default_factory=TargetSampling)
+    obstacles: list[Obstacle] = field(default_factory=list)
+    decorations: list[Obstacle] = field(default_factory=list)
+    """Models without collision geometry, to be seen."""
+
+    def __post_init__(self) -> None:
+        for name in ("plan_duration_s", "monitor_period_s", "clearance_range_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
+
+
+class Reaching(ClosedLoop):
+    """The diagram of the reaching task, for any robot.yaml with feet and reaching frames.
+
+    The other hand is the trained one in the mirror: ``state``, ``desired_preview`` and
+    ``features`` are then those of the mirror image, so that one assessment serves both. All else
+    is as it is.
+
+    Args:
+        scenario: The scenario.
+        variation: Name of the plant variation.
+        assessment: Γ; adds the assessor.
+        meshcat: Adds a visualiser.
+        hand: Which hand reaches; the scenario's by default.
+
+    Raises:
+        ValueError: A robot without feet or reaching frames, an unknown hand, or an assessment of
+            another diagram.
+    """
+
+    Parameters = ReachingParameters
+    online_parameters = ("decorations",)
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        variation: str = "nominal",
+        *,
+        assessment: SafetyAssessment | None = None,
+        meshcat: Meshcat | None = None,
+        hand: str | None = None,
+    ):
+        super().__init__(scenario, variation, assessment)
+        parameters = scenario.parameters
+        horizon = scenario.assessment.horizon
+        robot = load_robot(scenario.robot)
+        if not robot.reaching_frames:
+            raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
+        trained_hand = parameters.hand or next(iter(robot.reaching_frames))
+        robot.reaching_frame(trained_hand)
+        self.hand = trained_hand if hand is None else hand
+        robot.reaching_frame(self.hand)
+        builder = DiagramBuilder()
+
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
+        plant.set_name("plant")
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph, servos=False)
+        add_ground(plant, self.variation.foot_friction or robot.foot_friction)
+        obstacles = add_obstacles(plant, parameters.obstacles)
+        add_obstacles(plant, parameters.decorations)
+        plant.SetUseSampledOutputPorts(False)
+        plant.Finalize()
+        filter_collisions(plant, scene_graph, robot, obstacles)
+        self.plant, self.robot, self.robot_instance = plant, robot, instance
+        self.scene_graph = scene_graph
+
+        nominal = scenario.variation("nominal")
+        kinematics = RobotKinematics(robot, nominal)
+        self.kinematics = kinematics
+        n_q, n_v = kinematics.num_positions, kinematics.num_velocities
+        plant_state = plant.get_state_output_port(instance)
+        self.mirror = None if self.hand == trained_hand else Mirror(kinematics)
+
+        noise = self.variation.observation_noise
+        self._observers = Observers(
+            builder,
+            kinematics,
+            plant_state,
+            scenario.control_period_s,
+            hand=self.hand,
+            mirror=self.mirror,
+        )
+        observer = self._observers.add("observer", noise)
+        assessor_observer = self._observers.add(
+            "assessor_observer", combined(noise, self.variation.input_noise)
+        )
+        true_observer = self._observers.add("true_observer", ObservationNoise())
+
+        planner = builder.AddNamedSystem(
+            "trajectory_planner",
+            TrajectoryPlanner(
+                horizon=horizon,
+                step_s=scenario.step_s,
+                outlook_s=parameters.plan_duration_s,
+                num_outlook=_NUM_OUTLOOK,
+            ),
+        )
+        self._planner = planner
+        desired_preview = planner.GetOutputPort("desired_preview")
+        if self.mirror is not None:
+            reflection = builder.AddNamedSystem(
+                "preview_reflection",
+                MatrixGain(D=np.kron(np.eye(horizon), np.diag(self.mirror.points(np.ones(3))))),
+            )
+            builder.Connect(desired_preview, reflection.get_input_port())
+            desired_preview = reflection.get_output_port()
+
+        controller = builder.AddNamedSystem(
+            "whole_body_controller",
+            WholeBodyController(
+                kinematics,
+                hand=self.hand,
+                actuation_matrix=actuation_matrix(plant, robot, kinematics.joint_names),
+                period_s=scenario.control_period_s,
+                # After the noise of its instant was drawn, within the plant's step.
+                offset_s=0.5 * scenario.time_step_s,
+            ),
+        )
+        self._controller = controller
+        builder.Connect(
+            observer.GetOutputPort("measured_plant_state"), controller.GetInputPort("plant_state")
+        )
+        for name in ("desired_output", "desired_output_rate"):
+            builder.Connect(planner.GetOutputPort(name), controller.GetInputPort(name))
+        builder.Connect(
+            controller.GetOutputPort("actuation"), plant.get_actuation_input_port(instance)
+        )
+        if self.variation.joint_friction_nm:
+            # Without a desired state Drake disarms the servos that are the joints' friction.
+            port = plant.get_desired_state_input_port(instance)
+            rest = builder.AddNamedSystem("rest", ConstantVectorSource(np.zeros(port.size())))
+            builder.Connect(rest.get_output_port(), port)
+
+        clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)
+        self.safe_set = ReachingSafeSet(
+            controller.model, clearance, parameters.safe_set, is_mirrored=self.mirror is not None
+        )
+        monitor = builder.AddNamedSystem(
+            "safety_monitor",
+            SafetyMonitor(self.safe_set, n_q, n_v, period_s=parameters.monitor_period_s),
+        )
+        builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
+        features = builder.AddNamedSystem(
+            "plan_features", PlanFeatures(self.safe_set, n_q, n_v, horizon=_NUM_OUTLOOK)
+        )
+        builder.Connect(
+            assessor_observer.GetOutputPort("measured_plant_state"),
+            features.GetInputPort("plant_state"),
+        )
+        builder.Connect(
+            planner.GetOutputPort("desired_outlook"), features.GetInputPort("desired_preview")
+        )
+
+        self.state_names = assessor_observer.state_names
+        self.output_names = assessor_observer.output_names
+        self.feature_names = features.feature_names
+        self.constraint_names = monitor.constraint_names
+        self.fall_name = self.safe_set.fall_name
+        if assessment is not None:
+            self.check_assessment()
+            assessor = builder.AddNamedSystem(
+                "safety_assessor", SafetyAssessor(assessment, period_s=scenario.step_s)
+            )
+            builder.Connect(
+                assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
+            )
+            builder.Connect(desired_preview, assessor.GetInputPort("desired_preview"))
+            builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
+            for i in range(assessor.num_output_ports()):
+                port = assessor.get_output_port(i)
+                builder.ExportOutput(port, port.get_name())
+        builder.ExportOutput(assessor_observer.GetOutputPort("state"), "state")
+        builder.ExportOutput(true_observer.GetOutputPort("state"), "true_state")
+        builder.ExportOutput(observer.GetOutputPort("output"), "output")
+        builder.ExportOutput(planner.GetOutputPort("desired_output"), "desired_output")
+        builder.ExportOutput(desired_preview, "desired_preview")
+        builder.ExportOutput(features.GetOutputPort("features"), "features")
+        builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
+        builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
+        builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
+        builder.ExportOutput(plant_state, "plant_state")
+        builder.ExportInput(plant.get_applied_spatial_force_input_port(), "applied_spatial_force")
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        self.finish(builder)
+        self._default = self.CreateDefaultContext()
+
+    @classmethod
+    def model_files(cls, scenario: Scenario) -> list[Path]:
+        """The robot's YAML and model file, and the obstacles' files."""
+        files = [model_file(obstacle.model) for obstacle in scenario.parameters.obstacles]
+        return [*robot_files(scenario.robot), *files]
+
+    @property
+    def target_box(self) -> np.ndarray:
+        """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
+        box = self.scenario.parameters.target.box
+        return box if self.mirror is None else np.sort(self.mirror.points(box), axis=0)
+
+    def reset(
+        self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
+    ) -> int:
+        """Samples a standing posture and a target, and plans the hand's motion between them.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            rng: Source of every draw.
+            goal: Target in the world, (3,) [m], in place of a random one.
+
+        Returns:
+            0: nothing disturbs an episode.
+
+        Raises:
+            ValueError: The goal is not three finite numbers.
+        """
+        q = self._sample_posture(rng)
+        drawn = rng.uniform(*self.scenario.parameters.target.box)
+        if goal is None:
+            goal = drawn if self.mirror is None else self.mirror.points(drawn)
+        self._set(context, q, goal)
+        self._observers.reseed(context, rng)
+        return 0
+
+    def reset_standing(self, context: Context, goal: np.ndarray) -> None:
+        """Starts in the standing posture, without noise of its own, towards a target.
+
+        Args:
+            context: The diagram's Context.
+            goal: Target in the world, (3,) [m].
+
+        Raises:
+            ValueError: The goal is not three finite numbers.
+        """
+        self._set(context, self.kinematics.standing_positions(), goal)
+
+    def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
+        sampling = self.scenario.parameters.start
+        kinematics = self.kinematics
+        legs = {name for foot in self.robot.feet.values() for name in foot.joints}
+        is_free = np.array([name not in legs for name in kinematics.joint_names])
+        standing = kinematics.standing_positions()
+        p_WC = kinematics.contact_positions(standing)
+        for _ in range(_MAX_TRIES):
+            joints = kinematics.posture + is_free * sampling.joint_offset_rad * rng.uniform(
+                -1, 1, kinematics.num_joints
+            )
+            offset = np.append(
+                rng.uniform(-1, 1, 2) * sampling.base_offset_m,
+                -rng.uniform(0, sampling.base_lowering_m),
+            )
+            rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
+            X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)
+            if self.mirror is not None:
+                # The mirror image of what the trained hand's episode of these draws begins with.
+                joints = self.mirror.joints(joints)
+            joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, joints)
+            q = kinematics.positions_at(X_WB, joints)
+            margins = self.safe_set.margins(q, np.zeros(kinematics.num_velocities))
+            clearance = margins[self.safe_set.names.index("collision")]
+            if clearance >= sampling.clearance_m and margins.min() > 0:
+                return q
+        raise RuntimeError(
+            f"reaching: none of {_MAX_TRIES} random postures of robot '{self.robot.name}' is in "
+            f"the safe set with a clearance of {sampling.clearance_m} m: narrow 'start'"
+        )
+
+    def _set(self, context: Context, q: np.ndarray, goal: np.ndarray) -> None:
+        goal = np.asarray(goal, dtype=float)
+        if goal.shape != (3,) or not np.isfinite(goal).all():
+            raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
+        kinematics = self.kinematics
+        # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
+        context.SetTime(0.0)
+        context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
+        v = np.zeros(kinematics.num_velocities)
+        self.plant.SetPositionsAndVelocities(
+            plant_context, self.robot_instance, np.concatenate([q, v])
+        )
+        model = self._controller.model
+        self._controller.set_reference(
+            self._controller.GetMyMutableContextFromRoot(context), model.reference(q)
+        )
+        stance_pose = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
+        x, y, yaw = stance_pose
+        X_SW = RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0]).inverse()
+        plan = interpolate(
+            X_SW @ model.reaching_position(q),
+            X_SW @ goal,
+            self.scenario.parameters.plan_duration_s,
+        )
+        self._planner.set_plan(
+            self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose
+        )

@@ -1,0 +1,101 @@
+"""Where the whole body will be when the hand follows a plan: the controller without dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.linalg.lapack import dposv
+
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
+from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
+from drake_safety.control.whole_body_qp import task_errors
+
+_FOOT_WEIGHT = 1e4  # Against task weights of at most some hundreds: feet move by micrometres.
+_LAST_ITERATIONS = 3
+
+
+class KinematicPreview:
+    """Positions of the whole body along a plan of its hand, feet where they are.
+
+    The whole-body controller asks every task for K_p e - K_d ė. Where the gains of all tasks
+    agree and no torque or friction limit is met, the robot moves along the minimisers of
+
+        Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²,  feet still,
+
+    which are found here by a Gauss-Newton step a sample, a few at the last one.
+
+    Args:
+        model: Tasks and weights of the controller, with a hand.
+
+    Raises:
+        ValueError: The model has no hand.
+    """
+
+    def __init__(self, model: WholeBodyModel):
+        if model.hand is None:
+            raise ValueError(
+                f"kinematic preview of robot '{model.kinematics.robot.name}': the model must have "
+                f"a hand, one of {list(model.kinematics.robot.reaching_frames)}"
+            )
+        self.model = model
+
+    def follow(self, q: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Follows a path of the hand.
+
+        Args:
+            q: Positions to start from (n_q,).
+            path: Positions of the hand in the world, (M, 3) [m].
+
+        Returns:
+            Positions at the samples, (M, n_q).
+        """
+        model, kinematics = self.model, self.model.kinematics
+        reference = model.reference(q)
+        contacts = kinematics.contact_positions(q)
+        posture, regularization = model.parameters.posture, model.parameters.regularization
+        diagonal = np.full(model.num_velocities, regularization)
+        diagonal[NUM_BASE_VELOCITIES:] += posture.weight
+        q = q.copy()
+        positions = np.empty((len(path), len(q)))
+        for sample, point in enumerate(path):
+            reference.reaching = PointReference(position=point)
+            for _ in range(_LAST_ITERATIONS if sample == len(path) - 1 else 1):
+                reached, J_feet = kinematics.contact_positions_and_jacobian(q)
+                J, error = task_errors(model, q, reference)
+                weighted = model.weight[:, np.newaxis] * J
+                H = J.T @ weighted
+                H += _FOOT_WEIGHT * (J_feet.T @ J_feet)
+                H.flat[:: len(H) + 1] += diagonal
+                g = error @ weighted + _FOOT_WEIGHT * ((contacts - reached).ravel() @ J_feet)
+                g[NUM_BASE_VELOCITIES:] += posture.weight * (
+                    reference.posture - q[NUM_BASE_POSITIONS:]
+                )
+                _, step, _ = dposv(H, g)
+                # Positions are still those of q: the map of the step into them is exact.
+                q += kinematics.plant.MapVelocityToQDot(kinematics.context, step)
+                q[:4] /= np.linalg.norm(q[:4])
+            positions[sample] = q
+        return positions
+
+
+def chain_joints(model: WholeBodyModel) -> list[int]:
+    """Joints between base and hand, as indices into the robot's joints, (n_chain,)."""
+    kinematics = model.kinematics
+    if model.hand is None:
+        return []
+    # No joint of the chain stands so that it cannot move the hand at all of these postures.
+    moves = np.zeros(kinematics.num_joints, bool)
+    for offset in (0.0, 0.3):
+        q = kinematics.standing_positions()
+        q[NUM_BASE_POSITIONS:] += offset
+        kinematics.set_positions(q)
+        J = kinematics.plant.CalcJacobianSpatialVelocity(
+            kinematics.context,
+            JacobianWrtVariable.kV,
+            model.hand.frame,
+            model.hand.point,
+            kinematics.world_frame,
+            kinematics.world_frame,
+        )
+        moves |= np.abs(J[:, NUM_BASE_VELOCITIES:]).max(axis=0) > 1e-9
+    return np.flatnonzero(moves).tolist()

@@ -1,0 +1,223 @@
+"""The safe set of a robot that reaches: standing, clear of obstacles, off its joint stops."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    fit_stance,
+    planar_pose,
+)
+from drake_safety.control.obstacles import Clearance
+from drake_safety.control.safe_sets import (
+    DIRECTION_NAMES,
+    DIRECTIONS,
+    convex_hull,
+    signed_distance_to_polygon,
+)
+from drake_safety.control.whole_body_model import WholeBodyModel
+
+_NUM_PREVIEWED = 6  # Samples of the plan for which the whole body is previewed.
+
+
+@dataclass(kw_only=True)
+class ReachingLimits:
+    """The numbers of :class:`ReachingSafeSet`."""
+
+    joint_margin_rad: float = 0.03
+    """A joint nearer than this to a stop has left the safe set [rad]."""
+    support_clearance_m: float = 0.03
+    """A contact point carries the support polygon while it is lower than this [m]."""
+    fall_height_share: float = 0.7
+    """Below this share of the base's standing height the robot has fallen."""
+    fall_tilt_rad: float = 0.6
+    """Beyond this angle between the base's z axis and the vertical it has fallen [rad]."""
+
+    def __post_init__(self) -> None:
+        if not self.joint_margin_rad >= 0:
+            raise ValueError(
+                f"safe set: joint_margin_rad must not be negative; got {self.joint_margin_rad}"
+            )
+        if not 0 < self.fall_height_share < 1:
+            raise ValueError(
+                f"safe set: fall_height_share must be in (0, 1); got {self.fall_height_share}"
+            )
+
+
+class ReachingSafeSet:
+    """A robot reaches: base over its feet, arms clear of obstacles, joints off their stops.
+
+    The constraints, in the order of :attr:`names`:
+
+    - ``support_polygon``: signed distance of the base's ground projection to the boundary of
+      the polygon of the feet on the ground [m];
+    - ``collision``: distance of the arms to the nearest obstacle, at most the clearance's range
+      [m];
+    - ``joint_limits``: distance of the joint nearest to a stop, less ``joint_margin_rad`` [rad];
+    - ``fall``: the smaller of the height over the lowest one and of the height that a rigid
+      pendulum of the standing height has left before ``fall_tilt_rad`` [m].
+
+    Features are told from the side of the reaching hand: with ``is_mirrored``, left is right. A
+    hand's features are then those of the other hand in the mirror image of the scene.
+
+    Args:
+        model: Tasks and weights of the controller, with the reaching hand.
+        clearance: The obstacles.
+        limits: The numbers.
+        is_mirrored: Whether features are those of the mirror image.
+    """
+
+    names = ("support_polygon", "collision", "joint_limits", "fall")
+    fall_name = "fall"
+
+    def __init__(
+        self,
+        model: WholeBodyModel,
+        clearance: Clearance,
+        limits: ReachingLimits,
+        *,
+        is_mirrored: bool = False,
+    ):
+        self.model = model
+        self.kinematics = kinematics = model.kinematics
+        self.clearance = clearance
+        self.limits = limits
+        self._preview = KinematicPreview(model)
+        self._reflect = np.array([1.0, -1.0 if is_mirrored else 1.0, 1.0])
+        self._chain = chain_joints(model)
+        frame = next(
+            frame
+            for frame in kinematics.robot.reaching_frames.values()
+            if model.hand is not None and frame.body == model.hand.body.name()
+        )
+        self._radius_m = frame.radius_m
+        self._shoulder = kinematics.plant.GetJointByName(frame.joints[0]).frame_on_parent()
+        self._lowest_height = limits.fall_height_share * kinematics.standing_height
+        self._cos_fall_tilt = math.cos(limits.fall_tilt_rad)
+        chain = [kinematics.joint_names[i] for i in self._chain]
+        self.feature_names = [
+            *(f"goal_{axis}" for axis in "xyz"),
+            *(f"goal_from_shoulder_{axis}" for axis in "xyz"),
+            "goal_distance",
+            *(f"tracking_error_{axis}" for axis in "xyz"),
+            "center_of_mass_height",
+            "base_height",
+            *(f"now_{name}" for name in self.names[:3]),
+            *(f"center_of_mass_margin_{name}" for name in DIRECTION_NAMES),
+            "plan_clearance",
+            "goal_clearance",
+            *(f"preview_lowest_{name}" for name in self.names[:3]),
+            *(f"preview_last_{name}" for name in self.names[:3]),
+            "preview_last_miss",
+            "preview_lowest_center_of_mass_support",
+            *(f"preview_last_stop_{i}" for i in range(len(chain))),
+        ]
+
+    def _support(self, q: np.ndarray) -> list[tuple[float, float]]:
+        """Corners of the polygon of the contact points on the ground; none in the air."""
+        p_WC = self.kinematics.contact_positions(q)
+        clearance = p_WC[:, 2] - self.kinematics.foot_radii
+        is_support = clearance < self.limits.support_clearance_m
+        return convex_hull(p_WC[is_support, :2])
+
+    def _joint_margins(self, q: np.ndarray) -> np.ndarray:
+        """Distance of every joint to its nearer stop, less the margin, (n_j,) [rad]."""
+        lowest, highest = self.kinematics.position_limits.T
+        joints = q[NUM_BASE_POSITIONS:]
+        return np.minimum(joints - lowest, highest - joints) - self.limits.joint_margin_rad
+
+    def _support_margin(self, q: np.ndarray) -> float:
+        corners = self._support(q)
+        if corners:
+            return signed_distance_to_polygon(q[4:6], corners)
+        centre = self.kinematics.contact_positions(q)[:, :2].mean(axis=0)
+        return -float(np.hypot(*(q[4:6] - centre))) - 1e-3
+
+    def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Signed margins (4,) of a state; minus infinity never occurs.
+
+        Args:
+            q: Positions (n_q,).
+            v: Velocities (n_v,); unused by these constraints.
+        """
+        del v
+        w, x, y, z = q[:4].tolist()
+        cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
+        fall = min(
+            float(q[6]) - self._lowest_height,
+            self.kinematics.standing_height * (cos_tilt - self._cos_fall_tilt),
+        )
+        return np.array(
+            [
+                self._support_margin(q),
+                self.clearance.of_arms(q),
+                self._joint_margins(q).min(),
+                fall,
+            ]
+        )
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """The margins now, along the plan, and along a preview of the whole body.
+
+        Args:
+            q: Positions (n_q,), measured.
+            v: Velocities (n_v,), measured; unused but for being finite.
+            preview: Desired positions of the hand from now to the goal, in the stance frame,
+                (M, 3) [m].
+
+        Returns:
+            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; NaN throughout when
+            an argument is not finite.
+        """
+        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+            return np.full(len(self.feature_names), np.nan)
+        kinematics, model = self.kinematics, self.model
+        p_WC = kinematics.contact_positions(q)
+        X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
+        R_SW = X_WS.rotation().matrix().T
+        path = np.asarray(X_WS @ preview.T).T  # In the world.
+        center_of_mass = kinematics.center_of_mass(q)  # Sets the positions.
+        shoulder = self._shoulder.CalcPoseInWorld(kinematics.context).translation()
+        hand = model.reaching_position(q)
+        from_shoulder = self._reflect * (R_SW @ (path[-1] - shoulder))
+        in_stance = np.asarray(X_WS.inverse() @ p_WC.T).T * self._reflect
+        com_in_stance = np.asarray(X_WS.inverse() @ center_of_mass) * self._reflect
+        reach = (in_stance[:, :2] @ DIRECTIONS).max(axis=0) - com_in_stance[:2] @ DIRECTIONS
+        on_path = self.clearance.of_points(path, self._radius_m)
+
+        chosen = np.unique(np.linspace(0, len(path) - 1, _NUM_PREVIEWED + 1).round().astype(int))
+        ahead = self._preview.follow(q, path[chosen[1:] if len(chosen) > 1 else chosen])
+        corners = convex_hull(p_WC[:, :2])
+        previewed = np.array(
+            [
+                (
+                    signed_distance_to_polygon(at[4:6], corners),
+                    self.clearance.of_arms(at),
+                    self._joint_margins(at).min(),
+                )
+                for at in ahead
+            ]
+        )
+        com_support = min(
+            signed_distance_to_polygon(kinematics.center_of_mass(at)[:2], corners) for at in ahead
+        )
+        miss = float(np.linalg.norm(path[-1] - model.reaching_position(ahead[-1])))
+        return np.concatenate(
+            [
+                self._reflect * preview[-1],
+                from_shoulder,
+                [np.linalg.norm(from_shoulder)],
+                self._reflect * (R_SW @ (path[0] - hand)),
+                [center_of_mass[2], q[6]],
+                self.margins(q, v)[:3],
+                reach,
+                [on_path.min(), on_path[-1]],
+                previewed.min(axis=0),
+                previewed[-1],
+                [miss, com_support],
+                self._joint_margins(ahead[-1])[self._chain],
+            ]
+        )
