@@ -126,6 +126,7 @@ def add_robot(
     variation: PlantVariation | None = None,
     *,
     scene_graph: SceneGraph | None = None,
+    servos: bool = True,
 ) -> ModelInstanceIndex:
     """Adds a robot to a plant that is not finalised: model, servos, friction.
 
@@ -138,6 +139,9 @@ def add_robot(
         robot: The robot.
         variation: What differs from the published robot; nothing by default.
         scene_graph: Where the feet's friction is assigned; without it friction is left alone.
+        servos: Whether the joints get robot.yaml's position servos. A robot under torques must
+            have none: in Drake 1.51 an actuator with gains whose desired state is not connected
+            takes no torque either, although it should be as if it had no gains.
 
     Returns:
         The model instance.
@@ -189,7 +193,7 @@ def add_robot(
             actuator = plant.AddJointActuator(f"{joint.name()}_actuator", joint, limit)
             actuated[joint.name()] = actuator
         gains = by_pattern(robot.joint_gains, joint.name(), "gains", robot.name)
-        if gains is not None:
+        if gains is not None and servos:
             actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
         if variation.joint_damping:
             joint.set_default_damping(joint.default_damping() + variation.joint_damping)
@@ -231,8 +235,8 @@ def actuation_matrix(
 ) -> np.ndarray:
     """Maps joint values onto the robot's actuators, by name; friction actuators get none.
 
-    A plant with dry joint friction needs its desired state connected too (zero, or this matrix
-    twice for position servos): without one Drake disarms the servos that hold the joints.
+    A plant with dry joint friction needs its desired state connected too, zero for a robot
+    without servos: friction is a servo of its own, disarmed otherwise.
 
     Args:
         plant: The finalised plant.
