@@ -16,13 +16,13 @@ from drake_safety.control.robot import (
     posture_positions,
     servo_joints,
 )
-from drake_safety.control.robot_model import RobotModel, by_pattern, load_robot_file
+from drake_safety.control.robot_model import by_pattern, load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
 
 
-def plant_of(robot, variation=None):
+def plant_of(robot, variation=None, **options):
     plant = MultibodyPlant(0.001)
-    add_robot(plant, robot, variation)
+    add_robot(plant, robot, variation, **options)
     plant.Finalize()
     return plant
 
@@ -165,8 +165,7 @@ FRICTION_NM = 0.4
 def joint_rate_under(torque, variation, seconds=0.01):
     """Rate of one joint of a robot in free space, after a constant torque without any servo."""
     robot = robot_model("hexapod")
-    robot = RobotModel(**{**vars(robot), "joint_gains": {}})
-    plant = plant_of(robot, variation)
+    plant = plant_of(robot, variation, servos=False)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
     context = plant.CreateDefaultContext()
     joint = plant.GetJointByName("knee_0")

@@ -67,8 +67,10 @@ def solved(model, q, v, reference):
 def clarabel_torques(qp, tolerance):
     """Joint torques of the same program by Drake's Clarabel."""
     program = MathematicalProgram()
-    x = program.NewContinuousVariables(len(qp.g))
-    program.AddQuadraticCost(qp.H, qp.g, x, is_convex=True)
+    n_v, n = len(qp.g), qp.A.shape[1]
+    x = program.NewContinuousVariables(n)
+    program.AddQuadraticCost(qp.H, qp.g, x[:n_v], is_convex=True)
+    program.AddQuadraticCost(np.eye(n - n_v), np.zeros(n - n_v), x[n_v:], is_convex=True)
     is_equality = qp.sense == EQUALITY
     program.AddLinearEqualityConstraint(qp.A[is_equality], qp.lower[is_equality], x)
     program.AddLinearConstraint(
@@ -79,8 +81,7 @@ def clarabel_torques(qp, tolerance):
         options.SetOption(ClarabelSolver.id(), name, tolerance)
     result = ClarabelSolver().Solve(program, None, options)
     assert result.is_success()
-    n_v = len(qp.bias)
-    return qp.A[6:n_v] @ result.GetSolution(x) + qp.bias[6:]
+    return qp.torques(result.GetSolution(x))
 
 
 def test_the_torques_are_those_of_inverse_dynamics_and_the_base_has_none(model):

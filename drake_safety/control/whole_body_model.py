@@ -98,7 +98,9 @@ class WholeBodyModel:
         self.num_joints = kinematics.num_joints
         self.num_velocities = kinematics.num_velocities
         self.mass = kinematics.total_mass
-        self.gravity = plant.gravity_field().gravity_vector()
+        self.weight_W = self.mass * plant.gravity_field().gravity_vector()
+        # Of forces divided by this the cost is the plain square.
+        self.force_scale = self.mass / math.sqrt(parameters.force_regularization)
         self.hand: Hand | None = None
         if hand is not None:
             frame = robot.reaching_frame(hand)
@@ -115,7 +117,12 @@ class WholeBodyModel:
         # Three rows a task: the centre of mass, the bodies in their order, the hand.
         self.num_task_rows = 3 * len(tasks)
         gains = np.array([[task.weight, task.stiffness, task.damping] for task in tasks])
-        self.weight, self.stiffness, self.damping = np.repeat(gains, 3, axis=0).T.copy()
+        weights, self.stiffness, self.damping = np.repeat(gains, 3, axis=0).T.copy()
+        self.task_weights = weights[:, np.newaxis]
+        diagonal = np.full(self.num_velocities, parameters.regularization)
+        diagonal[NUM_BASE_VELOCITIES:] += parameters.posture.weight
+        self.H = np.diag(diagonal)
+        """What the regularisation and the posture add to the cost's matrix, (n_v, n_v)."""
         self.base_turns = np.eye(3, self.num_velocities)
         self.torque_limits = self._torque_limits()
         self._stances: dict[bytes, Stance] = {}
@@ -219,13 +226,13 @@ class Stance:
         num_points = sum(foot.num_points for foot in self.feet)
         num_still = sum(foot.num_rows for foot in self.feet)
         self.still_rows = slice(n_v, n_v + num_still)
-        self.num_variables = n_v + 3 * num_points
+        num_columns = n_v + 3 * num_points
         num_rows = n_v + num_still + 4 * num_points
 
         # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z; together they say f_z ≥ 0.
         mu = parameters.friction
         pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
-        self.A = np.zeros((num_rows, self.num_variables))
+        self.A = np.zeros((num_rows, num_columns))
         self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
         # Without torques of its own the base is a joint whose limit is zero.
         limits = np.concatenate([np.zeros(NUM_BASE_VELOCITIES), model.torque_limits])
@@ -234,8 +241,3 @@ class Stance:
         self.sense = np.zeros(num_rows, np.int32)
         self.sense[:n_v][limits == 0.0] = EQUALITY
         self.sense[self.still_rows] = EQUALITY
-
-        diagonal = np.full(self.num_variables, parameters.regularization)
-        diagonal[n_v:] = parameters.force_regularization
-        diagonal[NUM_BASE_VELOCITIES:n_v] += parameters.posture.weight
-        self.H = np.diag(diagonal)

@@ -14,7 +14,7 @@ from drake_safety.control.whole_body_model import (
     WholeBodyModel,
     WholeBodyReference,
 )
-from drake_safety.control.whole_body_qp import SOLVED, build_qp, solve_qp
+from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
 
 NOT_FINITE = 1
 """Solver status of a tick whose state or set point no controller could use."""
@@ -132,7 +132,7 @@ class WholeBodyController(LeafSystem):
             qp = build_qp(
                 self.model, state[: self._n_q], state[self._n_q :], self._reference(context)
             )
-        except ValueError:
+        except NotFiniteError:
             status = NOT_FINITE
         else:
             solution = solve_qp(qp)
