@@ -1,7 +1,6 @@
 """Obstacles around a robot, and how far its arms and the points of a plan are from them."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import (

@@ -66,6 +66,8 @@ class AssessmentParameters:
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
+        shortest_segment: Steps that a safe episode's segment has at least; 0 stands for the whole
+            horizon (sharpened). For episodes that end at rest.
         first_row_weight: Weight of the segment an episode starts with, relative to the others: they
             are few, and verdicts at planning time rest on them (sharpened).
     """
@@ -92,6 +94,7 @@ class AssessmentParameters:
     margin_unit: float = 0.02
     margin_range: list[float] = field(default_factory=lambda: [-0.03, 0.10])
     first_row_weight: float = 6.0
+    shortest_segment: int = 0
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -106,6 +109,9 @@ class AssessmentParameters:
             self._expect(name, getattr(self, name) >= 1, ">= 1")
         for name in ("cell_length", "learning_rate", "margin_unit", "first_row_weight"):
             self._expect(name, getattr(self, name) > 0.0, "> 0")
+        self._expect(
+            "shortest_segment", 0 <= self.shortest_segment <= self.horizon, "a value in 0..horizon"
+        )
         self._expect("perplexity", self.perplexity >= 1.0, ">= 1")
         self._expect("dropout", 0.0 <= self.dropout < 1.0, "a value in [0, 1)")
         self._expect(
@@ -230,7 +236,12 @@ class SafetyAssessment:
 
         horizon = parameters.horizon
         stride = 1 if parameters.is_sharpened else horizon
-        segments = split(episodes, stride=stride, discount=parameters.discount)
+        segments = split(
+            episodes,
+            stride=stride,
+            discount=parameters.discount,
+            shortest=(parameters.shortest_segment or None) if parameters.is_sharpened else None,
+        )
         every = max(horizon // 2, 1) if parameters.is_sharpened else 1
         first = np.array([episode.first_step for episode in episodes])[segments.episode]
         has_target = (segments.start_row - first) % every == 0

@@ -231,10 +231,13 @@ class Segments:
         return Segments(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
-def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
+def split(
+    episodes: Episodes, *, stride: int, discount: float, shortest: int | None = None
+) -> Segments:
     """Cuts episodes into segments of the assessment horizon H.
 
-    A safe episode gives segments that fit whole into it. An unsafe one gives a segment from every
+    A safe episode gives segments that fit whole into it, or at least ``shortest`` steps of them:
+    where nothing happens after an episode's end, what is left of it is enough. An unsafe one gives a segment from every
     start before its end; those that reach beyond the end are cut short and keep the terminal
     sample. Diverged episodes give none.
 
@@ -242,13 +245,17 @@ def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
         episodes: The episodes; H is `episodes.info.horizon`.
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
+        shortest: Steps that a safe episode's segment has at least; H by default.
 
     Raises:
-        ValueError: The stride is below 1, or no episode is long enough for one segment.
+        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode is long enough for one segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")
     horizon = episodes.info.horizon
+    shortest = horizon if shortest is None else shortest
+    if not 1 <= shortest <= horizon:
+        raise ValueError(f"split: shortest is {shortest}, expected 1..{horizon}")
     offsets = np.arange(horizon)
     names = episodes.info.constraint_names
     pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
@@ -256,7 +263,7 @@ def split(episodes: Episodes, *, stride: int, discount: float) -> Segments:
         if episode.cause == DIVERGED:
             continue
         num_steps = episode.num_steps
-        end = num_steps - horizon + 1 if episode.is_safe else num_steps
+        end = num_steps - shortest + 1 if episode.is_safe else num_steps
         rows = np.arange(episode.first_step, end, stride)
         if rows.size == 0:
             continue

@@ -78,13 +78,17 @@ class Recorder:
         return {"time_s": np.array(self._times), **arrays}
 
 
-def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
+def run_episode(
+    loop: ClosedLoop, index: int = 0, *, seed: int = 0, goal: np.ndarray | None = None
+) -> Episode:
     """Simulates one episode: until it leaves the safe set, or its time is over.
 
     Args:
         loop: The closed loop; it keeps no state, and can be used again.
         index: Number of the episode in its set.
         seed: Seed of the set.
+        goal: What the task's plan shall lead to, in place of a random goal; only for tasks whose
+            ``reset`` takes one.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
@@ -93,7 +97,8 @@ def run_episode(loop: ClosedLoop, index: int = 0, *, seed: int = 0) -> Episode:
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    first_step = loop.reset(context, episode_rng(seed, index))
+    rng = episode_rng(seed, index)
+    first_step = loop.reset(context, rng) if goal is None else loop.reset(context, rng, goal)
     safe = loop.GetOutputPort("safe")
     nothing = EventStatus.DidNothing()
 
@@ -149,6 +154,7 @@ def run_episodes(
     path: str | PathLike[str] | None = None,
     progress: Progress | None = None,
     extra: dict[str, Any] | None = None,
+    goals: np.ndarray | None = None,
     **loop_options: Any,
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
@@ -166,11 +172,16 @@ def run_episodes(
             already holds are not simulated again.
         progress: Called with the number done and the number wanted.
         extra: Stored beside the episodes' info.
+        goals: Goal of each episode in place of random ones, (num_episodes, n_goal).
         **loop_options: For the task.
 
     Raises:
-        ValueError: The folder holds another set.
+        ValueError: The folder holds another set, or there is not one goal an episode.
     """
+    if goals is not None and len(goals) != num_episodes:
+        raise ValueError(f"run_episodes: {len(goals)} goals for {num_episodes} episodes")
+    if goals is not None and path is not None:
+        raise ValueError("run_episodes: episodes of given goals are not kept; leave out 'path'")
     loop = scenario.make_loop(variation, **loop_options)
     info = episodes_info(loop, seed)
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
@@ -181,7 +192,17 @@ def run_episodes(
     writer = EpisodeWriter(path, info, extra) if path is not None else None
     results = parallel_map(
         _episode_batch,
-        [(scenario, variation, loop_options, seed, batch) for batch in batches(remaining)],
+        [
+            (
+                scenario,
+                variation,
+                loop_options,
+                seed,
+                batch,
+                None if goals is None else goals[batch],
+            )
+            for batch in batches(remaining)
+        ],
         num_workers,
     )
     try:
@@ -263,7 +284,16 @@ def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> 
 
 
 def _episode_batch(
-    scenario: Scenario, variation: str, options: dict[str, Any], seed: int, indices: list[int]
+    scenario: Scenario,
+    variation: str,
+    options: dict[str, Any],
+    seed: int,
+    indices: list[int],
+    goals: np.ndarray | None,
 ) -> list[Episode]:
     loop = worker_loop(scenario, variation, options)
-    return [run_episode(loop, index, seed=seed) for index in indices]
+    chosen = [None] * len(indices) if goals is None else list(goals)
+    return [
+        run_episode(loop, index, seed=seed, goal=goal)
+        for index, goal in zip(indices, chosen, strict=True)
+    ]
