@@ -52,9 +52,7 @@ class KinematicPreview:
         model, kinematics = self.model, self.model.kinematics
         reference = model.reference(q)
         contacts = kinematics.contact_positions(q)
-        posture, regularization = model.parameters.posture, model.parameters.regularization
-        diagonal = np.full(model.num_velocities, regularization)
-        diagonal[NUM_BASE_VELOCITIES:] += posture.weight
+        posture = model.parameters.posture
         q = q.copy()
         positions = np.empty((len(path), len(q)))
         for sample, point in enumerate(path):
@@ -62,10 +60,8 @@ class KinematicPreview:
             for _ in range(_LAST_ITERATIONS if sample == len(path) - 1 else 1):
                 reached, J_feet = kinematics.contact_positions_and_jacobian(q)
                 J, error = task_errors(model, q, reference)
-                weighted = model.weight[:, np.newaxis] * J
-                H = J.T @ weighted
-                H += _FOOT_WEIGHT * (J_feet.T @ J_feet)
-                H.flat[:: len(H) + 1] += diagonal
+                weighted = model.task_weights * J
+                H = model.H + J.T @ weighted + _FOOT_WEIGHT * (J_feet.T @ J_feet)
                 g = error @ weighted + _FOOT_WEIGHT * ((contacts - reached).ravel() @ J_feet)
                 g[NUM_BASE_VELOCITIES:] += posture.weight * (
                     reference.posture - q[NUM_BASE_POSITIONS:]

@@ -237,9 +237,9 @@ def split(
     """Cuts episodes into segments of the assessment horizon H.
 
     A safe episode gives segments that fit whole into it, or at least ``shortest`` steps of them:
-    where nothing happens after an episode's end, what is left of it is enough. An unsafe one gives a segment from every
-    start before its end; those that reach beyond the end are cut short and keep the terminal
-    sample. Diverged episodes give none.
+    where nothing happens after an episode's end, what is left of it is enough. An unsafe one gives
+    a segment from every start before its end; those that reach beyond the end are cut short and
+    keep the terminal sample. Diverged episodes give none.
 
     Args:
         episodes: The episodes; H is `episodes.info.horizon`.
@@ -248,7 +248,8 @@ def split(
         shortest: Steps that a safe episode's segment has at least; H by default.
 
     Raises:
-        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode is long enough for one segment.
+        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode is long enough
+            for one segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")

@@ -130,12 +130,16 @@ class ClosedLoop(Diagram):
         del scenario
         return []
 
-    def reset(self, context: Context, rng: np.random.Generator) -> int:
+    def reset(
+        self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
+    ) -> int:
         """Samples an initial state and a plan into the root Context.
 
         Args:
             context: The diagram's Context; what an earlier episode left is overwritten.
             rng: Source of every draw.
+            goal: Where the plan shall lead, in place of a random goal; a task whose plans have
+                no goal of their own leaves this argument out.
 
         Returns:
             The first step whose future is undisturbed: 0, or later when the episode begins
