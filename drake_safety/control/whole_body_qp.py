@@ -119,7 +119,7 @@ def build_qp(
     tasks = _TaskRows(model.num_task_rows, n_v)
     tasks.J[:3] = J_com
     tasks.Jdot_v[:3] = C[3:NUM_BASE_VELOCITIES] / model.mass
-    # The base's columns of J_com hold [p]x of the centre of mass seen from the base.
+    # The base's columns of J_com hold -[p]x of the centre of mass seen from the base.
     p_com = q[4:7] + (J_com[1, 2], J_com[2, 0], J_com[0, 1])
     tasks.follow(_FIRST, reference.center_of_mass, p_com)
     _set_orientations(model, reference, tasks)
