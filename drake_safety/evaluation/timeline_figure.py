@@ -228,9 +228,7 @@ def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
     axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
     axes.annotate(
         "recovery steps",
-        (0.5 * (start + end), 0.0),
-        xytext=(0, 5),
-        textcoords="offset points",
+        (0.5 * (start + end), 0.6),
         ha="center",
         color=RECOVERY_COLOUR,
         fontsize=9,
@@ -258,11 +256,10 @@ def _annotate_trigger(axes: Axes, time_s: np.ndarray, instant_s: float, threshol
     axes.plot(instant_s, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
     axes.annotate(
         "trigger",
-        (instant_s, threshold),
-        xytext=(-7 if is_late else 7, -3),
+        (instant_s, 0.75),
+        xytext=(-5 if is_late else 5, 0),
         textcoords="offset points",
         ha="right" if is_late else "left",
-        va="top",
         color=UNSAFE_COLOUR,
         fontsize=9,
     )
