@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -26,6 +27,19 @@ console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 def new_table(*columns: str, title: str | None = None) -> Table:
     """A table whose cells fold where they do not fit: no figure is cut short."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
+
+
+def margin_words(name: str, margin: float, angular_constraints: Collection[str]) -> str:
+    """A constraint and its margin as one reads them: ``collision, -1.2 cm``.
+
+    Args:
+        name: The constraint.
+        margin: Its margin [m, rad].
+        angular_constraints: Names of those whose margins are angles.
+    """
+    if name in angular_constraints:
+        return f"{name}, {math.degrees(margin):+.1f}°"
+    return f"{name}, {100 * margin:+.1f} cm"
 
 
 def print_path(what: str, path: Path) -> None:

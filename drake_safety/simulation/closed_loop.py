@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from drake_safety.simulation.view import View
+
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
 
 RECORDED_PORTS = (
@@ -35,7 +39,10 @@ class ClosedLoop(Diagram):
     Whoever runs, records or judges episodes uses only what this class promises: the output ports
     below, :meth:`reset`, and the names of what the ports carry. Throws and pictures also use the
     plant: ``plant``, ``robot``, ``robot_instance``, ``kinematics``, ``fall_name`` and
-    ``trigger_port``, which a task with a ball provides. A subclass wires its systems in
+    ``trigger_port``, which a task with a ball provides. A task whose plans have a goal, a point
+    in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, it overrides
+    :meth:`reset_standing`, and it may have :attr:`named_targets` and, with the input port
+    ``applied_spatial_force`` of its plant, :attr:`pushes`. A subclass wires its systems in
     ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
@@ -73,6 +80,15 @@ class ClosedLoop(Diagram):
     output_names: list[str]
     feature_names: list[str]
     constraint_names: list[str]
+
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; those of all others are lengths [m]."""
+    view: View = View()
+    """Where pictures are taken from."""
+    named_targets: Mapping[str, list[float]] = {}
+    """Goals that can be asked for by name, in the world, (3,) [m] each."""
+    pushes: Mapping[str, Push] = {}
+    """Pushes that a run can be disturbed with, by name."""
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
@@ -146,6 +162,28 @@ class ClosedLoop(Diagram):
             with a push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
+
+    @property
+    def target_box(self) -> np.ndarray | None:
+        """Lowest and highest corner of the goals that are drawn, in the world, (2, 3) [m].
+
+        None for a task whose plans have no goal.
+        """
+        return None
+
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts at rest in the robot's own posture; tasks whose plans have a goal override this.
+
+        What the assessor sees of the first instant is without noise.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            goal: Where the plan shall lead, in the world, (3,) [m].
+            rng: Source of the noise that follows; always the same by default.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.
