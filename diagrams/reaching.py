@@ -13,7 +13,13 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.obstacles import Clearance, Obstacle, add_obstacles, filter_collisions
+from drake_safety.control.obstacles import (
+    Clearance,
+    Obstacle,
+    add_obstacles,
+    collision_geometries,
+    filter_collisions,
+)
 from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
 from drake_safety.control.robot import (
     ObservationNoise,
@@ -55,6 +61,22 @@ class PostureSampling:
     clearance_m: float = 0.02
     """Least distance of the arms to an obstacle."""
 
+    def __post_init__(self) -> None:
+        if len(self.base_offset_m) != 2:
+            raise ValueError(f"start: base_offset_m must be [x, y]; got {self.base_offset_m}")
+        for name in (
+            "base_offset_m",
+            "base_lowering_m",
+            "tilt_rad",
+            "joint_offset_rad",
+            "clearance_m",
+        ):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if not ((value >= 0) & np.isfinite(value)).all():
+                raise ValueError(
+                    f"start: {name} must be finite and not negative; got {getattr(self, name)}"
+                )
+
 
 @dataclass(kw_only=True)
 class TargetSampling:
@@ -70,8 +92,8 @@ class TargetSampling:
     def __post_init__(self) -> None:
         for name in ("x_m", "y_m", "z_m"):
             bounds = getattr(self, name)
-            if len(bounds) != 2 or not bounds[0] < bounds[1]:
-                raise ValueError(f"target: {name} must be [lowest, highest]; got {bounds}")
+            if len(bounds) != 2 or not -np.inf < bounds[0] < bounds[1] < np.inf:
+                raise ValueError(f"target: {name} must be [lowest, highest], finite; got {bounds}")
 
     @property
     def box(self) -> np.ndarray:
@@ -121,6 +143,11 @@ class ReachingParameters:
                 raise ValueError(
                     f"reaching: named target '{name}' must be three numbers [m]; got {target}"
                 )
+        if not self.start.clearance_m <= self.clearance_range_m:
+            raise ValueError(
+                f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
+                f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
+            )
 
 
 class Reaching(ClosedLoop):
@@ -138,8 +165,9 @@ class Reaching(ClosedLoop):
         hand: Which hand reaches; the scenario's by default.
 
     Raises:
-        ValueError: A robot without feet or reaching frames, an unknown hand, or an assessment of
-            another diagram.
+        ValueError: A robot without feet or reaching frames, an unknown hand, one that is neither
+            the trained hand nor its mirror image, a decoration that can be touched, or an
+            assessment of another diagram.
     """
 
     Parameters = ReachingParameters
@@ -167,9 +195,9 @@ class Reaching(ClosedLoop):
         if not robot.reaching_frames:
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
         trained_hand = parameters.hand or next(iter(robot.reaching_frames))
-        robot.reaching_frame(trained_hand)
         self.hand = trained_hand if hand is None else hand
-        robot.reaching_frame(self.hand)
+        for name in (trained_hand, self.hand):
+            robot.reaching_frame(name)
         builder = DiagramBuilder()
 
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
@@ -178,9 +206,15 @@ class Reaching(ClosedLoop):
         instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph, servos=False)
         add_ground(plant, self.variation.foot_friction or robot.foot_friction)
         obstacles = add_obstacles(plant, parameters.obstacles)
-        add_obstacles(plant, parameters.decorations)
+        decorations = add_obstacles(plant, parameters.decorations)
         plant.SetUseSampledOutputPorts(False)
         plant.Finalize()
+        for decoration, model in zip(parameters.decorations, decorations, strict=True):
+            if collision_geometries(plant, [model]):
+                raise ValueError(
+                    f"reaching: decoration '{decoration.model}' has collision geometry, which no "
+                    "margin would tell of; list it under 'obstacles'"
+                )
         filter_collisions(plant, scene_graph, robot, obstacles)
         self.plant, self.robot, self.robot_instance = plant, robot, instance
         self.scene_graph = scene_graph
@@ -191,6 +225,12 @@ class Reaching(ClosedLoop):
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
         plant_state = plant.get_state_output_port(instance)
         self.mirror = None if self.hand == trained_hand else Mirror(kinematics)
+        if self.mirror is not None and self.mirror.hand(trained_hand) != self.hand:
+            raise ValueError(
+                f"reaching: scenario '{scenario.name}' is about hand '{trained_hand}' of robot "
+                f"'{robot.name}' and its mirror image '{self.mirror.hand(trained_hand)}'; got "
+                f"'{self.hand}'"
+            )
 
         noise = self.variation.observation_noise
         self._observers = Observers(
@@ -338,6 +378,7 @@ class Reaching(ClosedLoop):
 
         Raises:
             ValueError: The goal is not three finite numbers.
+            RuntimeError: No posture that is drawn is in the safe set.
         """
         q = self._sample_posture(rng)
         drawn = rng.uniform(*self.scenario.parameters.target.box)
@@ -353,7 +394,7 @@ class Reaching(ClosedLoop):
         """Starts in the standing posture towards a target; its first instant is without noise.
 
         Args:
-            context: The diagram's Context.
+            context: The diagram's Context; what an earlier episode left is overwritten.
             goal: Target in the world, (3,) [m].
             rng: Source of the noise that follows; always the same by default.
 
@@ -381,12 +422,13 @@ class Reaching(ClosedLoop):
             )
             rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
             X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)
-            if self.mirror is not None:
-                # The mirror image of what the trained hand's episode of these draws begins with.
-                joints = self.mirror.joints(joints)
             joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, joints)
             q = kinematics.positions_at(X_WB, joints)
-            margins = self.safe_set.margins(q, np.zeros(kinematics.num_velocities))
+            v = np.zeros(kinematics.num_velocities)
+            if self.mirror is not None:
+                # The mirror image of what the trained hand's episode of these draws begins with.
+                q, _ = self.mirror.plant_state(q, v, np.zeros(3))
+            margins = self.safe_set.margins(q, v)
             clearance = margins[self.safe_set.names.index("collision")]
             if clearance >= sampling.clearance_m and margins.min() > 0:
                 return q

@@ -1,4 +1,4 @@
-"""Legged robots for the tests: one that comes with the package, and two made up on the spot.
+"""Legged robots for the tests: one that comes with the package, and three made up on the spot.
 
 The made-up ones share no link name, number of legs or foot shape with any robot of the package.
 """
@@ -32,11 +32,14 @@ def _link(name, mass, size, centre, collisions=()):
 
 
 def _joint(name, parent, child, origin, axis, limits=(-2.5, 2.5), yaw=0.0):
+    """A hinge; without limits it turns without stops."""
     x, y, z = origin
+    kind = "continuous" if limits is None else "revolute"
+    stops = "" if limits is None else f'lower="{limits[0]}" upper="{limits[1]}"'
     return (
-        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{x} {y} {z}" rpy="0 0 {yaw}"/><axis xyz="{axis}"/>'
-        f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="40" velocity="20"/></joint>'
+        f'<limit {stops} effort="40" velocity="20"/></joint>'
     )
 
 
@@ -86,10 +89,9 @@ def write_hexapod(folder: Path) -> Path:
     )
 
 
-def write_biped(folder: Path) -> Path:
-    """Writes two six-joint legs whose feet touch at four points each; returns its robot.yaml."""
-    parts = [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1))]
-    feet = {}
+def _legs():
+    """Two six-joint legs under a pelvis, whose feet touch at four points each: parts and feet."""
+    parts, feet = [], {}
     corners = [[x, y, -0.05] for x in (-0.06, 0.1) for y in (-0.04, 0.04)]
     for side, y in (("left", 0.1), ("right", -0.1)):
         links = [f"{side}_{n}" for n in ("yaw", "roll", "thigh", "shin", "ankle", "sole")]
@@ -116,10 +118,16 @@ def write_biped(folder: Path) -> Path:
             "radius_m": 0.005,
             "joints": joints,
         }
+    return parts, feet
+
+
+def write_biped(folder: Path) -> Path:
+    """Writes a pelvis on two legs; returns its robot.yaml."""
+    legs, feet = _legs()
     return _write(
         folder,
         "biped",
-        parts,
+        [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1)), *legs],
         {
             "base": "pelvis",
             "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
@@ -130,6 +138,57 @@ def write_biped(folder: Path) -> Path:
             # It has no arms, so it reaches with its head.
             "reaching_frames": {"head": {"body": "pelvis", "point": [0.0, 0.0, 0.25]}},
             "whole_body": {"orientation": {"pelvis": {"weight": 20.0}}},
+        },
+    )
+
+
+HAND_POINT, HAND_RADIUS_M = (0.22, 0.0, 0.0), 0.04
+
+
+def write_porter(folder: Path) -> Path:
+    """Writes two legs with two arms of three joints and a wrist; returns its robot.yaml.
+
+    The wrists turn without stops. A hand is a sphere, and nothing else of an arm can be touched.
+    """
+    legs, feet = _legs()
+    parts = [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1)), *legs]
+    hands = {}
+    for side, y in (("left", 1), ("right", -1)):
+        links = [f"{side}_{n}" for n in ("shoulder", "upper_arm", "forearm", "palm")]
+        joints = [f"{side}_{n}" for n in ("shoulder_y", "shoulder_x", "elbow", "wrist")]
+        palm = _link(links[3], 0.2, (0.05, 0.05, 0.05), HAND_POINT, [(HAND_POINT, HAND_RADIUS_M)])
+        roll = (-0.3, 2.0) if side == "left" else (-2.0, 0.3)
+        parts += [
+            _link(links[0], 0.3, (0.05, 0.05, 0.05), (0, 0, 0)),
+            _link(links[1], 0.8, (0.06, 0.06, 0.25), (0, 0, -0.12)),
+            _link(links[2], 0.4, (0.2, 0.05, 0.05), (0.1, 0, 0)),
+            palm,
+            _joint(joints[0], "pelvis", links[0], (0, 0.2 * y, 0.25), "0 1 0"),
+            _joint(joints[1], links[0], links[1], (0, 0, 0), "1 0 0", roll),
+            _joint(joints[2], links[1], links[2], (0, 0, -0.25), "0 1 0", (-1.5, 1.5)),
+            _joint(joints[3], links[2], links[3], (0, 0, 0), "1 0 0", None),
+        ]
+        hands[side] = {
+            "body": links[3],
+            "point": list(HAND_POINT),
+            "radius_m": HAND_RADIUS_M,
+            "joints": joints,
+        }
+    return _write(
+        folder,
+        "porter",
+        parts,
+        {
+            "base": "pelvis",
+            "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
+            "feet": feet,
+            "effort_limits": {".*": 80.0},
+            "mirror": {"left_(.*)": r"right_\1"},
+            "reaching_frames": hands,
+            "whole_body": {
+                "orientation": {"pelvis": {"weight": 20.0}},
+                "reaching": {"weight": 200.0},
+            },
         },
     )
 
@@ -146,7 +205,7 @@ ROBOT_NAMES = ("laikago", "hexapod", "biped")
 @functools.cache
 def robot_model(name: str) -> RobotModel:
     """A robot of the package by name, or one of the made-up ones."""
-    writers = {"hexapod": write_hexapod, "biped": write_biped}
+    writers = {"hexapod": write_hexapod, "biped": write_biped, "porter": write_porter}
     if name not in writers:
         return load_robot(name)
     return load_robot_file(writers[name](Path(tempfile.mkdtemp(prefix=name))))

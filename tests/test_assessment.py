@@ -277,3 +277,48 @@ def test_the_defaults_are_the_papers_table():
     assert parameters.initial_uncertainty == 0.3
     assert parameters.min_count == 5
     assert (parameters.resolution, parameters.cell_length) == (14, 10.0)
+
+
+def test_features_may_enter_a_second_time_spread_out_near_zero(episodes, held_out):
+    parameters = AssessmentParameters(feature_unit=0.05, raw_input_scale=0.2, **QUICK)
+    doubled = SafetyAssessment(parameters).fit(episodes)
+    info = doubled.info_
+    num_raw = len(info.state_names) + info.horizon * len(info.output_names)
+    assert doubled.embedding_.num_inputs == num_raw + 2 * len(info.feature_names)
+    state, preview, features = inputs(held_out, slice(0, 20))
+    result = doubled.predict(state, preview, features)
+    one = doubled.predict_one(state[3], preview[3], features[3])
+    np.testing.assert_allclose(one.belief, result.belief[3], atol=1e-5)
+    features[:] = np.nan
+    assert np.all(doubled.predict(state, preview, features).belief == EMPTY)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"raw_input_scale": 0.0}, {"feature_unit": -1.0}, {"shortest_segment": 11}]
+)
+def test_scales_and_lengths_that_mean_nothing_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        AssessmentParameters(**wrong)
+
+
+def trained_on(episodes, **changes):
+    quick = QUICK | {"epochs": 1, "ensemble_size": 1} | changes
+    return SafetyAssessment(AssessmentParameters(**quick)).fit(episodes)
+
+
+def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_for(episodes):
+    few = episodes[:40]
+    sizes = {}
+    for shortest in (0, 10, 3):
+        learned = trained_on(few, shortest_segment=shortest)
+        expected = split(few, stride=1, discount=0.99, shortest=shortest or None)
+        sizes[shortest] = learned.training_score_.shape[-1]
+        assert sizes[shortest] == len(expected)
+    assert sizes[0] == sizes[10] < sizes[3]  # The horizon is 10.
+
+
+def test_the_papers_mode_knows_no_short_segments(episodes):
+    few = episodes[:60]
+    learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
+    sizes = {assessment.training_score_.shape[-1] for assessment in learned}
+    assert sizes == {len(split(few, stride=10, discount=0.99))}

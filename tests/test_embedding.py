@@ -49,6 +49,7 @@ def data():
         is_unsafe=x[:, 0] > 0.5,
         margins=(0.02 * (0.5 - x[:, :1])),
         sample_weight=np.ones(600),
+        input_scale=np.ones(4),
     )
 
 
@@ -130,7 +131,9 @@ def test_a_sample_weight_draws_the_map_towards_its_samples(data):
     agreement = []
     for weight in (0.01, 20.0):
         sample_weight = np.where(contrary, weight, 1.0)
-        trained = train_map(MapData(**shared, sample_weight=sample_weight), settings, seed=0)
+        trained = train_map(
+            MapData(**shared, sample_weight=sample_weight, input_scale=np.ones(4)), settings, seed=0
+        )
         logit = stack_members([trained], num_margins=1).evaluate(x[contrary]).unsafe_logit[0]
         agreement.append(((logit > 0.0) == is_unsafe[contrary]).mean())
     assert agreement[1] > agreement[0]

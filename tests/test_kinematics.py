@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
 from drake_safety.control.robot import PlantVariation, add_robot
 from drake_safety.control.robot_model import RobotModel, load_robot_file
-from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model, write_hexapod
+from legged_robots import ROBOT_NAMES, edited, robot_kinematics, robot_model, write_hexapod
 
 G = 9.81
 
@@ -204,3 +204,9 @@ def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
     joints = [joint for joint in joints if joint.num_velocities() == 1]
     joints.sort(key=lambda joint: joint.velocity_start())
     assert [joint.name() for joint in joints] == kinematics.joint_names
+
+
+def test_a_robot_without_feet_is_refused(tmp_path):
+    robot = load_robot_file(edited(write_hexapod(tmp_path), feet={}))
+    with pytest.raises(ValueError, match="robot 'hexapod' has no feet to stand on"):
+        RobotKinematics(robot)

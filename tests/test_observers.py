@@ -14,15 +14,15 @@ NOISE = ObservationNoise(position=0.01, velocity=0.02)
 class Bench:
     """A robot that stands still, looked at without noise, with noise, and with the same again."""
 
-    def __init__(self):
-        kinematics = robot_kinematics("laikago")
+    def __init__(self, name="laikago", **options):
+        kinematics = robot_kinematics(name)
         n_v = kinematics.num_velocities
         q = np.concatenate(
             [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, kinematics.standing_height], kinematics.posture]
         )
         builder = DiagramBuilder()
         source = builder.AddSystem(ConstantVectorSource(np.concatenate([q, np.zeros(n_v)])))
-        self.observers = Observers(builder, kinematics, source.get_output_port(), 0.01)
+        self.observers = Observers(builder, kinematics, source.get_output_port(), 0.01, **options)
         self.exact = self.observers.add("exact", ObservationNoise())
         self.noisy = self.observers.add("noisy", NOISE)
         self.same = self.observers.add("same", NOISE)
@@ -77,3 +77,23 @@ def test_independent_noise_adds_in_squares():
     both = combined(ObservationNoise(position=3.0), ObservationNoise(position=4.0, velocity=2.0))
     assert both == ObservationNoise(position=5.0, velocity=2.0)
     assert combined(NOISE, ObservationNoise()) == NOISE
+
+
+def test_options_are_those_of_every_observer():
+    bench = Bench("porter", hand="right")
+    for observer in (bench.exact, bench.noisy):
+        assert observer.output_names == ["hand_x", "hand_y", "hand_z"]
+
+
+def test_noise_is_new_every_period_and_held_in_between(bench):
+    simulator = Simulator(bench.diagram)
+    context = simulator.get_mutable_context()
+    bench.observers.reseed(context, np.random.default_rng(0))
+    simulator.Initialize()
+    port, of = bench.noisy.GetOutputPort("state"), bench.noisy.GetMyContextFromRoot(context)
+    seen = []
+    for time in (0.001, 0.009, 0.011):
+        simulator.AdvanceTo(time)
+        seen.append(port.Eval(of).copy())
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[1], seen[2])

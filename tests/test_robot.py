@@ -13,6 +13,8 @@ from drake_safety.control.robot import (
     actuation_matrix,
     add_robot,
     apply_mass_scale,
+    model_file,
+    models_package_xml,
     posture_positions,
     servo_joints,
 )
@@ -229,3 +231,23 @@ def test_actuation_of_joints_that_are_not_given_is_refused():
     robot = robot_model("biped")
     with pytest.raises(ValueError, match=r"no joint 'right_hip_z'|no joint 'left_hip_z'"):
         actuation_matrix(plant_of(robot), robot, ["left_knee"])
+
+
+def test_a_file_of_the_package_is_found_by_its_url():
+    path = model_file("package://drake_safety_models/scenes/bookshelf.urdf", "/elsewhere")
+    assert path == models_package_xml().parent / "scenes" / "bookshelf.urdf"
+    assert path.is_file()
+
+
+def test_a_file_of_drakes_own_package_is_found_by_its_url():
+    assert model_file("package://drake/package.xml").is_file()
+
+
+def test_a_path_starts_in_the_folder_unless_it_is_absolute(tmp_path):
+    assert model_file("meshes/shelf.sdf", str(tmp_path)) == tmp_path / "meshes" / "shelf.sdf"
+    assert model_file(str(tmp_path / "shelf.sdf"), "/elsewhere") == tmp_path / "shelf.sdf"
+
+
+def test_an_unknown_package_is_named():
+    with pytest.raises(ValueError, match=r"'package://shelves/a.urdf': no package 'shelves'"):
+        model_file("package://shelves/a.urdf")

@@ -10,7 +10,7 @@ from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import episode_rng, parallel_map
 from drake_safety.simulation.scenario import parse_scenario
-from gliding_task import SCENARIO
+from gliding_task import SCENARIO, Gliding
 
 ARRAYS = ("time_s", "state", "true_state", "output", "desired_output", "desired_preview")
 ARRAYS += ("features", "margins")
@@ -233,3 +233,69 @@ def test_sixty_four_episodes_are_the_same_to_the_bit_with_one_and_two_workers():
     alone = run_episodes(scenario, 64, num_workers=1)
     assert_identical(run_episodes(scenario, 64, num_workers=2), alone)
     assert 0.2 < alone.num_unsafe / 64 < 0.8
+
+
+class Aimed(Gliding):
+    """Glides from where it is told to."""
+
+    def reset(self, context, rng, goal=None):
+        super().reset(context, rng)
+        if goal is not None:
+            mass_context = self.mass.GetMyMutableContextFromRoot(context)
+            mass_context.SetDiscreteState([goal[0], 0.0])
+        return 0
+
+
+def aimed():
+    text = SCENARIO.replace("gliding_task:Gliding", "test_rollouts:Aimed")
+    return parse_scenario(text, name="aimed", folder=Path())
+
+
+def test_a_goal_is_handed_to_the_task():
+    episode = run_episode(aimed().make_loop(), 3, goal=np.array([0.25]))
+    np.testing.assert_array_equal(episode.state[:, 0], 0.25)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_every_episode_gets_its_own_goal_whoever_runs_it(num_workers):
+    goals = np.linspace(-0.4, 0.4, 10)[:, np.newaxis]
+    for given in (goals, goals.tolist()):
+        episodes = run_episodes(aimed(), 10, goals=given, num_workers=num_workers)
+        np.testing.assert_array_equal([e.state[0, 0] for e in episodes], goals[:, 0])
+        assert [e.index for e in episodes] == list(range(10))
+
+
+def test_an_episode_with_a_goal_is_the_same_alone_as_in_a_set():
+    goals = np.linspace(-0.4, 0.4, 6)[:, np.newaxis]
+    episodes = run_episodes(aimed(), 6, goals=goals, seed=2, num_workers=1)
+    loop = aimed().make_loop()
+    alone = [run_episode(loop, i, seed=2, goal=goal) for i, goal in enumerate(goals)]
+    assert_identical(alone, episodes)
+
+
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        (np.zeros((2, 1)), r"one row an episode, of 3 episodes; got shape \(2, 1\)"),
+        (np.zeros(3), r"one row an episode, of 3 episodes; got shape \(3,\)"),
+        ([[0.0], [np.nan], [0.1]], r"goals must be finite; goal 1 is \[nan\]"),
+    ],
+)
+def test_goals_that_are_not_one_finite_row_an_episode_are_refused(goals, message):
+    with pytest.raises(ValueError, match=message):
+        run_episodes(aimed(), 3, goals=goals, num_workers=1)
+
+
+def test_a_task_whose_plans_have_no_goal_says_so():
+    with pytest.raises(ValueError, match="task 'Gliding' has plans without a goal"):
+        run_episode(gliding().make_loop(), goal=np.zeros(1))
+    with pytest.raises(ValueError, match="task 'Gliding' has plans without a goal"):
+        run_episodes(gliding(), 1, goals=np.zeros((1, 1)), num_workers=1)
+
+
+def test_what_a_folder_cannot_tell_apart_is_not_kept_in_one(tmp_path):
+    with pytest.raises(ValueError, match=r"with \['goals'\] are not kept; leave out 'path'"):
+        run_episodes(aimed(), 1, goals=np.zeros((1, 1)), path=tmp_path)
+    with pytest.raises(ValueError, match=r"episodes with \['recovery'\] are not kept"):
+        run_episodes(load_scenario("laikago_balancing"), 1, path=tmp_path, recovery=True)
+    assert not list(tmp_path.iterdir())

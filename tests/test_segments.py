@@ -92,3 +92,42 @@ def test_an_unknown_cause_is_refused_with_those_that_exist(episodes):
 def test_a_set_without_one_whole_segment_is_refused(episodes):
     with pytest.raises(ValueError, match="none of the 0 episodes"):
         split(episodes[:0], stride=1, discount=0.99)
+
+
+@pytest.mark.parametrize("shortest", [1, 4, HORIZON])
+def test_what_is_left_of_a_safe_episode_is_enough_where_a_segment_may_be_short(episodes, shortest):
+    segments = split(episodes, stride=1, discount=0.99, shortest=shortest)
+    for position, episode in enumerate(episodes):
+        rows = segments.start_row[segments.episode == position]
+        num_starts = episode.num_steps - shortest + 1 if episode.is_safe else episode.num_steps
+        np.testing.assert_array_equal(rows, np.arange(max(num_starts, 0)))
+    assert segments.remaining_steps[~segments.is_unsafe].min() == shortest
+    expected = np.minimum(HORIZON, segments.remaining_steps + 1)
+    np.testing.assert_array_equal(segments.length, expected)
+
+
+def test_short_segments_change_none_of_the_others(episodes):
+    whole = split(episodes, stride=1, discount=0.99)
+    short = split(episodes, stride=1, discount=0.99, shortest=2)
+    kept = short.take(short.is_unsafe | (short.remaining_steps >= HORIZON))
+    for field in dataclasses.fields(whole):
+        np.testing.assert_array_equal(getattr(kept, field.name), getattr(whole, field.name))
+
+
+@pytest.mark.parametrize("shortest", [0, -1, HORIZON + 1])
+def test_a_shortest_segment_beyond_the_horizon_is_refused(episodes, shortest):
+    with pytest.raises(ValueError, match=rf"shortest is {shortest}, expected 1\.\.{HORIZON}"):
+        split(episodes, stride=1, discount=0.99, shortest=shortest)
+
+
+def test_episodes_too_short_for_any_segment_are_refused_with_the_length_wanted(episodes):
+    safe = next(episode for episode in episodes if episode.is_safe)
+    arrays = {
+        field.name: getattr(safe, field.name)[:4]
+        for field in dataclasses.fields(safe)
+        if isinstance(getattr(safe, field.name), np.ndarray)
+    }
+    short = Episodes(episodes.info, [dataclasses.replace(safe, **arrays)])
+    assert len(split(short, stride=1, discount=0.99, shortest=3)) == 1
+    with pytest.raises(ValueError, match=r"none of the 1 episodes .* a segment of 5 steps"):
+        split(short, stride=1, discount=0.99, shortest=5)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import add_noise, stance_state
 from drake_safety.control.robot import ObservationNoise
 from drake_safety.systems.state_observer import StateObserver
@@ -19,8 +20,8 @@ def plant_state(kinematics):
     return np.concatenate([q, np.linspace(-1, 1, kinematics.num_velocities)])
 
 
-def observed(kinematics, noise=None, draws=None, x=None):
-    observer = StateObserver(kinematics, noise)
+def observed(kinematics, noise=None, draws=None, x=None, **options):
+    observer = StateObserver(kinematics, noise, **options)
     context = observer.CreateDefaultContext()
     x = plant_state(kinematics) if x is None else x
     observer.GetInputPort("plant_state").FixValue(context, x)
@@ -85,3 +86,51 @@ def test_a_plant_state_that_is_not_finite_is_reported_as_no_number(value, entry,
     values = observed(kinematics, noise, np.ones(2 * kinematics.num_velocities), x)
     assert np.isnan(values["state"]).all()
     assert not np.isfinite(values["measured_plant_state"]).all()
+
+
+@pytest.mark.parametrize(("name", "hand"), [("porter", "left"), ("porter", "right")])
+def test_with_a_hand_the_output_is_where_the_measured_hand_is(name, hand):
+    kinematics = robot_kinematics(name)
+    frame = kinematics.robot.reaching_frame(hand)
+    x, n_q = plant_state(kinematics), kinematics.num_positions
+    draws = np.random.default_rng(0).normal(size=2 * kinematics.num_velocities)
+    for noise in (None, NOISE):
+        values = observed(kinematics, noise, draws, hand=hand)
+        q = values["measured_plant_state"][:n_q]
+        expected = kinematics.reaching_position(q, frame)
+        np.testing.assert_array_equal(values["output"], expected)
+        without = observed(kinematics, noise, draws)
+        for port in ("measured_plant_state", "state"):
+            np.testing.assert_array_equal(values[port], without[port])
+    assert np.any(values["output"] != kinematics.reaching_position(x[:n_q], frame))
+    assert StateObserver(kinematics, hand=hand).output_names == ["hand_x", "hand_y", "hand_z"]
+
+
+def test_an_unknown_hand_is_answered_with_the_hands_there_are():
+    with pytest.raises(ValueError, match=r"'porter' has no reaching frame 'tail'; it has \['left'"):
+        StateObserver(robot_kinematics("porter"), hand="tail")
+
+
+def test_a_mirror_reflects_the_state_and_nothing_else():
+    kinematics = robot_kinematics("porter")
+    mirror, n_q = Mirror(kinematics), kinematics.num_positions
+    draws = np.random.default_rng(0).normal(size=2 * kinematics.num_velocities)
+    plain = observed(kinematics, NOISE, draws, hand="left")
+    mirrored = observed(kinematics, NOISE, draws, hand="left", mirror=mirror)
+    for port in ("measured_plant_state", "output"):
+        np.testing.assert_array_equal(mirrored[port], plain[port])
+    q, v = np.split(plain["measured_plant_state"], [n_q])
+    expected = stance_state(kinematics, *mirror.plant_state(q, v))
+    np.testing.assert_allclose(mirrored["state"], expected, atol=1e-9)
+    assert np.abs(mirrored["state"] - plain["state"]).max() > 0.1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("entry", [0, 4, 10, -1])
+def test_of_a_plant_state_that_is_not_finite_a_hand_is_nowhere(value, entry):
+    kinematics = robot_kinematics("porter")
+    x = plant_state(kinematics)
+    x[entry] = value
+    values = observed(kinematics, x=x, hand="left", mirror=Mirror(kinematics))
+    assert np.isnan(values["output"]).all()
+    assert np.isnan(values["state"]).all()

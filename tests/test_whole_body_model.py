@@ -110,14 +110,6 @@ def test_an_unknown_hand_is_answered_with_the_hands_there_are():
         WholeBodyModel(robot_kinematics("biped")).reaching_position(np.zeros(19))
 
 
-def test_a_robot_without_feet_is_refused():
-    kinematics = copy.copy(robot_kinematics("biped"))
-    kinematics.robot = copy.deepcopy(kinematics.robot)
-    kinematics.robot.feet = {}
-    with pytest.raises(ValueError, match="robot 'biped' has no feet to stand on"):
-        WholeBodyModel(kinematics)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg.lapack import dposv
 
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
-from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    RobotKinematics,
+)
+from drake_safety.control.whole_body_model import Hand, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
 
 _FOOT_WEIGHT = 1e4  # Against task weights of at most some hundreds: feet move by micrometres.
@@ -38,6 +41,7 @@ class KinematicPreview:
                 f"a hand, one of {list(model.kinematics.robot.reaching_frames)}"
             )
         self.model = model
+        self.hand = model.hand
 
     def follow(self, q: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Follows a path of the hand.
@@ -74,24 +78,13 @@ class KinematicPreview:
         return positions
 
 
-def chain_joints(model: WholeBodyModel) -> list[int]:
+def chain_joints(kinematics: RobotKinematics, hand: Hand) -> list[int]:
     """Joints between base and hand, as indices into the robot's joints, (n_chain,)."""
-    kinematics = model.kinematics
-    if model.hand is None:
-        return []
-    # No joint of the chain stands so that it cannot move the hand at all of these postures.
-    moves = np.zeros(kinematics.num_joints, bool)
-    for offset in (0.0, 0.3):
-        q = kinematics.standing_positions()
-        q[NUM_BASE_POSITIONS:] += offset
-        kinematics.set_positions(q)
-        J = kinematics.plant.CalcJacobianSpatialVelocity(
-            kinematics.context,
-            JacobianWrtVariable.kV,
-            model.hand.frame,
-            model.hand.point,
-            kinematics.world_frame,
-            kinematics.world_frame,
-        )
-        moves |= np.abs(J[:, NUM_BASE_VELOCITIES:]).max(axis=0) > 1e-9
-    return np.flatnonzero(moves).tolist()
+    plant = kinematics.plant
+    instance = plant.GetModelInstanceByName(kinematics.robot.name)
+    return [
+        i
+        for i, name in enumerate(kinematics.joint_names)
+        if hand.body.index()
+        in plant.GetBodiesKinematicallyAffectedBy([plant.GetJointByName(name, instance).index()])
+    ]

@@ -34,11 +34,13 @@ class RobotKinematics:
         variation: Mass that the controller believes in.
 
     Raises:
-        ValueError: The robot's base is not the only floating body, or a foot names an unknown
-            body or joint.
+        ValueError: The robot has no feet, its base is not the only floating body, or a foot names
+            an unknown body or joint.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
+        if not robot.feet:
+            raise ValueError(f"robot '{robot.name}' has no feet to stand on")
         self.robot = robot
         self.plant = MultibodyPlant(time_step=0.0)
         add_robot(self.plant, robot)

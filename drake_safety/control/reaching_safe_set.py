@@ -6,11 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    fit_stance,
-    planar_pose,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, fit_stance, planar_pose
 from drake_safety.control.obstacles import Clearance
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
@@ -37,13 +33,18 @@ class ReachingLimits:
     """Beyond this angle between the base's z axis and the vertical it has fallen [rad]."""
 
     def __post_init__(self) -> None:
-        if not self.joint_margin_rad >= 0:
-            raise ValueError(
-                f"safe set: joint_margin_rad must not be negative; got {self.joint_margin_rad}"
-            )
+        for name in ("joint_margin_rad", "support_clearance_m"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"safe set: {name} must be finite and not negative; got {getattr(self, name)}"
+                )
         if not 0 < self.fall_height_share < 1:
             raise ValueError(
                 f"safe set: fall_height_share must be in (0, 1); got {self.fall_height_share}"
+            )
+        if not 0 < self.fall_tilt_rad < math.pi:
+            raise ValueError(
+                f"safe set: fall_tilt_rad must be in (0, pi); got {self.fall_tilt_rad}"
             )
 
 
@@ -56,7 +57,8 @@ class ReachingSafeSet:
       the polygon of the feet on the ground [m];
     - ``collision``: distance of the arms to the nearest obstacle, at most the clearance's range
       [m];
-    - ``joint_limits``: distance of the joint nearest to a stop, less ``joint_margin_rad`` [rad];
+    - ``joint_limits``: distance of the joint nearest to a stop, at most half a turn, less
+      ``joint_margin_rad`` [rad];
     - ``fall``: the smaller of the height over the lowest one and of the height that a rigid
       pendulum of the standing height has left before ``fall_tilt_rad`` [m].
 
@@ -68,6 +70,9 @@ class ReachingSafeSet:
         clearance: The obstacles.
         limits: The numbers.
         is_mirrored: Whether features are those of the mirror image.
+
+    Raises:
+        ValueError: The model has no hand, or the hand no joints.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")
@@ -87,18 +92,17 @@ class ReachingSafeSet:
         self.clearance = clearance
         self.limits = limits
         self._preview = KinematicPreview(model)
+        self._hand = hand = self._preview.hand
+        if not hand.joints:
+            raise ValueError(
+                f"robot '{kinematics.robot.name}', reaching frame '{hand.name}': joints must be "
+                "those of its arm, from the torso to the hand; got none"
+            )
+        self._shoulder = kinematics.plant.GetJointByName(hand.joints[0]).frame_on_parent()
+        self._chain = chain_joints(kinematics, hand)
         self._reflect = np.array([1.0, -1.0 if is_mirrored else 1.0, 1.0])
-        self._chain = chain_joints(model)
-        frame = next(
-            frame
-            for frame in kinematics.robot.reaching_frames.values()
-            if model.hand is not None and frame.body == model.hand.body.name()
-        )
-        self._radius_m = frame.radius_m
-        self._shoulder = kinematics.plant.GetJointByName(frame.joints[0]).frame_on_parent()
         self._lowest_height = limits.fall_height_share * kinematics.standing_height
         self._cos_fall_tilt = math.cos(limits.fall_tilt_rad)
-        chain = [kinematics.joint_names[i] for i in self._chain]
         self.feature_names = [
             *(f"goal_{axis}" for axis in "xyz"),
             *(f"goal_from_shoulder_{axis}" for axis in "xyz"),
@@ -114,7 +118,7 @@ class ReachingSafeSet:
             *(f"preview_last_{name}" for name in self.names[:3]),
             "preview_last_miss",
             "preview_lowest_center_of_mass_support",
-            *(f"preview_last_stop_{i}" for i in range(len(chain))),
+            *(f"preview_last_stop_{i}" for i in range(len(self._chain))),
         ]
 
     def _support(self, q: np.ndarray) -> list[tuple[float, float]]:
@@ -128,7 +132,9 @@ class ReachingSafeSet:
         """Distance of every joint to its nearer stop, less the margin, (n_j,) [rad]."""
         lowest, highest = self.kinematics.position_limits.T
         joints = q[NUM_BASE_POSITIONS:]
-        return np.minimum(joints - lowest, highest - joints) - self.limits.joint_margin_rad
+        # A joint that turns without stops has a margin too, a finite one.
+        distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
+        return distance - self.limits.joint_margin_rad
 
     def _support_margin(self, q: np.ndarray) -> float:
         corners = self._support(q)
@@ -187,7 +193,7 @@ class ReachingSafeSet:
         in_stance = np.asarray(X_WS.inverse() @ p_WC.T).T * self._reflect
         com_in_stance = np.asarray(X_WS.inverse() @ center_of_mass) * self._reflect
         reach = (in_stance[:, :2] @ DIRECTIONS).max(axis=0) - com_in_stance[:2] @ DIRECTIONS
-        on_path = self.clearance.of_points(path, self._radius_m)
+        on_path = self.clearance.of_points(path, self._hand.radius_m)
 
         chosen = np.unique(np.linspace(0, len(path) - 1, _NUM_PREVIEWED + 1).round().astype(int))
         ahead = self._preview.follow(q, path[chosen[1:] if len(chosen) > 1 else chosen])

@@ -10,6 +10,7 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import Frame, RigidBody
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics, fit_stance
+from drake_safety.control.robot_model import ReachingFrame
 
 EQUALITY = 5
 """daqp's word, in ``sense``, for a row whose bounds are equal."""
@@ -49,12 +50,15 @@ class WholeBodyReference:
 
 
 class Hand:
-    """The point that reaches."""
+    """The point that reaches, the sphere around it, and the joints of its arm."""
 
-    def __init__(self, body: RigidBody, point: list[float]):
+    def __init__(self, name: str, body: RigidBody, reaching_frame: ReachingFrame):
+        self.name = name
         self.body = body
         self.frame: Frame = body.body_frame()
-        self.point = np.array(point, dtype=float)
+        self.point = np.array(reaching_frame.point, dtype=float)
+        self.radius_m = reaching_frame.radius_m
+        self.joints = list(reaching_frame.joints)
 
 
 class StandingFoot:
@@ -86,13 +90,11 @@ class WholeBodyModel:
         hand: Name of the reaching frame; None leaves the reaching task out.
 
     Raises:
-        ValueError: The robot has no feet, or no such hand.
+        ValueError: The robot has no such hand.
     """
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
         robot, plant = kinematics.robot, kinematics.plant
-        if not robot.feet:
-            raise ValueError(f"robot '{robot.name}' has no feet to stand on")
         self.kinematics = kinematics
         self.parameters = parameters = robot.whole_body
         self.num_joints = kinematics.num_joints
@@ -104,7 +106,7 @@ class WholeBodyModel:
         self.hand: Hand | None = None
         if hand is not None:
             frame = robot.reaching_frame(hand)
-            self.hand = Hand(plant.GetBodyByName(frame.body), frame.point)
+            self.hand = Hand(hand, plant.GetBodyByName(frame.body), frame)
         self.body_names = list(parameters.orientation)
         self.bodies = [plant.GetBodyByName(name) for name in self.body_names]
         self.feet = [

@@ -66,6 +66,11 @@ class AssessmentParameters:
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
+        raw_input_scale: Spread of state and preview as a map sees them, beside features of spread
+            one (sharpened). Where the features say nearly all, a small one keeps the maps from
+            learning the rest by heart.
+        feature_unit: Features enter a second time as asinh(f / feature_unit), which spreads out
+            what lies near a margin's zero [unit of the features]; 0 leaves that out (sharpened).
         shortest_segment: Steps that a safe episode's segment has at least; 0 stands for the whole
             horizon (sharpened). For episodes that end at rest.
         first_row_weight: Weight of the segment an episode starts with, relative to the others: they
@@ -95,6 +100,8 @@ class AssessmentParameters:
     margin_range: list[float] = field(default_factory=lambda: [-0.03, 0.10])
     first_row_weight: float = 6.0
     shortest_segment: int = 0
+    raw_input_scale: float = 1.0
+    feature_unit: float = 0.0
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -103,11 +110,23 @@ class AssessmentParameters:
             )
         for name in ("discount", "initial_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
-        for name in ("score_weight", "target_weight", "safety_weight", "margin_weight"):
+        for name in (
+            "score_weight",
+            "target_weight",
+            "safety_weight",
+            "margin_weight",
+            "feature_unit",
+        ):
             self._expect(name, getattr(self, name) >= 0.0, ">= 0")
         for name in ("horizon", "min_count", "resolution", "batch_size", "epochs", "ensemble_size"):
             self._expect(name, getattr(self, name) >= 1, ">= 1")
-        for name in ("cell_length", "learning_rate", "margin_unit", "first_row_weight"):
+        for name in (
+            "cell_length",
+            "learning_rate",
+            "margin_unit",
+            "first_row_weight",
+            "raw_input_scale",
+        ):
             self._expect(name, getattr(self, name) > 0.0, "> 0")
         self._expect(
             "shortest_segment", 0 <= self.shortest_segment <= self.horizon, "a value in 0..horizon"
@@ -287,6 +306,7 @@ class SafetyAssessment:
             is_unsafe=segments.is_unsafe,
             margins=segments.future_margins,
             sample_weight=self._sample_weight(segments),
+            input_scale=self._input_scale(x.shape[1], segments.features.shape[1]),
         )
         self.info_ = info
         self.embedding_ = self._train(data, stage("training"))
@@ -300,6 +320,13 @@ class SafetyAssessment:
         if self.parameters.is_sharpened:
             weight[segments.is_first] = self.parameters.first_row_weight
         return weight / weight.mean()
+
+    def _input_scale(self, num_inputs: int, num_features: int) -> np.ndarray:
+        scale = np.ones(num_inputs)
+        if self.parameters.is_sharpened:
+            num_copies = 2 if self.parameters.feature_unit else 1
+            scale[: num_inputs - num_copies * num_features] = self.parameters.raw_input_scale
+        return scale
 
     def _train(self, data: MapData, progress: Callable[[float], None] | None) -> Embedding:
         parameters = self.parameters
@@ -372,6 +399,8 @@ class SafetyAssessment:
         parts = [np.asarray(state, dtype=float), np.asarray(desired_preview, dtype=float)]
         if self.parameters.is_sharpened and features is not None:
             parts.append(np.asarray(features, dtype=float))
+            if self.parameters.feature_unit:
+                parts.append(np.arcsinh(parts[-1] / self.parameters.feature_unit))
         return np.concatenate(parts, axis=-1)
 
     def _check_fitted(self) -> None:
@@ -386,7 +415,7 @@ class SafetyAssessment:
                 f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, "
                 f"expected {len(info.state_names)} of the state, "
                 f"{info.horizon * len(info.output_names)} of the desired preview and "
-                f"{num_features} features"
+                f"{num_features} features{' twice' if self.parameters.feature_unit else ''}"
             )
 
     def _beliefs(self, beliefs: np.ndarray | None) -> np.ndarray:
@@ -501,6 +530,8 @@ class SafetyAssessment:
         parts: tuple[np.ndarray, ...] = (state, desired_preview)
         if is_sharpened and features is not None:
             parts = (state, desired_preview, features)
+            if self.parameters.feature_unit:
+                parts = (*parts, np.arcsinh(features / self.parameters.feature_unit))
         embedding, grid = self.embedding_, self.grid_
         width = sum(map(len, parts))
         if width != embedding.num_inputs:
@@ -611,7 +642,8 @@ class SafetyAssessment:
         weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
         self.embedding_ = Embedding(weights, num_margins=num_margins)
         num_inputs = len(info.state_names) + info.horizon * len(info.output_names)
-        num_inputs += len(info.feature_names) if parameters.is_sharpened else 0
+        if parameters.is_sharpened:
+            num_inputs += len(info.feature_names) * (2 if parameters.feature_unit else 1)
         if self.embedding_.num_inputs != num_inputs:
             raise ValueError(
                 f"its maps take {self.embedding_.num_inputs} inputs, "

@@ -299,6 +299,7 @@ class MapData:
         is_unsafe: Whether the input's episode ended unsafely, (N,).
         margins: Smallest future margins, (N, n_c).
         sample_weight: Weight of each input in all losses, (N,).
+        input_scale: Spread of each column of x as the map sees it, (n_x,).
     """
 
     x: np.ndarray
@@ -307,6 +308,7 @@ class MapData:
     is_unsafe: np.ndarray
     margins: np.ndarray
     sample_weight: np.ndarray
+    input_scale: np.ndarray
 
 
 def train_map(
@@ -352,7 +354,7 @@ def _train(
 ) -> dict[str, np.ndarray]:
     has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
     mean = data.x.mean(axis=0)
-    spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD)
+    spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
     target_scale = float(data.target.std())
     num_inputs, num_margins = data.x.shape[1], data.margins.shape[1] if has_margins else 0
 

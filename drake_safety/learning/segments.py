@@ -248,8 +248,8 @@ def split(
         shortest: Steps that a safe episode's segment has at least; H by default.
 
     Raises:
-        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode is long enough
-            for one segment.
+        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
+            segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")
@@ -292,6 +292,6 @@ def split(
     if not pieces["score"]:
         raise ValueError(
             f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives "
-            f"a segment of {horizon} steps ({episodes.num_diverged} diverged)"
+            f"a segment of {shortest} steps ({episodes.num_diverged} diverged)"
         )
     return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})

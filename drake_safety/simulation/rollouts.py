@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import inspect
 import logging
 import warnings
 from collections.abc import Callable, Generator, Iterable
@@ -87,13 +88,18 @@ def run_episode(
         loop: The closed loop; it keeps no state, and can be used again.
         index: Number of the episode in its set.
         seed: Seed of the set.
-        goal: What the task's plan shall lead to, in place of a random goal; only for tasks whose
+        goal: Where the task's plan shall lead, in place of a random goal; only for tasks whose
             ``reset`` takes one.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
         that were finite.
+
+    Raises:
+        ValueError: The task takes no goal, or not this one.
     """
+    if goal is not None:
+        _check_takes_goal(loop)
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
@@ -172,17 +178,21 @@ def run_episodes(
             already holds are not simulated again.
         progress: Called with the number done and the number wanted.
         extra: Stored beside the episodes' info.
-        goals: Goal of each episode in place of random ones, (num_episodes, n_goal).
-        **loop_options: For the task.
+        goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
+            are not kept.
+        **loop_options: For the task; episodes with options are not kept.
 
     Raises:
-        ValueError: The folder holds another set, or there is not one goal an episode.
+        ValueError: The folder holds another set, the task takes no goals, there is not one finite
+            goal an episode, or a folder was given for what is not kept.
     """
-    if goals is not None and len(goals) != num_episodes:
-        raise ValueError(f"run_episodes: {len(goals)} goals for {num_episodes} episodes")
-    if goals is not None and path is not None:
-        raise ValueError("run_episodes: episodes of given goals are not kept; leave out 'path'")
+    if path is not None and (goals is not None or loop_options):
+        # What a folder holds is known by scenario, variation and seed alone.
+        given = ["goals"] * (goals is not None) + list(loop_options)
+        raise ValueError(f"run_episodes: episodes with {given} are not kept; leave out 'path'")
     loop = scenario.make_loop(variation, **loop_options)
+    if goals is not None:
+        goals = _checked_goals(loop, goals, num_episodes)
     info = episodes_info(loop, seed)
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
@@ -223,6 +233,26 @@ def run_episodes(
         stored = [e for e in load_episodes(path) if e.index in done]
         finished += stored
     return Episodes(info, sorted(finished, key=lambda episode: episode.index))
+
+
+def _check_takes_goal(loop: ClosedLoop) -> None:
+    if "goal" not in inspect.signature(loop.reset).parameters:
+        raise ValueError(f"task '{type(loop).__name__}' has plans without a goal; leave it out")
+
+
+def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np.ndarray:
+    _check_takes_goal(loop)
+    goals = np.asarray(goals, dtype=float)
+    if goals.ndim != 2 or len(goals) != num_episodes:
+        raise ValueError(
+            f"run_episodes: goals must be one row an episode, of {num_episodes} episodes; got "
+            f"shape {goals.shape}"
+        )
+    is_finite = np.isfinite(goals).all(axis=1)
+    if not is_finite.all():
+        first = int(np.argmin(is_finite))
+        raise ValueError(f"run_episodes: goals must be finite; goal {first} is {goals[first]}")
+    return goals
 
 
 def batches(indices: list[int]) -> list[list[int]]:

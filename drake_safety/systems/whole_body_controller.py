@@ -52,7 +52,7 @@ class WholeBodyController(LeafSystem):
         offset_s: Time of the first tick; commands of what drives it are then fresh [s].
 
     Raises:
-        ValueError: The robot has no feet or no such hand, or the matrix is of another size.
+        ValueError: The robot has no such hand, or the matrix is of another size.
     """
 
     def __init__(

@@ -1,0 +1,214 @@
+"""Reaching in motion: any robot reaches, sees what its variation says, and is judged by Γ."""
+
+import numpy as np
+import pytest
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
+from drake_safety.control.kinematic_preview import chain_joints
+from drake_safety.control.whole_body_qp import solve_qp
+from drake_safety.learning.segments import DIVERGED
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
+from drake_safety.systems import whole_body_controller
+from reaching_loops import (
+    EASY,
+    NOISE,
+    atlas,
+    easy_episode,
+    evaluated,
+    porter,
+    porter_path,
+    positions,
+    started,
+)
+
+
+@pytest.mark.parametrize(("hand", "side"), [("left", 1), ("right", -1)])
+def test_a_robot_of_ones_own_reaches_from_yaml_alone(hand, side):
+    episode = easy_episode(hand=hand)
+    assert episode.is_safe
+    assert np.linalg.norm(episode.output[-1] - EASY * [1, side, 1]) < 0.02
+    error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
+    assert error.max() < 0.05
+
+
+def test_a_target_behind_a_board_ends_in_a_collision():
+    episode = run_episode(porter(), 0, goal=[0.5, 0.2, 0.475])  # Inside the board below the hand.
+    assert not episode.is_safe
+    assert episode.cause == "collision"
+    assert episode.margins[-1, 1] < 0
+
+
+@pytest.mark.parametrize("variation", ["heavy", "rough", "noisy"])
+def test_reality_gaps_run_and_reach_nearly(variation):
+    episode = easy_episode(variation)
+    assert episode.cause == ""
+    assert np.linalg.norm(episode.output[-1] - EASY) < 0.04
+    assert np.abs(episode.true_state - easy_episode().true_state).max() > 1e-5
+
+
+def test_friction_holds_the_joints_back():
+    moved = {}
+    for variation in ("nominal", "rough"):
+        loop = porter(variation)
+        context = loop.CreateDefaultContext()
+        loop.reset_standing(context, EASY)
+        before = positions(loop, context)[7:].copy()
+        simulator = Simulator(loop, context)
+        simulator.AdvanceTo(0.25)
+        moved[variation] = np.abs(positions(loop, context)[7:] - before).max()
+    assert moved["rough"] < 0.7 * moved["nominal"]
+
+
+def test_the_plant_is_the_variations_and_the_controller_believes_in_the_nominal_one():
+    masses = {}
+    for variation in ("nominal", "heavy"):
+        loop = porter(variation)
+        context = started(loop)
+        masses[variation] = loop.plant.CalcTotalMass(
+            loop.plant.GetMyContextFromRoot(context), [loop.robot_instance]
+        )
+        assert loop.kinematics.total_mass == pytest.approx(masses["nominal"])
+    assert masses["heavy"] == pytest.approx(1.1 * masses["nominal"])
+
+
+def test_noise_stands_only_where_it_was_configured():
+    quiet, noisy, blurred = map(easy_episode, ("nominal", "noisy", "blurred"))
+    np.testing.assert_array_equal(quiet.state, quiet.true_state)
+    np.testing.assert_array_equal(blurred.true_state, quiet.true_state)
+    np.testing.assert_array_equal(blurred.output, quiet.output)
+    for episode in (noisy, blurred):
+        joints = slice(12, 12 + (episode.state.shape[1] - 12) // 2)
+        error = (episode.state - episode.true_state)[:, joints]
+        assert np.std(error) == pytest.approx(NOISE["position"], rel=0.2)
+        assert np.abs(episode.features - quiet.features).max() > 1e-4
+
+
+def test_the_preview_foresees_the_joints_of_an_easy_reach():
+    loop, goal = atlas(), np.array([0.65, 0.3, 1.05])
+    context = loop.CreateDefaultContext()
+    loop.reset_standing(context, goal)
+    names = loop.feature_names
+    x = dict(zip(names, evaluated(loop, context, "features"), strict=True))
+    Simulator(loop, context).AdvanceTo(loop.scenario.episode_duration_s)
+    q = positions(loop, context)
+    assert np.linalg.norm(loop.safe_set.model.reaching_position(q) - goal) < 0.02
+    margins = loop.safe_set.margins(q, np.zeros(loop.kinematics.num_velocities))
+    for name, margin in zip(loop.constraint_names[:3], margins, strict=False):
+        assert x[f"preview_last_{name}"] == pytest.approx(margin, abs=0.03)
+    lowest, highest = loop.kinematics.position_limits.T
+    distance = np.minimum(q[7:] - lowest, highest - q[7:])
+    chain = chain_joints(loop.kinematics, loop.safe_set.model.hand)
+    expected = distance[chain] - loop.scenario.parameters.safe_set.joint_margin_rad
+    foreseen = [x[f"preview_last_stop_{i}"] for i in range(len(chain))]
+    np.testing.assert_allclose(foreseen, expected, atol=0.05)
+
+
+def test_an_unsolved_program_shows_in_the_solver_status():
+    loop = porter()
+    context = started(loop)
+    simulator = Simulator(loop, context)
+    simulator.AdvanceTo(0.02)
+    assert evaluated(loop, context, "solver_status")[0] == 0
+    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+    v = np.zeros(loop.plant.num_velocities())
+    v[6 : 6 + loop.kinematics.num_joints] = 200.0  # No ankle can stop a foot that spins so fast.
+    loop.plant.SetVelocities(plant_context, loop.robot_instance, v)
+    simulator.AdvanceTo(0.024)
+    assert evaluated(loop, context, "solver_status")[0] != 0
+
+
+def test_a_push_may_be_applied_to_any_body():
+    loop = porter()
+    moved = []
+    for force_n in (0.0, 40.0):
+        context = loop.CreateDefaultContext()
+        loop.reset_standing(context, EASY)
+        push = ExternallyAppliedSpatialForce()
+        push.body_index = loop.plant.GetBodyByName(loop.robot.base).index()
+        push.F_Bq_W = SpatialForce(tau=[0.0, 0.0, 0.0], f=[0.0, force_n, 0.0])
+        loop.GetInputPort("applied_spatial_force").FixValue(context, [push])
+        Simulator(loop, context).AdvanceTo(0.1)
+        moved.append(positions(loop, context)[5])
+    assert moved[1] - moved[0] > 1e-3
+
+
+def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
+    loop = porter()
+    q = loop.kinematics.standing_positions()
+    q[6] += 0.5
+    monkeypatch.setattr(loop, "_sample_posture", lambda rng: q)
+    episode = run_episode(loop, 0)
+    assert not episode.is_safe
+    assert episode.cause == "support_polygon"
+    assert len(episode.time_s) == 1
+
+
+def test_an_episode_whose_simulation_fails_keeps_its_rows_and_says_so(monkeypatch):
+    ticks = []
+
+    def fails_later(qp):
+        ticks.append(qp)
+        if len(ticks) > 30:
+            raise RuntimeError("no memory")
+        return solve_qp(qp)
+
+    monkeypatch.setattr(whole_body_controller, "solve_qp", fails_later)
+    episode = run_episode(porter(), 0, goal=EASY)
+    assert episode.cause == DIVERGED
+    np.testing.assert_array_equal(episode.state, easy_episode().state[: len(episode.time_s)])
+    assert 0 < episode.time_s[-1] <= 31 * porter().scenario.control_period_s
+
+
+@pytest.fixture(scope="module")
+def assessment():
+    scenario = load_scenario(porter_path())
+    episodes = run_episodes(scenario, 7, num_workers=1)
+    return SafetyAssessment(scenario.assessment).fit(episodes)
+
+
+def test_one_assessment_serves_both_hands(assessment):
+    probabilities = []
+    for hand in ("left", "right"):
+        loop = porter(assessment=assessment, hand=hand)
+        context = started(loop, 3)
+        Simulator(loop, context).Initialize()
+        values = {name: evaluated(loop, context, name) for name in ASSESSMENT_PORTS}
+        assert all(np.isfinite(value).all() for value in values.values())
+        assert values["belief"].sum() == pytest.approx(1.0)
+        probabilities.append(values["safety_probability"][0])
+    assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-4)
+
+
+def test_an_assessment_of_another_scenario_is_refused(assessment):
+    scenario = load_scenario(porter_path())
+    scenario.parameters.safe_set.joint_margin_rad = 0.04
+    with pytest.raises(ValueError, match="assessment and diagram differ in scenario hash"):
+        scenario.make_loop(assessment=assessment)
+    with pytest.raises(
+        ValueError, match=r"differ in scenario: .* with porting, the diagram has at"
+    ):
+        load_scenario("atlas_reaching").make_loop(assessment=assessment)
+
+
+def test_the_hash_follows_what_can_be_touched_and_not_what_is_only_to_be_seen(tmp_path):
+    path = porter_path()
+    before = load_scenario(path).simulation_hash()
+    scenario = load_scenario(path)
+    scenario.parameters.decorations = []
+    assert scenario.simulation_hash() == before
+    scenario.parameters.obstacles[0].position[2] += 0.01
+    assert scenario.simulation_hash() != before
+    shelf = tmp_path / "shelf.urdf"
+    own = load_scenario(path)
+    own.parameters.obstacles[0].model = str(shelf)
+    hashes = set()
+    for size in ("0.1", "0.2"):
+        shelf.write_text(
+            f'<robot name="s"><link name="s"><collision><geometry><box size="{size} 1 1"/>'
+            "</geometry></collision></link></robot>"
+        )
+        hashes.add(own.simulation_hash())
+    assert len(hashes) == 2
