@@ -34,7 +34,9 @@ from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.view import View
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
@@ -143,9 +145,22 @@ class ReachingParameters:
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
     """Models without collision geometry, to be seen."""
+    named_targets: dict[str, list[float]] = field(default_factory=dict)
+    """Targets in the world that can be asked for by name, (3,) [m] each."""
+    pushes: dict[str, Push] = field(default_factory=dict)
+    """Pushes that a run can be disturbed with, by name."""
+    assessment_period_s: float = 0.02
+    """Time between two evaluations of Γ [s]."""
+    view: View = field(default_factory=View)
+    """Where pictures are taken from when the trained hand reaches."""
 
     def __post_init__(self) -> None:
-        for name in ("plan_duration_s", "monitor_period_s", "clearance_range_m"):
+        for name in (
+            "plan_duration_s",
+            "monitor_period_s",
+            "clearance_range_m",
+            "assessment_period_s",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
         if not self.start.clearance_m <= self.clearance_range_m:
@@ -153,6 +168,11 @@ class ReachingParameters:
                 f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
                 f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
             )
+        for name, target in self.named_targets.items():
+            if len(target) != 3 or not np.isfinite(target).all():
+                raise ValueError(
+                    f"reaching: named target '{name}' must be three numbers [m]; got {target}"
+                )
 
 
 class Reaching(ClosedLoop):
@@ -176,7 +196,14 @@ class Reaching(ClosedLoop):
     """
 
     Parameters = ReachingParameters
-    online_parameters = ("decorations", "fair")
+    online_parameters = (
+        "decorations",
+        "fair",
+        "named_targets",
+        "pushes",
+        "assessment_period_s",
+        "view",
+    )
 
     def __init__(
         self,
@@ -316,10 +343,15 @@ class Reaching(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
         self.fall_name = self.safe_set.fall_name
+        self.angular_constraints = self.safe_set.angular_names
+        self.named_targets = parameters.named_targets
+        self.pushes = parameters.pushes
+        self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
         if assessment is not None:
             self.check_assessment()
             assessor = builder.AddNamedSystem(
-                "safety_assessor", SafetyAssessor(assessment, period_s=scenario.step_s)
+                "safety_assessor",
+                SafetyAssessor(assessment, period_s=parameters.assessment_period_s),
             )
             builder.Connect(
                 assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
@@ -429,18 +461,22 @@ class Reaching(ClosedLoop):
         self._observers.reseed(context, rng)
         return 0
 
-    def reset_standing(self, context: Context, goal: np.ndarray) -> None:
-        """Starts in the standing posture, with the same noise every time, towards a target.
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts in the standing posture towards a target; its first instant is without noise.
 
         Args:
             context: The diagram's Context; what an earlier episode left is overwritten.
             goal: Target in the world, (3,) [m].
+            rng: Source of the noise that follows; always the same by default.
 
         Raises:
             ValueError: The goal is not three finite numbers.
         """
         self._set(context, self.kinematics.standing_positions(), goal)
-        self._observers.reseed(context, np.random.default_rng(0))
+        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        self._observers.silence(context)
 
     def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
         sampling = self.scenario.parameters.start

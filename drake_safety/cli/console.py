@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +39,19 @@ def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
         return "-"
     value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
     return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
+
+
+def margin_words(name: str, margin: float, angular_constraints: Collection[str]) -> str:
+    """A constraint and its margin as one reads them: ``collision, -1.2 cm``.
+
+    Args:
+        name: The constraint.
+        margin: Its margin [m, rad].
+        angular_constraints: Names of those whose margins are angles.
+    """
+    if name in angular_constraints:
+        return f"{name}, {math.degrees(margin):+.1f}°"
+    return f"{name}, {100 * margin:+.1f} cm"
 
 
 def print_path(what: str, path: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from drake_safety.simulation.view import View
+
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episode
     from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
 
 RECORDED_PORTS = (
@@ -39,9 +43,10 @@ class ClosedLoop(Diagram):
     ``trigger_port``, which a task with a ball provides. A task whose plans have a goal, a point
     in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, and it
     overrides :meth:`goal_of` and :meth:`reset_standing`; :attr:`fair_box`, :meth:`is_fair`,
-    :attr:`mirror_options` and :attr:`hand` where they say something of it. A subclass wires its
-    systems in ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with
-    :meth:`finish`.
+    :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets` and, with the input port
+    ``applied_spatial_force`` of its plant, :attr:`pushes` where they say something of it. A
+    subclass wires its systems in ``__init__``, calls :meth:`check_assessment` before it wires one,
+    and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -81,6 +86,14 @@ class ClosedLoop(Diagram):
 
     hand: str | None = None
     """The robot's reaching frame that goes to the goal, for tasks with such plans."""
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; those of all others are lengths [m]."""
+    view: View = View()
+    """Where pictures are taken from."""
+    named_targets: Mapping[str, list[float]] = {}
+    """Goals that can be asked for by name, in the world, (3,) [m] each."""
+    pushes: Mapping[str, Push] = {}
+    """Pushes that a run can be disturbed with, by name."""
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
@@ -167,15 +180,6 @@ class ClosedLoop(Diagram):
         goal, box = self.goal_of(episode), self.fair_box
         return box is None or bool(np.all((goal >= box[0]) & (goal <= box[1])))
 
-    def reset_standing(self, context: Context, goal: np.ndarray) -> None:
-        """Starts at rest in the robot's own posture; tasks whose plans have a goal override this.
-
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            goal: Where the plan shall lead, in the world, (3,) [m].
-        """
-        raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
-
     def num_controller_failures(self, context: Context) -> int:
         """How often a controller had no command of its own since the episode began.
 
@@ -207,6 +211,20 @@ class ClosedLoop(Diagram):
             with a push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
+
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts at rest in the robot's own posture; tasks whose plans have a goal override this.
+
+        What the assessor sees of the first instant is without noise.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            goal: Where the plan shall lead, in the world, (3,) [m].
+            rng: Source of the noise that follows; always the same by default.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.
