@@ -20,6 +20,21 @@ def episodes_folder(folder: Path) -> Path:
     return folder / "episodes"
 
 
+def fresh_episodes_folder(
+    folder: Path, scenario_hash: str, seed: int, loop_options: dict[str, str]
+) -> Path:
+    """Where ``evaluate`` keeps the nominal episodes it judges by, so that it can go on with them.
+
+    Args:
+        folder: The folder of the training.
+        scenario_hash: Of what was simulated: another simulation is another set.
+        seed: Of the set.
+        loop_options: Options of the task's diagram.
+    """
+    options = [f"{name}-{value}" for name, value in sorted(loop_options.items())]
+    return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
+
+
 def assessment_file(folder: Path, mode: str) -> Path:
     """Where ``train`` keeps the assessment of a mode."""
     return folder / f"{mode}.safetensors"

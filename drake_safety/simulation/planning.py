@@ -238,7 +238,7 @@ def nearest_accepted_goal(
         best = nearest_of(centre + radius * _in_unit_ball(rng, num_candidates))
         radius *= _GROWTH
     if best is None:
-        best = nearest_of(rng.uniform(*box, (_LAST_CHANCE * num_candidates, 3)))
+        best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
     if best is None:
         return None
 
