@@ -167,7 +167,7 @@ def _lay_out(
 def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: float) -> None:
     axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
     axes.annotate(
-        f"threshold {threshold:g}",
+        f"threshold {threshold:.3g}",
         (1.0, threshold),
         xycoords=("axes fraction", "data"),
         xytext=(-4, 3),
