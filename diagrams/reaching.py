@@ -29,11 +29,14 @@ from drake_safety.control.robot import (
     model_file,
 )
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.view import View
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
@@ -100,6 +103,29 @@ class TargetSampling:
 
 
 @dataclass(kw_only=True)
+class FairTargets:
+    """The part of the target box in which a verdict is neither trivial nor absurd, in the world.
+
+    Bounds that are left empty are the target box's own.
+    """
+
+    x_m: list[float] = field(default_factory=list)
+    y_m: list[float] = field(default_factory=list)
+    z_m: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m", "z_m"):
+            bounds = getattr(self, name)
+            if bounds and (len(bounds) != 2 or not bounds[0] < bounds[1]):
+                raise ValueError(f"fair: {name} must be [lowest, highest] or empty; got {bounds}")
+
+    def box(self, target: TargetSampling) -> np.ndarray:
+        """Lowest and highest corner, (2, 3) [m]."""
+        bounds = [getattr(self, name) or getattr(target, name) for name in ("x_m", "y_m", "z_m")]
+        return np.array(bounds, dtype=float).T
+
+
+@dataclass(kw_only=True)
 class ReachingParameters:
     """The task's part of the scenario file."""
 
@@ -115,12 +141,26 @@ class ReachingParameters:
     safe_set: ReachingLimits = field(default_factory=ReachingLimits)
     start: PostureSampling = field(default_factory=PostureSampling)
     target: TargetSampling = field(default_factory=TargetSampling)
+    fair: FairTargets = field(default_factory=FairTargets)
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
     """Models without collision geometry, to be seen."""
+    named_targets: dict[str, list[float]] = field(default_factory=dict)
+    """Targets in the world that can be asked for by name, (3,) [m] each."""
+    pushes: dict[str, Push] = field(default_factory=dict)
+    """Pushes that a run can be disturbed with, by name."""
+    assessment_period_s: float = 0.02
+    """Time between two evaluations of Γ [s]."""
+    view: View = field(default_factory=View)
+    """Where pictures are taken from when the trained hand reaches."""
 
     def __post_init__(self) -> None:
-        for name in ("plan_duration_s", "monitor_period_s", "clearance_range_m"):
+        for name in (
+            "plan_duration_s",
+            "monitor_period_s",
+            "clearance_range_m",
+            "assessment_period_s",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
         if not self.start.clearance_m <= self.clearance_range_m:
@@ -128,6 +168,11 @@ class ReachingParameters:
                 f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
                 f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
             )
+        for name, target in self.named_targets.items():
+            if len(target) != 3 or not np.isfinite(target).all():
+                raise ValueError(
+                    f"reaching: named target '{name}' must be three numbers [m]; got {target}"
+                )
 
 
 class Reaching(ClosedLoop):
@@ -151,7 +196,14 @@ class Reaching(ClosedLoop):
     """
 
     Parameters = ReachingParameters
-    online_parameters = ("decorations",)
+    online_parameters = (
+        "decorations",
+        "fair",
+        "named_targets",
+        "pushes",
+        "assessment_period_s",
+        "view",
+    )
 
     def __init__(
         self,
@@ -291,10 +343,15 @@ class Reaching(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
         self.fall_name = self.safe_set.fall_name
+        self.angular_constraints = self.safe_set.angular_names
+        self.named_targets = parameters.named_targets
+        self.pushes = parameters.pushes
+        self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
         if assessment is not None:
             self.check_assessment()
             assessor = builder.AddNamedSystem(
-                "safety_assessor", SafetyAssessor(assessment, period_s=scenario.step_s)
+                "safety_assessor",
+                SafetyAssessor(assessment, period_s=parameters.assessment_period_s),
             )
             builder.Connect(
                 assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
@@ -329,8 +386,55 @@ class Reaching(ClosedLoop):
     @property
     def target_box(self) -> np.ndarray:
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
-        box = self.scenario.parameters.target.box
+        return self._of_this_hand(self.scenario.parameters.target.box)
+
+    @property
+    def fair_box(self) -> np.ndarray:
+        """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
+        parameters = self.scenario.parameters
+        return self._of_this_hand(parameters.fair.box(parameters.target))
+
+    def _of_this_hand(self, box: np.ndarray) -> np.ndarray:
         return box if self.mirror is None else np.sort(self.mirror.points(box), axis=0)
+
+    @property
+    def mirror_options(self) -> dict[str, str]:
+        """The hand on the other side, if the robot has one there."""
+        mirror = Mirror(self.kinematics)
+        try:
+            return {"hand": mirror.hand(self.hand)}
+        except ValueError:
+            return {}
+
+    def goal_of(self, episode: Episode) -> np.ndarray:
+        """The target of an episode in the world, (3,) [m]."""
+        return self._ends_of_plan(episode)[1]
+
+    def is_fair(self, episode: Episode) -> bool:
+        """Whether the target is in the fair box, and the plan leads through no obstacle."""
+        path = np.linspace(*self._ends_of_plan(episode), _NUM_OUTLOOK)
+        radius_m = self.robot.reaching_frame(self.hand).radius_m
+        is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
+        return bool(is_clear) and super().is_fair(episode)
+
+    def _ends_of_plan(self, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+        """Where the hand's motion begins and where it leads, in the world, (3,) each [m]."""
+        # The preview carries no noise, but it may end before the motion does.
+        preview = episode.desired_preview[episode.first_step].reshape(-1, 3)
+        duration_s = self.scenario.parameters.plan_duration_s
+        seen_s = min(self.scenario.step_s * (len(preview) - 1), duration_s)
+        progress = interpolate(np.zeros(1), np.ones(1), duration_s).value(seen_s).item()
+        start = preview[0]
+        ends = np.array([start, start + (preview[-1] - start) / progress])
+        if self.mirror is not None:
+            ends = self.mirror.points(ends)
+        # An episode begins on the feet of the standing posture.
+        ends[:, :2] -= self.kinematics.nominal_base_offset
+        return ends[0], ends[1]
+
+    def num_controller_failures(self, context: Context) -> int:
+        """Ticks whose quadratic program had no solution."""
+        return self._controller.num_failures(self._controller.GetMyContextFromRoot(context))
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
@@ -357,18 +461,22 @@ class Reaching(ClosedLoop):
         self._observers.reseed(context, rng)
         return 0
 
-    def reset_standing(self, context: Context, goal: np.ndarray) -> None:
-        """Starts in the standing posture, with the same noise every time, towards a target.
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts in the standing posture towards a target; its first instant is without noise.
 
         Args:
             context: The diagram's Context; what an earlier episode left is overwritten.
             goal: Target in the world, (3,) [m].
+            rng: Source of the noise that follows; always the same by default.
 
         Raises:
             ValueError: The goal is not three finite numbers.
         """
         self._set(context, self.kinematics.standing_positions(), goal)
-        self._observers.reseed(context, np.random.default_rng(0))
+        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        self._observers.silence(context)
 
     def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
         sampling = self.scenario.parameters.start

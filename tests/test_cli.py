@@ -1,5 +1,6 @@
 """The command line: every command is listed, and what a user did wrong is one line."""
 
+import json
 import math
 import sys
 from types import SimpleNamespace
@@ -7,12 +8,24 @@ from types import SimpleNamespace
 import pytest
 import typer
 
+from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.cli import app, main
+from drake_safety.cli.evaluate_plans import PlanOptions, check_options, parse_sizes
 from drake_safety.cli.run import parse_pushes
-from drake_safety.cli.training_folder import MODES, assessment_file, load_assessment
+from drake_safety.cli.training_folder import (
+    MODES,
+    assessment_file,
+    episodes_folder,
+    fresh_episodes_folder,
+    load_assessment,
+)
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.simulation import rollouts
 from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.dataset import completed
+from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO
+from shuttle_task import SCENARIO as SHUTTLE_SCENARIO
 
 
 def call(monkeypatch, *arguments):
@@ -25,7 +38,7 @@ def call(monkeypatch, *arguments):
 
 def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
-    assert list(commands) == ["scenarios", "train", "run", "evaluate"]
+    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate"]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")
 
@@ -46,6 +59,10 @@ def test_a_table_of_scenarios_is_printed(monkeypatch, capsys):
         ),
         (["run", "laikago_balancing", "--assessment", "x"], "error x holds no 'sharpened'"),
         (["evaluate", "laikago_balancing", "--assessment", "x"], "error x holds no 'sharpened'"),
+        (
+            ["ask", "laikago_balancing", "--assessment", "x", "--target", "1", "-2", "3"],
+            "error x holds no 'sharpened'",
+        ),
     ],
 )
 def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
@@ -125,3 +142,105 @@ def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
 def test_a_push_that_cannot_be_is_refused(scenario, push, message):
     with pytest.raises(ValueError, match=message):
         parse_pushes(scenario, [push])
+
+
+@pytest.fixture(scope="module")
+def shuttle_run(tmp_path_factory):
+    """A scenario whose plans have a goal, and what was learned of it."""
+    folder = tmp_path_factory.mktemp("shuttle")
+    file = folder / "shuttling.yaml"
+    file.write_text(SHUTTLE_SCENARIO)
+    scenario = load_scenario(file)
+    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
+    for mode in MODES:
+        scenario.assessment.mode = mode
+        assessment = SafetyAssessment(scenario.assessment).fit(episodes)
+        assessment.save(assessment_file(folder, mode))
+    return file, folder
+
+
+def evaluate_shuttle(monkeypatch, run, *arguments):
+    file, folder = run
+    options = ("--assessment", folder, "--episodes", 30, "--calibration-episodes", 20)
+    options += ("--workers", 1, "--seed", 100)
+    return call(monkeypatch, "evaluate", file, *options, *arguments)
+
+
+def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, capsys, shuttle_run):
+    _, folder = shuttle_run
+    arguments = ("--other-hand", 10, "--plane-step", 0.6, "--learning-curve", "40,60")
+    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
+    printed = capsys.readouterr().out
+    for title in ("30 fresh targets judged at k = 0: all targets", "the other hand", "Learning"):
+        assert title in printed
+    report = json.loads((folder / "evaluation.json").read_text())
+    assert report["plans.causes.named_by"] in ("cause_probability", "predicted_margins")
+    for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
+        for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
+            figure = report[f"{prefix}.{name}.unsafe_recall"]
+            assert set(figure) == {"value", "low", "high", "n"}
+    assert report["plans.outcomes.safe"]["n"] == 30
+    assert report["plans.other_hand.outcomes.safe"]["n"] == 10
+    assert report["plans.sharpened.threshold"]["n"] == report["calibration_episodes"] == 20
+    assert {"plans.plane.sharpened.right", "plans.learning_curve.40.auc"} <= report.keys()
+    for name in ("plans", "plans_roc", "reachable_region", "learning_curve"):
+        assert (folder / f"{name}.png").is_file()
+    # What takes throws or runs is no part of it.
+    assert not any(key.startswith(("throws.", "segments.")) for key in report)
+
+
+def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    arguments = ("--plane-step", 0)
+    # After the first time, even a simulation that always fails is not needed.
+    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
+    first = json.loads((folder / "evaluation.json").read_text())
+    hash_ = load_scenario(file).simulation_hash()
+    kept = [
+        fresh_episodes_folder(folder, hash_, seed, options)
+        for seed, options in ((100, {}), (103, {}), (104, {"side": "right"}))
+    ]
+    assert [len(completed(path)) for path in kept] == [30, 20, 30]
+
+    def forbidden(*arguments, **options):
+        raise AssertionError("simulated again")
+
+    monkeypatch.setattr(rollouts, "run_episode", forbidden)
+    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
+    again = json.loads((folder / "evaluation.json").read_text())
+    assert again.keys() == first.keys()
+    assert all(again[key] == first[key] for key in first if key.startswith("plans."))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-curve", "61"], "60 training episodes; got sizes [61]"),
+        (["--learning-curve", "many"], "--learning-curve 'many': give numbers of episodes"),
+        (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
+        (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
+        (["--seed", "-4"], "-4 to 0 would be used, and 0 is the training episodes' own"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
+    monkeypatch, capsys, shuttle_run, arguments, message
+):
+    def forbidden(*arguments, **options):
+        raise AssertionError("simulated")
+
+    monkeypatch.setattr(rollouts, "run_episode", forbidden)
+    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) == 2
+    assert message in capsys.readouterr().out
+
+
+def test_options_of_targets_are_refused_where_plans_have_no_goal():
+    loop = load_scenario("laikago_balancing").make_loop()
+    check_options(loop, PlanOptions(), 100)
+    for options in (PlanOptions(other_hand=5), PlanOptions(learning_curve=(64,))):
+        with pytest.raises(ValueError, match="Balancing have no goal: leave out --other-hand"):
+            check_options(loop, options, 100)
+
+
+def test_sizes_of_a_learning_curve_are_numbers_between_commas():
+    assert parse_sizes("512,1024") == (512, 1024)
+    assert parse_sizes("") == ()

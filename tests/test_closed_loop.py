@@ -14,8 +14,10 @@ from drake_safety.simulation.closed_loop import (
     REQUIRED_PORTS,
     ClosedLoop,
 )
+from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO, Gliding
+from shuttle_task import Shuttling, shuttling
 
 LOOP_NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 
@@ -117,3 +119,33 @@ def test_a_task_refuses_a_foreign_assessment_when_it_is_built():
     loop = Gliding(gliding())
     with pytest.raises(ValueError, match="differ in horizon"):
         gliding().make_loop(assessment=assessment_for(loop, horizon=3))
+
+
+def test_a_task_whose_plans_have_no_goal_says_so():
+    loop = Gliding(gliding())
+    context = loop.CreateDefaultContext()
+    assert loop.target_box is None
+    assert loop.fair_box is None
+    assert loop.mirror_options == {}
+    assert loop.num_controller_failures(context) == 0
+    for ask in (loop.goal_of, lambda _: loop.reset_standing(context, np.zeros(3))):
+        with pytest.raises(ValueError, match="task 'Gliding' has plans without a goal"):
+            ask(None)
+
+
+def test_without_a_word_of_its_own_all_of_a_tasks_targets_are_fair():
+    class Plain(Shuttling):
+        fair_box = ClosedLoop.fair_box
+
+    loop = Plain(shuttling())
+    np.testing.assert_array_equal(loop.fair_box, loop.target_box)
+    assert all(loop.is_fair(run_episode(loop, index)) for index in range(3))
+
+
+def test_a_goal_outside_the_fair_box_is_not_fair():
+    loop = Shuttling(shuttling())
+    for index in range(12):
+        episode = run_episode(loop, index)
+        low, high = loop.fair_box
+        goal = loop.goal_of(episode)
+        assert loop.is_fair(episode) == bool(np.all((low <= goal) & (goal <= high)))

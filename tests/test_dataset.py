@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from drake_safety.learning.segments import Episode, EpisodesInfo
@@ -131,6 +132,7 @@ def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
         "is_safe",
         "cause",
         "first_step",
+        "num_controller_failures",
     ]
     assert frame.episode.tolist() == [1] * 5 + [0] * 5
     assert frame.step.tolist() == [0, 1, 2, 3, 4] * 2
@@ -388,3 +390,18 @@ def test_every_field_of_an_episode_is_a_column(tmp_path):
     columns = set(pd.read_parquet(tmp_path / "episodes-00000.parquet").columns)
     fields = {field.name for field in dataclasses.fields(Episode)} - {"index"}
     assert columns == fields | {"episode", "step"}
+
+
+def test_a_shard_from_before_failures_were_counted_has_none(tmp_path):
+    write(tmp_path, [0, 1])
+    shard = tmp_path / "episodes-00000.parquet"
+    table = pq.read_table(shard)
+    pq.write_table(table.drop_columns(["num_controller_failures"]), shard)
+    assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0]
+
+
+def test_failures_of_the_controller_come_back(tmp_path):
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        for index in range(3):
+            writer.append(make_episode(index, num_controller_failures=index))
+    assert [e.num_controller_failures for e in load_episodes(tmp_path)] == [0, 1, 2]

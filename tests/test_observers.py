@@ -58,6 +58,21 @@ def test_noise_follows_from_the_generator_alone(bench):
     assert not np.array_equal(noisy, exact)
 
 
+def test_silence_lasts_until_the_next_draw(bench):
+    context = bench.diagram.CreateDefaultContext()
+    bench.observers.reseed(context, np.random.default_rng(0))
+    bench.observers.silence(context)
+    exact, noisy = (
+        observer.GetOutputPort("state").Eval(observer.GetMyContextFromRoot(context))
+        for observer in (bench.exact, bench.noisy)
+    )
+    np.testing.assert_array_equal(noisy, exact)
+    simulator = Simulator(bench.diagram, context)
+    simulator.AdvanceTo(0.02)
+    later = bench.noisy.GetOutputPort("state").Eval(bench.noisy.GetMyContextFromRoot(context))
+    assert not np.array_equal(later, exact)
+
+
 def test_independent_noise_adds_in_squares():
     both = combined(ObservationNoise(position=3.0), ObservationNoise(position=4.0, velocity=2.0))
     assert both == ObservationNoise(position=5.0, velocity=2.0)

@@ -11,6 +11,7 @@ from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import episode_rng, parallel_map
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO, Gliding
+from shuttle_task import shuttling
 
 ARRAYS = ("time_s", "state", "true_state", "output", "desired_output", "desired_preview")
 ARRAYS += ("features", "margins")
@@ -294,8 +295,43 @@ def test_a_task_whose_plans_have_no_goal_says_so():
 
 
 def test_what_a_folder_cannot_tell_apart_is_not_kept_in_one(tmp_path):
-    with pytest.raises(ValueError, match=r"with \['goals'\] are not kept; leave out 'path'"):
+    with pytest.raises(ValueError, match="with goals are not kept; leave out 'path'"):
         run_episodes(aimed(), 1, goals=np.zeros((1, 1)), path=tmp_path)
-    with pytest.raises(ValueError, match=r"episodes with \['recovery'\] are not kept"):
-        run_episodes(load_scenario("laikago_balancing"), 1, path=tmp_path, recovery=True)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_episode_from_the_standing_posture_starts_there_whatever_its_number():
+    goals = np.array([[0.9, 0.2, 0.5], [0.7, 0.4, 0.6]])
+    standing = run_episodes(shuttling(), 2, goals=goals, is_standing=True, num_workers=1)
+    for episode, goal in zip(standing, goals, strict=True):
+        np.testing.assert_array_equal(episode.state[0, :3], 0.0)
+        np.testing.assert_allclose(shuttling().make_loop().goal_of(episode), goal)
+    sampled = run_episodes(shuttling(), 2, goals=goals, num_workers=1)
+    assert all(episode.state[0, :3].any() for episode in sampled)
+    with pytest.raises(ValueError, match="from the standing posture takes a goal"):
+        run_episode(shuttling().make_loop(), is_standing=True)
+
+
+def test_an_episode_counts_the_failures_of_its_controller(tmp_path):
+    goals = np.array([[0.9, 0.2, 0.5], [0.9, 0.2, 0.99]])
+    episodes = run_episodes(shuttling(), 2, goals=goals, is_standing=True, num_workers=1)
+    assert [episode.num_controller_failures for episode in episodes] == [0, 1]
+    drawn = run_episodes(shuttling(), 12, num_workers=1, path=tmp_path)
+    counts = [episode.num_controller_failures for episode in drawn]
+    assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == counts
+    assert run_episode(gliding().make_loop()).num_controller_failures == 0
+
+
+def test_what_a_loops_options_make_is_another_set(tmp_path):
+    left, right = (
+        run_episodes(shuttling(), 2, side=side, num_workers=1, path=tmp_path / side)
+        for side in ("left", "right")
+    )
+    assert left.info.scenario_hash != right.info.scenario_hash
+    # A set goes on with its own options, and with no others.
+    more = run_episodes(shuttling(), 4, side="right", num_workers=1, path=tmp_path / "right")
+    assert_identical(more[:2], right)
+    with pytest.raises(ValueError, match="episodes of another set"):
+        run_episodes(shuttling(), 4, side="left", num_workers=1, path=tmp_path / "right")
+    with pytest.raises(ValueError, match="episodes of another set"):
+        run_episodes(shuttling(), 4, num_workers=1, path=tmp_path / "right")

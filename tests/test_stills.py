@@ -4,17 +4,19 @@ import pytest
 from drake_safety.evaluation.stills import (
     StillCamera,
     render_stills,
+    spread_times,
     stack_positions,
     still_times,
 )
-from drake_safety.simulation.scenario import load_scenario, scenario_names
+from drake_safety.simulation.scenario import load_scenario
+from drake_safety.simulation.view import View
 
 SIZE = {"width": 96, "height": 72}
 
 
 @pytest.fixture(scope="module")
 def loop():
-    return load_scenario(scenario_names()[0]).make_loop(ball=True)
+    return load_scenario("laikago_balancing").make_loop(ball=True)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +95,20 @@ def test_still_times_are_logged_instants_about_throws_and_the_first_trigger():
     np.testing.assert_allclose(times, [0.0, 0.48, 0.66, 0.9, 1.94, 2.0], atol=1e-9)
     assert set(times) <= set(time_s)
     assert times == sorted(times)
+
+
+def test_stills_are_spread_evenly_and_give_way_to_events():
+    time_s = 0.02 * np.arange(201)
+    np.testing.assert_allclose(spread_times(time_s, [], num_stills=5), [0, 1, 2, 3, 4])
+    times = spread_times(time_s, [1.215, 1.3, 3.9], num_stills=5)
+    np.testing.assert_allclose(times, [0.0, 1.22, 1.3, 2.0, 3.0, 3.9], atol=0.011)
+    assert set(times) <= set(time_s)
+
+
+def test_a_view_with_more_room_shows_the_robot_smaller(loop, camera, standing):
+    far = StillCamera(loop, standing, view=View(room=2 * loop.view.room), **SIZE)
+    small, large = (np.mean(c.render(standing).max(axis=-1) < 90) for c in (far, camera))
+    assert small == pytest.approx(large / 4, rel=0.25)
 
 
 def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from drake_safety.evaluation.figure_style import RECOVERY_COLOUR
+from drake_safety.evaluation.figure_style import BALL_COLOUR, RECOVERY_COLOUR
 from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.simulation.pushes import Push
 
 
 @pytest.fixture
@@ -58,6 +59,31 @@ def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(
     np.testing.assert_allclose(tops, [0.63, 0.93, 1.0])
     drawn = next(line for line in margins.lines if line.get_label() == "support polygon")
     np.testing.assert_allclose(drawn.get_ydata()[0], 10.0)
+
+
+def test_the_timeline_marks_a_push_for_as_long_as_it_lasts_and_the_leaving(run):
+    push = Push(force_n=[0.0, 300.0, 400.0], time_s=0.8, duration_s=0.1)
+    fig = timeline_figure(
+        **run | {"throws": [], "recovery_intervals_s": []},
+        pushes=[push],
+        leave_time_s=1.4,
+        trigger_label="alarm",
+    )
+    for panel in fig.axes[2:5]:
+        spans = [p for p in panel.patches if to_hex(p.get_facecolor()) == BALL_COLOUR]
+        (span,) = spans
+        assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((0.8, 0.9))
+        assert [1.4, 1.4] in [list(line.get_xdata()) for line in panel.lines]
+    labels = {text.get_text() for text in fig.axes[2].texts}
+    assert {"push of 500 N for 0.1 s", "alarm", "leaves the safe set"} <= labels
+    assert "trigger" not in labels
+
+
+def test_margins_that_are_angles_are_drawn_in_degrees_and_say_so(run):
+    fig = timeline_figure(**run, angular_constraints=["height"])
+    drawn = {line.get_label(): line.get_ydata() for line in fig.axes[4].lines}
+    np.testing.assert_allclose(drawn["height [°]"], np.degrees(0.05))
+    np.testing.assert_allclose(drawn["support polygon"][0], 10.0)
 
 
 def test_the_timeline_needs_no_more_than_gamma(run):

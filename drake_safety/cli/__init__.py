@@ -12,11 +12,12 @@ import sys
 import typer
 from rich.logging import RichHandler
 
-from drake_safety.cli import evaluate, run, scenarios, train
+from drake_safety.cli import ask, evaluate, run, scenarios, train
 from drake_safety.cli.console import console
+from drake_safety.cli.targets import TargetCommand
 
 # In the order in which the help lists them.
-_COMMANDS = (scenarios.scenarios, train.train, run.run, evaluate.evaluate)
+_COMMANDS = (scenarios.scenarios, train.train, ask.ask, run.run, evaluate.evaluate)
 
 app = typer.Typer(
     help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
@@ -26,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for _command in _COMMANDS:
-    app.command()(_command)
+    app.command(cls=TargetCommand)(_command)
 
 
 def main() -> None:
@@ -34,7 +35,7 @@ def main() -> None:
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(prog_name="drake-safety", standalone_mode=False))
     except (ValueError, OSError) as error:
         console.print("error", error, style="red", highlight=False, soft_wrap=True)
         sys.exit(2)

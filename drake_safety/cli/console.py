@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -19,6 +21,9 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
+if TYPE_CHECKING:
+    from drake_safety.evaluation.metrics import Figure
+
 # Square brackets are units here, not markup. A log has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 
@@ -26,6 +31,27 @@ console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 def new_table(*columns: str, title: str | None = None) -> Table:
     """A table whose cells fold where they do not fit: no figure is cut short."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
+
+
+def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
+    """A figure with its interval, as tables show it; a dash where there was nothing to see."""
+    if math.isnan(figure.value):
+        return "-"
+    value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
+    return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
+
+
+def margin_words(name: str, margin: float, angular_constraints: Collection[str]) -> str:
+    """A constraint and its margin as one reads them: ``collision, -1.2 cm``.
+
+    Args:
+        name: The constraint.
+        margin: Its margin [m, rad].
+        angular_constraints: Names of those whose margins are angles.
+    """
+    if name in angular_constraints:
+        return f"{name}, {math.degrees(margin):+.1f}°"
+    return f"{name}, {100 * margin:+.1f} cm"
 
 
 def print_path(what: str, path: Path) -> None:

@@ -5,110 +5,165 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 from rich.table import Table
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
-from drake_safety.cli.console import console, new_table, open_stages, print_path
+from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.evaluate_plans import (
+    PlanOptions,
+    check_options,
+    evaluate_plans,
+    parse_sizes,
+)
+from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.provenance import command_line, versions
-from drake_safety.cli.training_folder import MODES, episodes_folder, load_assessment
+from drake_safety.cli.training_folder import (
+    MODES,
+    episodes_folder,
+    fresh_episodes_folder,
+    load_assessment,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
 
     from drake_safety.evaluation.metrics import Figure
-    from drake_safety.evaluation.throw_study import ThrowStudy, TriggerRule
-    from drake_safety.learning.segments import EpisodesInfo
+    from drake_safety.evaluation.throw_study import ThrowStudy
+    from drake_safety.learning.segments import Episodes, EpisodesInfo
+
+_DEFAULT_THROWS = 600
 
 
 def evaluate(
     scenario: ScenarioArgument,
     assessment: AssessmentOption,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    throws: Annotated[int, typer.Option(help="Fresh balls at the actual plant.", min=0)] = 600,
+    throws: Annotated[
+        int | None,
+        typer.Option(
+            help="Fresh balls at the actual plant; 600 by default, none where plans have a goal.",
+            min=0,
+        ),
+    ] = None,
     calibration_episodes: Annotated[
         int, typer.Option(help="Other nominal episodes, to choose the recalls' thresholds.", min=20)
     ] = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other balls, to choose the classifiers' thresholds.", min=1)
     ] = 200,
+    other_hand: Annotated[
+        int | None,
+        typer.Option(
+            help="Targets: fresh ones for the other hand; as many as episodes by default.", min=0
+        ),
+    ] = None,
+    learning_curve: Annotated[
+        str,
+        typer.Option(
+            help="Targets: learn from fewer episodes, too, such as '512,1024'; takes long."
+        ),
+    ] = "",
+    plane_x: Annotated[
+        float | None,
+        typer.Option(help="Targets: x of the reachable region's plane [m]; the task's by default."),
+    ] = None,
+    plane_step: Annotated[
+        float,
+        typer.Option(help="Targets: spacing of those simulated on it [m]; 0 leaves it out.", min=0),
+    ] = 0.1,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
-    """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers."""
+    """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers.
+
+    Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
+    kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
+    """
     from drake_safety.evaluation.embedding_figure import embedding_figure
-    from drake_safety.evaluation.episode_study import evaluate_episodes
     from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.roc_figure import roc_figure
-    from drake_safety.evaluation.scorers import assessment_scorer, classifier_scorers
-    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
+    from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
+    loop = loaded.make_loop()
+    has_goals = loop.target_box is not None
+    if throws is None:
+        throws = 0 if has_goals else _DEFAULT_THROWS
     if throws and not hasattr(loaded.parameters, "recovery"):
         raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
+    options = PlanOptions(
+        other_hand=other_hand,
+        learning_curve=parse_sizes(learning_curve),
+        plane_x=plane_x,
+        plane_step=plane_step,
+    )
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
     train_set = load_episodes(episodes_folder(assessment))
-    used = range(seed, seed + 4)  # Episodes, throws, and those that thresholds are chosen on.
+    check_options(loop, options, len(train_set))
+    # Episodes, throws, those that thresholds are chosen on, and the other hand's.
+    used = range(seed, seed + (5 if has_goals else 4))
     if train_set.info.seed in used:
         raise ValueError(
             f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and "
             f"{train_set.info.seed} is the training episodes' own; choose another"
         )
     with open_stages() as stages:
-        run_set = partial(run_episodes, loaded, num_workers=workers)
-        test_set = run_set(episodes, seed=seed, progress=partial(stages, "fresh nominal episodes"))
-        _check_same_simulation(train_set.info, test_set.info)
-        calibration_set = run_set(
-            calibration_episodes, seed=seed + 3, progress=partial(stages, "calibration episodes")
-        )
-        classifiers = classifier_scorers(train_set, stages)
-        scorers = [
-            assessment_scorer("sharpened", sharpened, is_normalized=True),
-            assessment_scorer("paper", paper, is_normalized=True),
-            *classifiers,
-        ]
-        figures, scores, labels = evaluate_episodes(scorers, calibration_set, test_set)
-        pictures = [
-            *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
-            *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
-            *save(
-                roc_figure({name: (score, labels) for name, score in scores.items()}),
-                folder / "roc",
-            ),
-        ]
-        rules: list[TriggerRule] = []
-        if throws:
-            recovery = loaded.parameters.recovery
-            rules = trigger_rules(
-                sharpened,
-                paper,
-                classifiers,
-                threshold=recovery.threshold,
-                is_normalized=recovery.is_normalized,
-            )
-            study = evaluate_throws(
+
+        def run_set(what: str, num_episodes: int, offset: int, **loop_options: Any) -> Episodes:
+            path = None
+            if has_goals:
+                path = fresh_episodes_folder(
+                    assessment, loaded.simulation_hash(), seed + offset, loop_options
+                )
+            return run_episodes(
                 loaded,
-                rules,
-                num_throws=throws,
-                num_calibration=calibration_throws,
-                seed=seed + 1,
-                calibration_seed=seed + 2,
+                num_episodes,
+                seed=seed + offset,
                 num_workers=workers,
-                progress=stages,
+                path=path,
+                progress=partial(stages, what),
+                **loop_options,
             )
-            figures |= study.figures
-            figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
-            pictures += save(_throws_picture(study), folder / "throws")
+
+        test_set = run_set("fresh nominal episodes", episodes, 0)
+        _check_same_simulation(train_set.info, test_set.info)
+        calibration_set = run_set("calibration episodes", calibration_episodes, 3)
+        shortest = sharpened.parameters.shortest_segment or None
+        judged = Judged(
+            scenario=loaded,
+            sharpened=sharpened,
+            paper=paper,
+            classifiers=classifier_scorers(train_set, stages, shortest=shortest),
+            run_folder=assessment,
+            train_set=train_set,
+            calibration_set=calibration_set,
+            test_set=test_set,
+            folder=folder,
+            workers=workers,
+            stages=stages,
+        )
+        findings = Findings(
+            pictures=[
+                *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
+                *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
+            ]
+        )
+        if has_goals:
+            findings.add(evaluate_plans(judged, options, partial(run_set, offset=4)))
+        else:
+            findings.add(_evaluate_segments(judged))
+        if throws:
+            findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -117,18 +172,73 @@ def evaluate(
         "training_seed": train_set.info.seed,
         "training_episodes": len(train_set),
         "versions": versions(),
-        **{key: figure.to_json() for key, figure in figures.items()},
+        **findings.entries,
+        **{key: figure.to_json() for key, figure in findings.figures.items()},
     }
     file = folder / "evaluation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    names = [scorer.name for scorer in scorers]
-    console.print(_episodes_table(figures, names, "segments", "per segment"))
-    console.print(_episodes_table(figures, names, "episodes", "per episode, at k = 0"))
-    if rules:
-        console.print(_throws_table(figures, [rule.name for rule in rules]))
+    for table in findings.tables:
+        console.print(table)
     print_path("figures", file)
-    for picture in pictures:
+    for picture in findings.pictures:
         print_path("picture", picture)
+
+
+def _evaluate_segments(judged: Judged) -> Findings:
+    """Everyone on fresh episodes, per segment and at k = 0."""
+    from drake_safety.evaluation.episode_study import evaluate_episodes
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.roc_figure import roc_figure
+    from drake_safety.evaluation.scorers import assessment_scorer
+
+    scorers = [
+        assessment_scorer("sharpened", judged.sharpened, is_normalized=True),
+        assessment_scorer("paper", judged.paper, is_normalized=True),
+        *judged.classifiers,
+    ]
+    figures, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
+    curves = {name: (score, labels) for name, score in scores.items()}
+    names = [scorer.name for scorer in scorers]
+    return Findings(
+        figures=figures,
+        pictures=save(roc_figure(curves), judged.folder / "roc"),
+        tables=[
+            _episodes_table(figures, names, "segments", "per segment"),
+            _episodes_table(figures, names, "episodes", "per episode, at k = 0"),
+        ],
+    )
+
+
+def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed: int) -> Findings:
+    """Everyone as a trigger of recovery."""
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
+
+    recovery = judged.scenario.parameters.recovery
+    rules = trigger_rules(
+        judged.sharpened,
+        judged.paper,
+        judged.classifiers,
+        threshold=recovery.threshold,
+        is_normalized=recovery.is_normalized,
+    )
+    study = evaluate_throws(
+        judged.scenario,
+        rules,
+        num_throws=num_throws,
+        num_calibration=num_calibration,
+        seed=seed + 1,
+        calibration_seed=seed + 2,
+        num_workers=judged.workers,
+        progress=judged.stages,
+    )
+    figures = dict(study.figures)
+    figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
+    return Findings(
+        figures=figures,
+        pictures=save(_throws_picture(study), judged.folder / "throws"),
+        tables=[_throws_table(figures, [rule.name for rule in rules])],
+    )
 
 
 def _throws_picture(study: ThrowStudy) -> Picture:
@@ -155,16 +265,11 @@ def _check_same_simulation(trained: EpisodesInfo, fresh: EpisodesInfo) -> None:
         )
 
 
-def _interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
-    value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
-    return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
-
-
 def _episodes_table(figures: dict[str, Figure], names: list[str], kind: str, title: str) -> Table:
     columns = ("auc", "safe_recall", "unsafe_recall", "brier")
     table = new_table("scorer", *columns, title=f"Fresh nominal episodes, {title}")
     for name in names:
-        table.add_row(name, *(_interval(figures[f"{kind}.{name}.{key}"]) for key in columns))
+        table.add_row(name, *(interval(figures[f"{kind}.{name}.{key}"]) for key in columns))
     return table
 
 
@@ -179,7 +284,7 @@ def _throws_table(figures: dict[str, Figure], names: list[str]) -> Table:
         "after impact [ms]",
         "before the fall [s]",
         title=f"{alone.n} fresh throws at the actual plant; balancing alone falls in "
-        f"{_interval(alone, 100, 1)} %",
+        f"{interval(alone, 100, 1)} %",
     )
     for name in names:
         prefix = f"throws.{name}."
@@ -187,8 +292,8 @@ def _throws_table(figures: dict[str, Figure], names: list[str]) -> Table:
         table.add_row(
             name,
             f"{figures[f'{prefix}threshold'].value:.2f}",
-            _interval(figures[f"{prefix}falls_with_recovery"], 100, 1),
-            _interval(figures[f"{prefix}false_triggers"], 100, 1),
+            interval(figures[f"{prefix}falls_with_recovery"], 100, 1),
+            interval(figures[f"{prefix}false_triggers"], 100, 1),
             f"{round(missed.value * missed.n) if missed.n else 0} of {missed.n}",
             f"{1000 * figures[f'{prefix}trigger_after_impact_s'].value:.0f}",
             f"{figures[f'{prefix}trigger_before_fall_s'].value:.2f}",

@@ -10,8 +10,11 @@ import numpy as np
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import console, new_table, print_path
-from drake_safety.cli.training_folder import load_assessment
+from drake_safety.cli.console import margin_words, new_table
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
+from drake_safety.cli.target_run import run_to_target
+from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
+from drake_safety.cli.training_folder import goal_threshold, load_assessment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.scenario import Scenario
     from drake_safety.simulation.throws import ThrowLog
 
-_LOG_PERIOD_S = 0.02
+_DURATION_S = 5.0  # Of a run with balls.
 _PORTS = (
     "normalized_safety_probability",
     "safety_probability",
@@ -45,18 +48,32 @@ _THROW_FIELDS = {
 def run(
     scenario: ScenarioArgument,
     assessment: AssessmentOption,
+    target: Annotated[
+        str | None, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)
+    ] = None,
+    hand: HandOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Go to the target even if Γ refuses it.")
+    ] = False,
     push: Annotated[
         list[str] | None,
         typer.Option(
-            help="'ball' throws the scenario's own balls; or your own, repeatable: "
-            "'time=1 mass=3 speed=9 direction=90' [s, kg, m/s, degrees from x]."
+            help="On the way to a target: a push that the scenario names. Else: 'ball' throws the "
+            "scenario's own balls; or your own, repeatable: 'time=1 mass=3 speed=9 direction=90' "
+            "[s, kg, m/s, degrees from x]."
         ),
     ] = None,
     variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
     recovery: Annotated[
-        bool, typer.Option("--recovery/--no-recovery", help="Step when Γ falls.")
-    ] = True,
-    duration: Annotated[float, typer.Option(help="Seconds to simulate.", min=0.1)] = 5.0,
+        bool | None,
+        typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds to simulate; 5, or to a target one more than an episode.", min=0.1
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = 0,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
@@ -67,45 +84,59 @@ def run(
         bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
     ] = False,
 ) -> None:
-    """Simulate once with Γ in the loop: a recording, a timeline, and what happened when."""
-    from pydrake.geometry import Meshcat
+    """Simulate once with Γ in the loop: a recording, a timeline, and what happened when.
 
-    from drake_safety.evaluation.figure_style import save
+    A target that Γ refuses is not gone to, and the exit code is 1; --force goes there.
+    """
     from drake_safety.simulation.scenario import load_scenario
+
+    given = {"hand": hand, "recovery": recovery}
+    settings = RunSettings(
+        scenario=load_scenario(scenario),
+        assessment=load_assessment(assessment, mode),
+        variation=variation,
+        options={name: value for name, value in given.items() if value is not None},
+        pushes=push or [],
+        seed=seed,
+        duration_s=duration,
+        folder=(out or assessment) / "run",
+        is_live=meshcat,
+    )
+    if target is not None:
+        threshold, remark = goal_threshold(assessment, mode)
+        if not run_to_target(settings, target, threshold, remark, is_forced=force):
+            raise typer.Exit(1)
+        return
+    if force:
+        raise ValueError(f"run: --force goes to a target that Γ refuses: pass {TARGET} too")
+    # What a task offers is asked of its diagram, before a browser is opened for it.
+    loop = settings.make_loop()
+    if loop.target_box is not None:
+        raise ValueError(
+            f"run: task '{type(loop).__name__}' goes to a target: pass {TARGET} X Y Z, or one of "
+            f"the names {list(loop.named_targets)}"
+        )
+    _run_with_balls(settings)
+
+
+def _run_with_balls(settings: RunSettings) -> None:
     from drake_safety.simulation.throws import run_throw
 
-    loaded = load_scenario(scenario)
-    gamma = load_assessment(assessment, mode)
-    throws = parse_pushes(loaded, push or [])
-    viewer = Meshcat()
-    loop = loaded.make_loop(
-        variation, assessment=gamma, meshcat=viewer, recovery=recovery, ball=True
-    )
-    if meshcat:
-        console.print(f"live at {viewer.web_url()}")
-        input("Press Enter when the browser shows the robot. ")
-    viewer.StartRecording()
+    throws = parse_pushes(settings.scenario, settings.pushes)
+    recording = Recording(settings)
+    loop = settings.make_loop(recording.viewer, ball=True)
+    recording.start()
     log = run_throw(
         loop,
         0,
-        seed=seed,
+        seed=settings.seed,
         throws=throws,
-        duration_s=duration,
-        log_period_s=_LOG_PERIOD_S,
+        duration_s=_DURATION_S if settings.duration_s is None else settings.duration_s,
+        log_period_s=LOG_PERIOD_S,
         ports=_PORTS,
-        realtime_rate=1.0 if meshcat else 0.0,
+        realtime_rate=settings.realtime_rate,
     )
-    viewer.StopRecording()
-    viewer.PublishRecording()
-    folder = (out or assessment) / "run"
-    folder.mkdir(parents=True, exist_ok=True)
-    recording = folder / "recording.html"
-    recording.write_text(viewer.StaticHtml(), encoding="utf-8")
-    pictures = save(_timeline(loop, log, throws), folder / "timeline")
-    console.print(_table_of_events(loop, log, throws))
-    print_path("recording", recording)
-    for picture in pictures:
-        print_path("picture  ", picture)
+    recording.save(_timeline(loop, log, throws), _table_of_events(loop, log, throws))
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
@@ -168,7 +199,7 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
 
 def _table_of_events(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Table:
     def row_at(time_s: float) -> int:
-        return min(round(time_s / _LOG_PERIOD_S), len(log.time_s) - 1)
+        return min(round(time_s / LOG_PERIOD_S), len(log.time_s) - 1)
 
     events = [
         (
@@ -185,8 +216,8 @@ def _table_of_events(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Ta
         events.append(
             (
                 time_s,
-                f"recovery triggered; expected violation: {loop.constraint_names[cause]}, "
-                f"{100 * margin:+.1f} cm",
+                "recovery triggered; expected violation: "
+                + margin_words(loop.constraint_names[cause], margin, loop.angular_constraints),
             )
         )
     if log.has_fallen:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,11 +11,28 @@ if TYPE_CHECKING:
 
 MODES = ("sharpened", "paper")
 """Modes that are trained and compared, the default first."""
+DEFAULT_THRESHOLD = 0.5
+"""From which Γ on a goal is accepted where no threshold was calibrated."""
 
 
 def episodes_folder(folder: Path) -> Path:
     """Where ``train`` keeps the nominal episodes."""
     return folder / "episodes"
+
+
+def fresh_episodes_folder(
+    folder: Path, scenario_hash: str, seed: int, loop_options: dict[str, str]
+) -> Path:
+    """Where ``evaluate`` keeps the nominal episodes it judges by, so that it can go on with them.
+
+    Args:
+        folder: The folder of the training.
+        scenario_hash: Of what was simulated: another simulation is another set.
+        seed: Of the set.
+        loop_options: Options of the task's diagram.
+    """
+    options = [f"{name}-{value}" for name, value in sorted(loop_options.items())]
+    return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
 
 
 def assessment_file(folder: Path, mode: str) -> Path:
@@ -38,3 +56,25 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
             "run `drake-safety train` first"
         )
     return SafetyAssessment.load(path)
+
+
+def goal_threshold(folder: Path, mode: str) -> tuple[float, str]:
+    """From which Γ = b_safe / (1 - μ) on a goal is accepted.
+
+    Args:
+        folder: The folder of a training.
+        mode: Of the assessment that is asked.
+
+    Returns:
+        The threshold that ``evaluate`` chose on its calibration episodes, and ""; without one the
+        default, and a remark that says so.
+    """
+    file = folder / "evaluation.json"
+    figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    figure = figures.get(f"plans.{mode}.threshold")
+    if figure is not None:
+        return float(figure["value"]), ""
+    return DEFAULT_THRESHOLD, (
+        f"the threshold {DEFAULT_THRESHOLD:g} is not calibrated: `drake-safety evaluate` writes "
+        f"one into {file}"
+    )

@@ -77,6 +77,7 @@ class ReachingSafeSet:
 
     names = ("support_polygon", "collision", "joint_limits", "fall")
     fall_name = "fall"
+    angular_names = ("joint_limits",)
 
     def __init__(
         self,

@@ -26,12 +26,20 @@ class DirectClassifier:
             MLPClassifier on standardised inputs).
         uses_features: Whether x has the features, as in the assessment's sharpened mode.
         seed: Seeds the held-out episodes and the training.
+        shortest: Steps that a safe episode's segment has at least; the horizon by default.
 
     Raises:
         ValueError: Unknown kind.
     """
 
-    def __init__(self, kind: str, *, uses_features: bool = True, seed: int = 0):
+    def __init__(
+        self,
+        kind: str,
+        *,
+        uses_features: bool = True,
+        seed: int = 0,
+        shortest: int | None = None,
+    ):
         if kind not in KINDS:
             raise ValueError(
                 f"DirectClassifier: unknown kind '{kind}'; the kinds are {list(KINDS)}"
@@ -39,6 +47,7 @@ class DirectClassifier:
         self.kind = kind
         self.uses_features = uses_features
         self.seed = seed
+        self.shortest = shortest
 
     def fit(self, episodes: Episodes) -> DirectClassifier:
         """Learns from episodes.
@@ -51,7 +60,7 @@ class DirectClassifier:
         """
         from threadpoolctl import threadpool_limits
 
-        segments = split(episodes, stride=1, discount=1.0)
+        segments = split(episodes, stride=1, discount=1.0, shortest=self.shortest)
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         is_held_out = self._held_out(segments)
         self.num_inputs_ = x.shape[1]

@@ -60,13 +60,21 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, *, is_normalized:
     )
 
 
-def classifier_scorers(episodes: Episodes, progress: StageProgress | None = None) -> list[Scorer]:
-    """The direct classifiers, trained on the assessment's own training episodes."""
+def classifier_scorers(
+    episodes: Episodes, progress: StageProgress | None = None, *, shortest: int | None = None
+) -> list[Scorer]:
+    """The direct classifiers, trained on the assessment's own training episodes.
+
+    Args:
+        episodes: The episodes.
+        progress: Called with a stage, the number done and the number wanted.
+        shortest: Steps that a safe episode's segment has at least; the horizon by default.
+    """
     scorers = []
     for i, kind in enumerate(KINDS):
         if progress is not None:
             progress("direct classifiers", i, len(KINDS))
-        scorers.append(_classifier_scorer(DirectClassifier(kind).fit(episodes)))
+        scorers.append(_classifier_scorer(DirectClassifier(kind, shortest=shortest).fit(episodes)))
     if progress is not None:
         progress("direct classifiers", len(KINDS), len(KINDS))
     return scorers

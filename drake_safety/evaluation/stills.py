@@ -30,6 +30,7 @@ from drake_safety.models import load_robot
 
 if TYPE_CHECKING:
     from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.view import View
 
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
@@ -37,7 +38,7 @@ _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
 _BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and what it did.
 _AFTER_TRIGGER_S = 0.3  # Feet in the air.
-_ROOM = 0.95  # How much more than the robot's own extent fits into a picture.
+_LEAST_GAP_S = 0.3  # Between two pictures that no event asks for.
 
 
 class StillCamera:
@@ -49,8 +50,7 @@ class StillCamera:
             a log, (n_q,).
         width: Of the pictures [pixels].
         height: Of the pictures [pixels].
-        azimuth_rad: Where the camera stands, as an angle from the world's x axis [rad].
-        elevation_rad: How far above the robot it stands [rad].
+        view: Where the camera stands; the task's own view by default.
 
     Raises:
         ValueError: The positions have another size, or are not finite.
@@ -63,8 +63,7 @@ class StillCamera:
         *,
         width: int = 720,
         height: int = 540,
-        azimuth_rad: float = math.radians(-42.0),
-        elevation_rad: float = math.radians(15.0),
+        view: View | None = None,
     ):
         plant = self._plant = loop.plant
         robot = load_robot(loop.scenario.robot)
@@ -78,16 +77,17 @@ class StillCamera:
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         # Only the base's motion over the ground is followed, so that a fall is seen as one.
         self._look_at_height = centre[2]
+        view = loop.view if view is None else view
         self._offset = (centre - base)[:2]
         direction = np.array(
             [
-                math.cos(elevation_rad) * math.cos(azimuth_rad),
-                math.cos(elevation_rad) * math.sin(azimuth_rad),
-                math.sin(elevation_rad),
+                math.cos(view.elevation_rad) * math.cos(view.azimuth_rad),
+                math.cos(view.elevation_rad) * math.sin(view.azimuth_rad),
+                math.sin(view.elevation_rad),
             ]
         )
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
-        self._eye = _ROOM * radius / math.sin(narrow) * direction
+        self._eye = view.room * radius / math.sin(narrow) * direction
         core = RenderCameraCore(
             _RENDERER,
             CameraInfo(width * _SUPERSAMPLING, height * _SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
@@ -215,6 +215,25 @@ def still_times(
         wanted += [touch_s - _BEFORE_TOUCH_S, touch_s + _AFTER_TOUCH_S]
     wanted += [trigger_s + _AFTER_TRIGGER_S for trigger_s in trigger_times_s[:1]]
     rows = {int(np.abs(time_s - instant).argmin()) for instant in wanted}
+    return [float(time_s[row]) for row in sorted(rows)]
+
+
+def spread_times(time_s: np.ndarray, events_s: Iterable[float], *, num_stills: int) -> list[float]:
+    """Instants of a motion worth a picture: those that are given, and others spread between them.
+
+    Args:
+        time_s: Instants of the log [s], (N,), increasing.
+        events_s: What must be seen [s].
+        num_stills: How many are spread evenly from start to end; those close to an event give way.
+
+    Returns:
+        Logged instants [s], increasing.
+    """
+    kept = [*events_s]
+    for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
+        if all(abs(instant - event) >= _LEAST_GAP_S for event in kept):
+            kept.append(instant)
+    rows = {int(np.abs(time_s - instant).argmin()) for instant in kept}
     return [float(time_s[row]) for row in sorted(rows)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.gridspec import GridSpecBase
 
     from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.pushes import Push
 
 _WIDTH = 12.0  # All sizes are in inches.
 _GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
@@ -44,26 +46,34 @@ def timeline_figure(
     threshold: float,
     *,
     throws: Sequence[Throw] = (),
+    pushes: Sequence[Push] = (),
     trigger_times_s: Sequence[float] = (),
+    trigger_label: str = "trigger",
+    leave_time_s: float = math.inf,
     recovery_intervals_s: Sequence[tuple[float, float]] = (),
     stills: Sequence[tuple[float, np.ndarray]] = (),
     belief: np.ndarray | None = None,
     margins: np.ndarray | None = None,
     constraint_names: Sequence[str] = (),
+    angular_constraints: Sequence[str] = (),
 ) -> Figure:
     """Gamma over time, with pictures of the robot at the moments that matter.
 
     Args:
         time_s: Instants [s], (N,).
         gamma: Safety probability, held until the next instant, (N,).
-        threshold: Below it a recovery is triggered.
+        threshold: Below it something is done: a recovery triggered, a goal given up.
         throws: Balls, each marked at the instant it touches.
-        trigger_times_s: When a recovery was triggered [s].
+        pushes: Pushes, each marked for as long as it lasts.
+        trigger_times_s: When that happened [s].
+        trigger_label: What it is called.
+        leave_time_s: When the robot left its safe set [s]; infinite for never.
         recovery_intervals_s: (start, end) of each recovery [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
-        margins: Signed margins [m], (N, n_c); drawn at the bottom.
+        margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
         constraint_names: Names of the columns of `margins`.
+        angular_constraints: Those whose margins are angles.
 
     Raises:
         ValueError: Arrays of different lengths, margins without as many names, or a still outside
@@ -98,15 +108,19 @@ def timeline_figure(
         if belief is not None:
             _draw_belief(next(remaining), time_s, belief)
         if margins is not None:
-            _draw_margins(next(remaining), time_s, margins, constraint_names)
+            _draw_margins(next(remaining), time_s, margins, constraint_names, angular_constraints)
         for panel in panels:
-            _mark_instants(panel, throws, trigger_times_s)
+            _mark_instants(panel, throws, pushes, trigger_times_s, leave_time_s)
         for interval in recovery_intervals_s:
             _annotate_recovery(gamma_axes, interval)
         for throw in throws:
             _annotate_throw(gamma_axes, time_s, throw)
+        for push in pushes:
+            _annotate_push(gamma_axes, time_s, push)
         for instant in trigger_times_s:
-            _annotate_trigger(gamma_axes, time_s, instant, threshold)
+            _annotate_trigger(gamma_axes, time_s, (instant, threshold), trigger_label)
+        if math.isfinite(leave_time_s):
+            _annotate_leaving(gamma_axes, time_s, leave_time_s)
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
             _draw_still(axes, image, f"({letter})  {instant:.2f} s")
             row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
@@ -185,18 +199,23 @@ def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
 
 
 def _draw_margins(
-    axes: Axes, time_s: np.ndarray, margins: np.ndarray, names: Sequence[str]
+    axes: Axes,
+    time_s: np.ndarray,
+    margins: np.ndarray,
+    names: Sequence[str],
+    angular: Sequence[str],
 ) -> None:
     axes.axhline(0.0, color=FAINT_INK, linewidth=0.8)
     for i, name in enumerate(names):
+        is_angle = name in angular
         axes.plot(
             time_s,
-            100.0 * margins[:, i],
+            np.degrees(margins[:, i]) if is_angle else 100.0 * margins[:, i],
             # From the third on: the first two are the colours of safe and unsafe.
             color=SERIES_COLOURS[(2 + i) % len(SERIES_COLOURS)],
             linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
             linewidth=1.5,
-            label=spoken(name),
+            label=f"{spoken(name)} [°]" if is_angle else spoken(name),
         )
     low, high = axes.get_ylim()
     low = min(low, -0.12 * high)
@@ -216,11 +235,28 @@ def _add_legend_on_the_right(axes: Axes, handles: Sequence[Any], labels: Sequenc
     )
 
 
-def _mark_instants(axes: Axes, throws: Sequence[Throw], trigger_times_s: Sequence[float]) -> None:
+def _mark_instants(
+    axes: Axes,
+    throws: Sequence[Throw],
+    pushes: Sequence[Push],
+    trigger_times_s: Sequence[float],
+    leave_time_s: float,
+) -> None:
     for throw in throws:
         axes.axvline(throw.time_s, color=INK, linewidth=1.0, linestyle=(0, (1, 2)))
+    for push in pushes:
+        axes.axvspan(
+            push.time_s,
+            push.time_s + push.duration_s,
+            color=BALL_COLOUR,
+            alpha=0.25,
+            linewidth=0,
+            zorder=0,
+        )
     for instant in trigger_times_s:
         axes.axvline(instant, color=UNSAFE_COLOUR, linewidth=1.2)
+    if math.isfinite(leave_time_s):
+        axes.axvline(leave_time_s, color=INK, linewidth=1.2, linestyle=(0, (4, 2)))
 
 
 def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
@@ -236,13 +272,24 @@ def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
 
 
 def _annotate_throw(axes: Axes, time_s: np.ndarray, throw: Throw) -> None:
-    # The words stand left of the ball, unless it comes so early that they would not fit.
-    is_early = throw.time_s - time_s[0] < 0.15 * (time_s[-1] - time_s[0])
-    place = (throw.time_s, _BALL_HEIGHT)
-    axes.plot(*place, "o", color=BALL_COLOUR, markersize=9, clip_on=False, zorder=5)
+    axes.plot(
+        throw.time_s, _BALL_HEIGHT, "o", color=BALL_COLOUR, markersize=9, clip_on=False, zorder=5
+    )
+    words = f"{throw.mass_kg:.1f} kg, {throw.speed_m_s:.1f} m/s"
+    _write_before(axes, time_s, throw.time_s, words)
+
+
+def _annotate_push(axes: Axes, time_s: np.ndarray, push: Push) -> None:
+    words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
+    _write_before(axes, time_s, push.time_s, words)
+
+
+def _write_before(axes: Axes, time_s: np.ndarray, instant_s: float, words: str) -> None:
+    # They stand left of the instant, unless it comes so early that they would not fit.
+    is_early = instant_s - time_s[0] < 0.15 * (time_s[-1] - time_s[0])
     axes.annotate(
-        f"{throw.mass_kg:.1f} kg, {throw.speed_m_s:.1f} m/s",
-        place,
+        words,
+        (instant_s, _BALL_HEIGHT),
         xytext=(8 if is_early else -8, 0),
         textcoords="offset points",
         ha="left" if is_early else "right",
@@ -251,16 +298,29 @@ def _annotate_throw(axes: Axes, time_s: np.ndarray, throw: Throw) -> None:
     )
 
 
-def _annotate_trigger(axes: Axes, time_s: np.ndarray, instant_s: float, threshold: float) -> None:
-    is_late = time_s[-1] - instant_s < 0.15 * (time_s[-1] - time_s[0])
-    axes.plot(instant_s, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
+def _annotate_trigger(
+    axes: Axes, time_s: np.ndarray, place: tuple[float, float], words: str
+) -> None:
+    axes.plot(*place, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
+    _write_after(axes, time_s, (place[0], 0.75), words, UNSAFE_COLOUR)
+
+
+def _annotate_leaving(axes: Axes, time_s: np.ndarray, instant_s: float) -> None:
+    _write_after(axes, time_s, (instant_s, 0.15), "leaves the safe set", INK)
+
+
+def _write_after(
+    axes: Axes, time_s: np.ndarray, place: tuple[float, float], words: str, colour: str
+) -> None:
+    # They stand right of the instant, unless it comes so late that they would not fit.
+    is_late = time_s[-1] - place[0] < 0.15 * (time_s[-1] - time_s[0])
     axes.annotate(
-        "trigger",
-        (instant_s, 0.75),
+        words,
+        place,
         xytext=(-5 if is_late else 5, 0),
         textcoords="offset points",
         ha="right" if is_late else "left",
-        color=UNSAFE_COLOUR,
+        color=colour,
         fontsize=9,
     )
 

@@ -74,6 +74,7 @@ class Episode:
         is_safe: Whether the whole rollout stayed in the safe set.
         cause: "" when safe, else the name of the violated constraint, or "diverged".
         first_step: First row whose future is undisturbed; the rows before are no training data.
+        num_controller_failures: How often a controller had no command of its own.
     """
 
     index: int
@@ -88,6 +89,7 @@ class Episode:
     is_safe: bool
     cause: str
     first_step: int = 0
+    num_controller_failures: int = 0
 
     @property
     def num_steps(self) -> int:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from drake_safety.simulation.view import View
+
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import Episode
     from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
 
 RECORDED_PORTS = (
@@ -35,8 +40,13 @@ class ClosedLoop(Diagram):
     Whoever runs, records or judges episodes uses only what this class promises: the output ports
     below, :meth:`reset`, and the names of what the ports carry. Throws and pictures also use the
     plant: ``plant``, ``robot``, ``robot_instance``, ``kinematics``, ``fall_name`` and
-    ``trigger_port``, which a task with a ball provides. A subclass wires its systems in
-    ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
+    ``trigger_port``, which a task with a ball provides. A task whose plans have a goal, a point
+    in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, and it
+    overrides :meth:`goal_of` and :meth:`reset_standing`; :attr:`fair_box`, :meth:`is_fair`,
+    :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets` and, with the input port
+    ``applied_spatial_force`` of its plant, :attr:`pushes` where they say something of it. A
+    subclass wires its systems in ``__init__``, calls :meth:`check_assessment` before it wires one,
+    and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -73,6 +83,17 @@ class ClosedLoop(Diagram):
     output_names: list[str]
     feature_names: list[str]
     constraint_names: list[str]
+
+    hand: str | None = None
+    """The robot's reaching frame that goes to the goal, for tasks with such plans."""
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; those of all others are lengths [m]."""
+    view: View = View()
+    """Where pictures are taken from."""
+    named_targets: Mapping[str, list[float]] = {}
+    """Goals that can be asked for by name, in the world, (3,) [m] each."""
+    pushes: Mapping[str, Push] = {}
+    """Pushes that a run can be disturbed with, by name."""
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
@@ -124,6 +145,50 @@ class ClosedLoop(Diagram):
                     f"{learned}, the diagram has {here}"
                 )
 
+    @property
+    def target_box(self) -> np.ndarray | None:
+        """Lowest and highest corner of the goals that are drawn, in the world, (2, 3) [m].
+
+        None for a task whose plans have no goal.
+        """
+        return None
+
+    @property
+    def fair_box(self) -> np.ndarray | None:
+        """The part of the target box whose goals are neither trivial nor absurd, (2, 3) [m]."""
+        return self.target_box
+
+    @property
+    def mirror_options(self) -> dict[str, Any]:
+        """Options of the diagram that is this one in the mirror; empty where there is none."""
+        return {}
+
+    def goal_of(self, episode: Episode) -> np.ndarray:
+        """Where the plan of an episode of this loop led to, in the world, (3,) [m].
+
+        Args:
+            episode: The episode; one that ended early will do.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
+
+    def is_fair(self, episode: Episode) -> bool:
+        """Whether an episode of this loop belongs to the set in which verdicts are not trivial.
+
+        Args:
+            episode: The episode.
+        """
+        goal, box = self.goal_of(episode), self.fair_box
+        return box is None or bool(np.all((goal >= box[0]) & (goal <= box[1])))
+
+    def num_controller_failures(self, context: Context) -> int:
+        """How often a controller had no command of its own since the episode began.
+
+        Args:
+            context: The diagram's Context.
+        """
+        del context
+        return 0
+
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that decide what the plant is; part of its hash."""
@@ -146,6 +211,20 @@ class ClosedLoop(Diagram):
             with a push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
+
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts at rest in the robot's own posture; tasks whose plans have a goal override this.
+
+        What the assessor sees of the first instant is without noise.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            goal: Where the plan shall lead, in the world, (3,) [m].
+            rng: Source of the noise that follows; always the same by default.
+        """
+        raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.

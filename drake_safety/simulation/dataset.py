@@ -31,6 +31,7 @@ __all__ = ["EpisodeWriter", "completed", "load_episodes", "read_info"]
 
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
+_FAILURES = "num_controller_failures"
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 _LOGGER = logging.getLogger("drake_safety")
 
@@ -300,6 +301,8 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
     columns["is_safe"] = repeat([episode.is_safe for episode in episodes], np.bool_)
     columns["cause"] = pa.array(np.repeat(np.asarray(causes, dtype=object), counts), pa.string())
     columns["first_step"] = repeat([episode.first_step for episode in episodes], np.int32)
+    failures = [episode.num_controller_failures for episode in episodes]
+    columns[_FAILURES] = repeat(failures, np.int32)
     return pa.table(columns)
 
 
@@ -307,8 +310,11 @@ def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Epis
     widths = _widths(info)
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
-    if table.column_names != names:
-        raise ValueError(f"{shard} has columns {table.column_names}; expected {names}")
+    # Shards from before failures were counted are as good: nothing is learned from the count.
+    if table.column_names not in ([*names, _FAILURES], names):
+        raise ValueError(
+            f"{shard} has columns {table.column_names}; expected {[*names, _FAILURES]}"
+        )
     arrays: dict[str, np.ndarray] = {}
     for name, width in widths.items():
         if not width:
@@ -320,6 +326,9 @@ def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Epis
         arrays[name] = column.flatten().to_numpy().reshape(table.num_rows, width)
     for name in ["episode", "step", "time_s", "is_safe", "cause", "first_step"]:
         arrays[name] = table.column(name).to_numpy()
+    failures = np.zeros(table.num_rows, dtype=int)
+    if _FAILURES in table.column_names:
+        failures = table.column(_FAILURES).to_numpy()
     episode = arrays["episode"]
     bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), table.num_rows]
     result = []
@@ -335,6 +344,7 @@ def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Epis
                 is_safe=bool(arrays["is_safe"][first]),
                 cause=str(arrays["cause"][first]),
                 first_step=int(arrays["first_step"][first]),
+                num_controller_failures=int(failures[first]),
             )
         )
     return result

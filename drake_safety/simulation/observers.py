@@ -80,6 +80,16 @@ class Observers:
                 RandomGenerator(int(rng.integers(2**31))),
             )
 
+    def silence(self, context: Context) -> None:
+        """Takes the noise out of this instant, up to the next draw.
+
+        Args:
+            context: The root Context.
+        """
+        for source in self._sources:
+            source_context = source.GetMyMutableContextFromRoot(context)
+            source_context.get_mutable_discrete_state_vector().SetZero()
+
 
 def combined(one: ObservationNoise, other: ObservationNoise) -> ObservationNoise:
     """The noise of two independent sources together."""

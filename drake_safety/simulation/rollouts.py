@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import inspect
 import logging
@@ -36,12 +37,25 @@ def episode_rng(seed: int, index: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
-def episodes_info(loop: ClosedLoop, seed: int) -> EpisodesInfo:
-    """What all episodes of a loop share."""
+def episodes_info(
+    loop: ClosedLoop, seed: int, loop_options: dict[str, Any] | None = None
+) -> EpisodesInfo:
+    """What all episodes of a loop share.
+
+    Args:
+        loop: The closed loop.
+        seed: Seed of the set.
+        loop_options: Options that the loop was made with; as they decide what is simulated, they
+            are part of the set's hash.
+    """
     scenario = loop.scenario
+    scenario_hash = scenario.simulation_hash(loop.variation_name)
+    if loop_options:
+        text = f"{scenario_hash} {sorted(loop_options.items())}"
+        scenario_hash = hashlib.sha256(text.encode()).hexdigest()
     return EpisodesInfo(
         scenario=scenario.name,
-        scenario_hash=scenario.simulation_hash(loop.variation_name),
+        scenario_hash=scenario_hash,
         variation=loop.variation_name,
         seed=seed,
         step_s=scenario.step_s,
@@ -80,7 +94,12 @@ class Recorder:
 
 
 def run_episode(
-    loop: ClosedLoop, index: int = 0, *, seed: int = 0, goal: np.ndarray | None = None
+    loop: ClosedLoop,
+    index: int = 0,
+    *,
+    seed: int = 0,
+    goal: np.ndarray | None = None,
+    is_standing: bool = False,
 ) -> Episode:
     """Simulates one episode: until it leaves the safe set, or its time is over.
 
@@ -90,6 +109,8 @@ def run_episode(
         seed: Seed of the set.
         goal: Where the task's plan shall lead, in place of a random goal; only for tasks whose
             ``reset`` takes one.
+        is_standing: Whether it begins in the robot's own posture instead of a random one; takes a
+            goal.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
@@ -100,11 +121,19 @@ def run_episode(
     """
     if goal is not None:
         _check_takes_goal(loop)
+    elif is_standing:
+        raise ValueError("run_episode: an episode from the standing posture takes a goal")
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     rng = episode_rng(seed, index)
-    first_step = loop.reset(context, rng) if goal is None else loop.reset(context, rng, goal)
+    first_step = 0
+    if goal is None:
+        first_step = loop.reset(context, rng)
+    elif is_standing:
+        loop.reset_standing(context, goal)
+    else:
+        first_step = loop.reset(context, rng, goal)
     safe = loop.GetOutputPort("safe")
     nothing = EventStatus.DidNothing()
 
@@ -147,7 +176,14 @@ def run_episode(
         is_safe = safe.Eval(context)[0] >= 1
         cause = "" if is_safe else loop.constraint_names[worst]
     first_step = min(first_step, len(arrays["time_s"]) - 1)
-    return Episode(index=index, **arrays, is_safe=cause == "", cause=cause, first_step=first_step)
+    return Episode(
+        index=index,
+        **arrays,
+        is_safe=cause == "",
+        cause=cause,
+        first_step=first_step,
+        num_controller_failures=loop.num_controller_failures(context),
+    )
 
 
 def run_episodes(
@@ -161,6 +197,7 @@ def run_episodes(
     progress: Progress | None = None,
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
+    is_standing: bool = False,
     **loop_options: Any,
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
@@ -180,20 +217,20 @@ def run_episodes(
         extra: Stored beside the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             are not kept.
-        **loop_options: For the task; episodes with options are not kept.
+        is_standing: Whether episodes begin in the robot's own posture; takes goals.
+        **loop_options: For the task; part of what a folder's set is known by.
 
     Raises:
         ValueError: The folder holds another set, the task takes no goals, there is not one finite
             goal an episode, or a folder was given for what is not kept.
     """
-    if path is not None and (goals is not None or loop_options):
-        # What a folder holds is known by scenario, variation and seed alone.
-        given = ["goals"] * (goals is not None) + list(loop_options)
-        raise ValueError(f"run_episodes: episodes with {given} are not kept; leave out 'path'")
+    if path is not None and goals is not None:
+        # What a folder holds is known by scenario, variation, options and seed alone.
+        raise ValueError("run_episodes: episodes with goals are not kept; leave out 'path'")
     loop = scenario.make_loop(variation, **loop_options)
     if goals is not None:
         goals = _checked_goals(loop, goals, num_episodes)
-    info = episodes_info(loop, seed)
+    info = episodes_info(loop, seed, loop_options)
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
     if progress is not None:
@@ -210,6 +247,7 @@ def run_episodes(
                 seed,
                 batch,
                 None if goals is None else goals[batch],
+                is_standing,
             )
             for batch in batches(remaining)
         ],
@@ -320,10 +358,11 @@ def _episode_batch(
     seed: int,
     indices: list[int],
     goals: np.ndarray | None,
+    is_standing: bool,
 ) -> list[Episode]:
     loop = worker_loop(scenario, variation, options)
     chosen = [None] * len(indices) if goals is None else list(goals)
     return [
-        run_episode(loop, index, seed=seed, goal=goal)
+        run_episode(loop, index, seed=seed, goal=goal, is_standing=is_standing)
         for index, goal in zip(indices, chosen, strict=True)
     ]

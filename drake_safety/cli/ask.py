@@ -1,0 +1,57 @@
+"""``drake-safety ask``: may the robot go there? Answered before anything moves."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
+from drake_safety.cli.console import console
+from drake_safety.cli.targets import (
+    TARGET,
+    TARGET_HELP,
+    HandOption,
+    nearest_accepted,
+    parse_target,
+    print_verdict,
+)
+from drake_safety.cli.training_folder import goal_threshold, load_assessment
+
+
+def ask(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    target: Annotated[str, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)],
+    hand: HandOption = None,
+    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Ask whether the robot may reach for a target from where it stands; nothing moves.
+
+    Tells the belief and the verdict; of a refusal also the likely cause and the nearest target
+    that would be accepted. Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
+    """
+    from drake_safety.simulation.planning import assess_goal
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    gamma = load_assessment(assessment, mode)
+    options: dict[str, Any] = {} if hand is None else {"hand": hand}
+    loop = loaded.make_loop(assessment=gamma, **options)
+    goal = parse_target(loop, target)
+    threshold, remark = goal_threshold(assessment, mode)
+    verdict = assess_goal(loop, gamma, goal, threshold=threshold)
+    nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
+    if as_json:
+        answer = verdict.to_json() | {
+            "hand": loop.hand,
+            "nearest_accepted": None if nearest is None else nearest.goal.tolist(),
+            "remark": remark,
+        }
+        console.print(json.dumps(answer), soft_wrap=True, highlight=False)
+    else:
+        print_verdict(loop, verdict, nearest, remark)
+    if not verdict.is_accepted:
+        raise typer.Exit(1)

@@ -1,0 +1,110 @@
+"""What every kind of run is given, and the recording that it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drake_safety.cli.console import console, print_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pydrake.geometry import Meshcat
+    from rich.table import Table
+
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.scenario import Scenario
+
+LOG_PERIOD_S = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """What ``drake-safety run`` was asked for.
+
+    Attributes:
+        scenario: The scenario.
+        assessment: Γ.
+        variation: Which plant.
+        options: Of the task's diagram.
+        pushes: As they were typed.
+        seed: Of start, plan and noise.
+        duration_s: How long to simulate [s]; None for as long as this kind of run takes.
+        folder: Where recording and pictures go.
+        is_live: Whether somebody watches in the browser, in real time.
+    """
+
+    scenario: Scenario
+    assessment: SafetyAssessment
+    variation: str
+    options: dict[str, Any]
+    pushes: list[str]
+    seed: int
+    duration_s: float | None
+    folder: Path
+    is_live: bool
+
+    @property
+    def realtime_rate(self) -> float:
+        """How fast to run at most; 0 for as fast as it goes."""
+        return 1.0 if self.is_live else 0.0
+
+    def make_loop(self, meshcat: Meshcat | None = None, **options: Any) -> ClosedLoop:
+        """The task's diagram.
+
+        Args:
+            meshcat: Adds a visualiser.
+            **options: More of the task's options.
+        """
+        return self.scenario.make_loop(
+            self.variation,
+            assessment=self.assessment,
+            meshcat=meshcat,
+            **self.options,
+            **options,
+        )
+
+
+class Recording:
+    """A run in Meshcat: watched live, and kept as one HTML file.
+
+    Args:
+        settings: Of the run.
+    """
+
+    def __init__(self, settings: RunSettings):
+        from pydrake.geometry import Meshcat
+
+        self._settings = settings
+        self.viewer = Meshcat()
+        if settings.is_live:
+            console.print(f"live at {self.viewer.web_url()}")
+
+    def start(self) -> None:
+        """Records from here on; waits for whoever watches live."""
+        if self._settings.is_live:
+            input("Press Enter when the browser shows the robot. ")
+        self.viewer.StartRecording()
+
+    def save(self, timeline: Figure, events: Table) -> None:
+        """Writes recording and timeline, and prints the events and where both are.
+
+        Args:
+            timeline: Γ over the time of the run.
+            events: What happened when.
+        """
+        from drake_safety.evaluation.figure_style import save
+
+        self.viewer.StopRecording()
+        self.viewer.PublishRecording()
+        folder = self._settings.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        recording = folder / "recording.html"
+        recording.write_text(self.viewer.StaticHtml(), encoding="utf-8")
+        pictures = save(timeline, folder / "timeline")
+        console.print(events)
+        print_path("recording", recording)
+        for path in pictures:
+            print_path("picture  ", path)

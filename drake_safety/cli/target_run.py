@@ -1,0 +1,185 @@
+"""``drake-safety run --target``: goes where Γ lets it go, or where it is forced to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.cli.console import console, margin_words, new_table
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
+from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+    from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.goal_motion import GoalMotion
+    from drake_safety.simulation.pushes import Push
+
+_MOTION_PORTS = (
+    "normalized_safety_probability",
+    "belief",
+    "cause_probability",
+    "predicted_margins",
+)
+_NUM_STILLS = 5
+_AFTER_PUSH_S = 0.15  # When a push shows.
+_AFTER_EPISODE_S = 1.0  # What is shown beyond an episode: whether the robot stays there.
+
+
+def run_to_target(
+    settings: RunSettings, target: str, threshold: float, remark: str, *, is_forced: bool
+) -> bool:
+    """Tells the verdict on a target and, unless that is a refusal to be obeyed, goes there.
+
+    Args:
+        settings: Of the run.
+        target: The target as it was typed.
+        threshold: From which Γ on it is accepted.
+        remark: Where the threshold comes from, if that is worth saying.
+        is_forced: Whether to go there in any case.
+
+    Returns:
+        Whether the robot went.
+
+    Raises:
+        ValueError: The task has no goals, or no such target, hand or push.
+    """
+    from drake_safety.simulation.goal_motion import run_to_goal
+    from drake_safety.simulation.planning import assess_goal
+
+    loop = settings.make_loop()
+    goal = parse_target(loop, target)
+    push = named_push(loop, settings.pushes)
+    verdict = assess_goal(loop, settings.assessment, goal, threshold=threshold)
+    nearest = None if verdict.is_accepted else nearest_accepted(loop, settings.assessment, verdict)
+    print_verdict(loop, verdict, nearest, remark)
+    if not (verdict.is_accepted or is_forced):
+        console.print("refused: nothing moved; --force goes there all the same", highlight=False)
+        return False
+    recording = Recording(settings)
+    loop = settings.make_loop(recording.viewer)
+    recording.start()
+    duration_s = settings.duration_s
+    if duration_s is None:
+        duration_s = settings.scenario.episode_duration_s + _AFTER_EPISODE_S
+    motion = run_to_goal(
+        loop,
+        goal,
+        push=push,
+        duration_s=duration_s,
+        seed=settings.seed,
+        log_period_s=LOG_PERIOD_S,
+        ports=_MOTION_PORTS,
+        realtime_rate=settings.realtime_rate,
+    )
+    recording.save(draw_motion(loop, motion, threshold), table_of_motion(loop, motion, threshold))
+    return True
+
+
+def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
+    """The push that ``--push`` asks for, if it does.
+
+    Args:
+        loop: Whose pushes there are.
+        names: What was asked for.
+
+    Raises:
+        ValueError: No such push, or more than one.
+    """
+    if not names:
+        return None
+    if len(names) > 1:
+        raise ValueError(f"--push: a motion to a target takes one push; got {names}")
+    (name,) = names
+    if name not in loop.pushes:
+        raise ValueError(
+            f"--push '{name}': scenario '{loop.scenario.name}' has no such push for a motion to a "
+            f"target; it has {list(loop.pushes)}"
+        )
+    return loop.pushes[name]
+
+
+def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
+    """The first row in which Γ, accepted at the start, is below the threshold; None for never."""
+    is_below = ~(motion.extra["normalized_safety_probability"][:, 0] >= threshold)
+    return int(np.argmax(is_below)) if is_below.any() and not is_below[0] else None
+
+
+def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figure:
+    """Γ along a motion, with pictures of it.
+
+    Args:
+        loop: The closed loop that was simulated.
+        motion: What came of it, with Γ and what it expects.
+        threshold: From which Γ on a goal is accepted.
+    """
+    from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
+    from drake_safety.evaluation.timeline_figure import timeline_figure
+
+    positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
+    events = [motion.leave_time_s] if motion.has_left else []
+    if motion.has_fallen:
+        events.append(motion.fall_time_s)
+    if motion.push is not None:
+        events += [motion.push.time_s, motion.push.time_s + motion.push.duration_s + _AFTER_PUSH_S]
+    events = [instant for instant in events if instant <= motion.time_s[-1]]
+    instants = spread_times(motion.time_s, events, num_stills=_NUM_STILLS)
+    alarm = alarm_row(motion, threshold)
+    return timeline_figure(
+        motion.time_s,
+        motion.extra["normalized_safety_probability"][:, 0],
+        threshold,
+        pushes=[] if motion.push is None else [motion.push],
+        trigger_times_s=[] if alarm is None else [float(motion.time_s[alarm])],
+        trigger_label="Γ falls",
+        leave_time_s=motion.leave_time_s,
+        stills=render_stills(loop, motion.time_s, positions, instants),
+        belief=motion.extra["belief"],
+        margins=motion.margins,
+        constraint_names=loop.constraint_names,
+        angular_constraints=loop.angular_constraints,
+    )
+
+
+def table_of_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Table:
+    """What happened when, and what Γ was then.
+
+    Args:
+        loop: The closed loop that was simulated.
+        motion: What came of it, with Γ and what it expects.
+        threshold: From which Γ on a goal is accepted.
+    """
+    gamma = motion.extra["normalized_safety_probability"][:, 0]
+    events = [(0.0, f"the {loop.hand} hand sets out")]
+    if motion.push is not None:
+        push = motion.push
+        events.append(
+            (push.time_s, f"{push.body} is pushed with {push.force_n} N for {push.duration_s:g} s")
+        )
+    alarm = alarm_row(motion, threshold)
+    if alarm is not None:
+        cause = int(np.argmax(motion.extra["cause_probability"][alarm]))
+        expected = margin_words(
+            loop.constraint_names[cause],
+            float(motion.extra["predicted_margins"][alarm, cause]),
+            loop.angular_constraints,
+        )
+        events.append(
+            (float(motion.time_s[alarm]), f"Γ below the threshold; expected violation: {expected}")
+        )
+    if motion.has_left:
+        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+    if motion.has_fallen:
+        events.append((motion.fall_time_s, "the robot fell"))
+    else:
+        place = "" if motion.has_left else ", inside the safe set throughout"
+        missed = f"standing{place}; {100 * motion.miss_m:.1f} cm from the target"
+        events.append((float(motion.time_s[-1]), missed))
+    table = new_table("time [s]", "event", "Γ")
+    for time_s, event in sorted(events, key=lambda one: one[0]):
+        row = int(np.abs(motion.time_s - time_s).argmin())
+        table.add_row(f"{time_s:.2f}", event, f"{gamma[row]:.2f}")
+    return table

@@ -1,0 +1,157 @@
+"""Targets on the command line: how they are typed, and how a verdict on one is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from typer.core import TyperCommand
+
+from drake_safety.cli.console import console, margin_words
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.planning import GoalVerdict
+
+TARGET = "--target"
+TARGET_HELP = "Where to reach: three numbers in the world [m], or a name that the scenario gives."
+HandOption = Annotated[
+    str | None,
+    typer.Option("--hand", help="Which hand reaches; the one that was trained by default."),
+]
+
+_SEARCH_SEED = 0  # The same question has the same answer.
+
+
+class TargetCommand(TyperCommand):
+    """A command whose ``--target`` takes three numbers, negative ones too, or one name."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the arguments, the numbers of a target as one word."""
+        return super().parse_args(ctx, join_targets(args))
+
+
+def join_targets(args: Sequence[str]) -> list[str]:
+    """Joins the numbers that follow ``--target``: an option has a fixed number of words.
+
+    Args:
+        args: The words of a command line.
+    """
+    joined: list[str] = []
+    words = list(args)
+    while words:
+        word = words.pop(0)
+        if word != TARGET or not words:
+            joined.append(word)
+            continue
+        numbers = [words.pop(0)]
+        while words and len(numbers) < 3 and _is_number(numbers[-1]) and _is_number(words[0]):
+            numbers.append(words.pop(0))
+        joined.append(f"{TARGET}={' '.join(numbers)}")
+    return joined
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
+    """The target that ``--target`` asks for, in the world, (3,) [m].
+
+    Args:
+        loop: Whose named targets there are.
+        text: A name, or three numbers with spaces between them.
+
+    Raises:
+        ValueError: The task's plans have no goal, no such name, or not three numbers.
+    """
+    from drake_safety.simulation.planning import target_box
+
+    target_box(loop)
+    if text in loop.named_targets:
+        return np.array(loop.named_targets[text], dtype=float)
+    words = text.split()
+    if len(words) == 3 and all(map(_is_number, words)):
+        return np.array([float(word) for word in words])
+    raise ValueError(
+        f"{TARGET} '{text}': give X Y Z, three numbers [m], or one of the names that scenario "
+        f"'{loop.scenario.name}' gives: {list(loop.named_targets)}"
+    )
+
+
+def nearest_accepted(
+    loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
+) -> GoalVerdict | None:
+    """What would be accepted instead of a target that was refused, if anything would be."""
+    from drake_safety.simulation.planning import nearest_accepted_goal
+
+    return nearest_accepted_goal(
+        loop,
+        assessment,
+        verdict.goal,
+        threshold=verdict.threshold,
+        rng=np.random.default_rng(_SEARCH_SEED),
+    )
+
+
+def print_verdict(
+    loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, remark: str
+) -> None:
+    """Tells a verdict, and if it is a refusal, why and what would be accepted.
+
+    Args:
+        loop: The closed loop that was asked about.
+        verdict: The verdict.
+        nearest: The nearest target that would be accepted; told of a refusal only.
+        remark: Where the threshold comes from, if that is worth saying.
+    """
+    lines = {"target": f"{_point(verdict.goal)} of the {loop.hand} hand"}
+    if verdict.reason:
+        lines["verdict"] = f"{verdict.verdict}: {verdict.reason}"
+    else:
+        sign = "<" if verdict.safety_probability < verdict.threshold else "≥"
+        lines["verdict"] = (
+            f"{verdict.verdict}: Γ {verdict.safety_probability:.3f} {sign} "
+            f"threshold {verdict.threshold:.3f}"
+        )
+    if np.isfinite(verdict.safety_probability):
+        safe, unsafe, unknown = verdict.belief.tolist()
+        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
+    if not verdict.is_accepted:
+        lines |= _refusal(loop, verdict, nearest)
+    if remark:
+        lines["remark"] = remark
+    for name, text in lines.items():
+        console.print(f"{name:<16}  {text}", highlight=False, soft_wrap=True)
+
+
+def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None) -> dict[str, str]:
+    lines = {}
+    name, margin = verdict.nearest_violation
+    violation = margin_words(name, margin, loop.angular_constraints) if name else ""
+    if verdict.cause and verdict.cause != name:
+        share = verdict.cause_probability.max() / verdict.cause_probability.sum()
+        lines["likely cause"] = f"{verdict.cause} ({100 * share:.0f} %)"
+        if violation:
+            lines["least margin"] = violation
+    elif violation and np.isfinite(verdict.safety_probability):
+        lines["likely cause"] = violation
+    if not np.isfinite(verdict.goal).all():
+        return lines
+    if nearest is None:
+        lines["nearest accepted"] = "none was found"
+    else:
+        distance_m = float(np.linalg.norm(nearest.goal - verdict.goal))
+        lines["nearest accepted"] = f"{_point(nearest.goal)}, {100 * distance_m:.1f} cm away"
+    return lines
+
+
+def _point(point: np.ndarray) -> str:
+    return " ".join(f"{value:.12g}" for value in point.tolist()) + " m"

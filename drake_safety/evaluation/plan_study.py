@@ -1,0 +1,310 @@
+"""Plans with a goal, judged before anything moves: who accepts what, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.evaluation.metrics import (
+    Figure,
+    proportion,
+    segment_figures,
+    threshold_for_recall,
+)
+from drake_safety.evaluation.reachability import Reachability
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
+from drake_safety.simulation.closed_loop import ClosedLoop
+
+SAFE_RECALL = 0.952
+"""Share of the safe targets that the paper's method predicts safe, of 1000 random ones."""
+UNSAFE_RECALL = 0.987
+"""Share of the unsafe targets that it predicts unsafe."""
+PROMISED_UNSAFE_RECALL = 0.992
+"""What thresholds are chosen for: half a point above the paper's, as a finite test set scatters."""
+SAFE = "safe"
+"""Outcome of an episode that stayed in the safe set; else it is the episode's cause."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plans:
+    """Episodes seen at k = 0, when the plan is made: what is known then, and what came of it.
+
+    Attributes:
+        first: The segment that each episode starts with, (N,); diverged episodes have none.
+        goals: Where each plan leads to, in the world, (N, 3) [m].
+        is_fair: Whether each belongs to the fair set, (N,).
+        hand: The robot's reaching frame that goes there, if it is one.
+        outcomes: Of all episodes, diverged ones too: `SAFE` or the cause, (M,).
+        is_outcome_fair: Whether each of them belongs to the fair set, (M,).
+        num_failures: Controller failures of each of them, (M,).
+        constraint_names: The n_c safety constraints.
+    """
+
+    first: Segments
+    goals: np.ndarray
+    is_fair: np.ndarray
+    hand: str | None
+    outcomes: np.ndarray
+    is_outcome_fair: np.ndarray
+    num_failures: np.ndarray
+    constraint_names: list[str]
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def is_unsafe(self) -> np.ndarray:
+        """Whether each plan ended outside the safe set, (N,)."""
+        return self.first.is_unsafe
+
+    def fair(self) -> Plans:
+        """Those of the fair set."""
+        return Plans(
+            first=self.first.take(self.is_fair),
+            goals=self.goals[self.is_fair],
+            is_fair=self.is_fair[self.is_fair],
+            hand=self.hand,
+            outcomes=self.outcomes[self.is_outcome_fair],
+            is_outcome_fair=self.is_outcome_fair[self.is_outcome_fair],
+            num_failures=self.num_failures[self.is_outcome_fair],
+            constraint_names=self.constraint_names,
+        )
+
+
+def plans_of(loop: ClosedLoop, episodes: Episodes) -> Plans:
+    """What there is to judge in episodes of a loop whose plans have a goal.
+
+    Args:
+        loop: The closed loop that the episodes were made with.
+        episodes: The episodes.
+
+    Raises:
+        ValueError: The task's plans have no goal.
+    """
+    # A segment that starts where the episode does, however early the episode ends.
+    segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
+    first = segments.take(segments.is_first)
+    is_fair = np.array([loop.is_fair(episode) for episode in episodes])
+    return Plans(
+        first=first,
+        goals=np.array([loop.goal_of(episodes[i]) for i in first.episode]),
+        is_fair=is_fair[first.episode],
+        hand=loop.hand,
+        outcomes=np.array([SAFE if e.is_safe else e.cause for e in episodes]),
+        is_outcome_fair=is_fair,
+        num_failures=np.array([episode.num_controller_failures for episode in episodes]),
+        constraint_names=list(episodes.info.constraint_names),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanRule:
+    """Something that accepts or refuses plans.
+
+    Attributes:
+        name: Its key in tables.
+        unsafe_score: How unsafe it takes each plan to be, (N,), in [0, 1]; NaN for "don't know",
+            which refuses.
+        threshold: Unsafe score above which a plan is refused; None to choose it on the calibration
+            plans.
+    """
+
+    name: str
+    unsafe_score: Callable[[Plans], np.ndarray]
+    threshold: float | None = None
+
+
+def scorer_rule(scorer: Scorer) -> PlanRule:
+    """A scorer of x, its threshold left open."""
+    return PlanRule(name=scorer.name, unsafe_score=lambda plans: scorer.unsafe_score(plans.first))
+
+
+def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
+    """Accepts what inverse kinematics reaches: yes or no, nothing to choose.
+
+    Args:
+        reachability: By hand.
+    """
+
+    def unsafe_score(plans: Plans) -> np.ndarray:
+        if plans.hand is None or plans.hand not in reachability:
+            raise ValueError(
+                f"reachability: no hand '{plans.hand}' is known; known are {list(reachability)}"
+            )
+        return 1.0 - reachability[plans.hand].is_reachable(plans.goals)
+
+    return PlanRule(name="reachability", unsafe_score=unsafe_score, threshold=0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanStudy:
+    """What :func:`evaluate_plans` found.
+
+    Attributes:
+        figures: By dotted key.
+        thresholds: Per rule, the unsafe score above which it refuses.
+        unsafe_score: Per set ("plans", "plans.other_hand") and rule, the score of each plan, (N,).
+        cause_rule: What names the most likely cause better on the calibration plans: the largest
+            "cause_probability" or the smallest of the "predicted_margins".
+    """
+
+    figures: dict[str, Figure]
+    thresholds: dict[str, float]
+    unsafe_score: dict[str, dict[str, np.ndarray]]
+    cause_rule: str
+
+
+def evaluate_plans(
+    rules: Sequence[PlanRule],
+    assessment: SafetyAssessment,
+    calibration: Plans,
+    sets: Mapping[str, Plans],
+) -> PlanStudy:
+    """Every rule on fresh plans, all of them and the fair ones.
+
+    Thresholds left open are chosen on the calibration plans, all of the target box, so that an
+    unsafe plan yet to come is refused with the probability `PROMISED_UNSAFE_RECALL`, see
+    :func:`~drake_safety.evaluation.metrics.threshold_for_recall`; of those the one that accepts
+    most. The figures give them as Γ_thre, the safety probability below which a plan is refused.
+
+    Args:
+        rules: Who is judged; the assessment's own rule is the one of this name: "sharpened".
+        assessment: Γ, which names causes.
+        calibration: Other fresh plans, for every choice that is to be made.
+        sets: Fresh plans by the prefix of their keys, such as "plans".
+
+    Raises:
+        ValueError: There is no threshold to choose: no calibration plan is unsafe.
+    """
+    thresholds = {
+        rule.name: threshold_for_recall(
+            rule.unsafe_score(calibration), calibration.is_unsafe, PROMISED_UNSAFE_RECALL
+        )
+        if rule.threshold is None
+        else rule.threshold
+        for rule in rules
+    }
+    own = next((rule for rule in rules if rule.name == "sharpened"), rules[0])
+    named = named_causes(assessment, calibration)
+    is_refused = _is_refused(own.unsafe_score(calibration), thresholds[own.name])
+    right = {
+        name: _right_causes(calibration, causes, is_refused)[0].value
+        for name, causes in named.items()
+    }
+    # The first, the belief's own word, unless another is better.
+    cause_rule = max(right, key=lambda name: np.nan_to_num(right[name], nan=-1.0))
+
+    figures: dict[str, Figure] = {}
+    scores: dict[str, dict[str, np.ndarray]] = {}
+    for prefix, plans in sets.items():
+        scores[prefix] = {rule.name: rule.unsafe_score(plans) for rule in rules}
+        causes = named_causes(assessment, plans)
+        for key, chosen, rows in (
+            (prefix, plans, np.ones(len(plans), dtype=bool)),
+            (f"{prefix}.fair", plans.fair(), plans.is_fair),
+        ):
+            for name, score in scores[prefix].items():
+                found = verdict_figures(chosen, score[rows], thresholds[name])
+                figures |= {f"{key}.{name}.{what}": figure for what, figure in found.items()}
+                limit = 1.0 - thresholds[name]
+                figures[f"{key}.{name}.threshold"] = Figure(limit, limit, limit, len(calibration))
+            found = _cause_figures(
+                chosen,
+                {name: of_all[rows] for name, of_all in causes.items()},
+                cause_rule,
+                _is_refused(scores[prefix][own.name][rows], thresholds[own.name]),
+            )
+            found |= outcome_figures(chosen)
+            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
+        figures[f"{prefix}.share_fair"] = proportion(
+            int(plans.is_outcome_fair.sum()), len(plans.outcomes)
+        )
+    return PlanStudy(
+        figures=figures, thresholds=thresholds, unsafe_score=scores, cause_rule=cause_rule
+    )
+
+
+def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) -> dict[str, Figure]:
+    """How well scores (N,) tell unsafe plans from safe ones.
+
+    Returns:
+        `auc`, `safe_recall`, `unsafe_recall` and `brier`. Each plan is an episode of its own, so
+        the recalls have Clopper-Pearson's interval.
+    """
+    return segment_figures(plans.first, unsafe_score, threshold=threshold)
+
+
+def outcome_figures(plans: Plans) -> dict[str, Figure]:
+    """What came of the plans: `outcomes.safe`, `outcomes.CAUSE` and the controllers' failures.
+
+    Returns:
+        Shares of all episodes, diverged ones too. `episodes_with_controller_failures` is a share,
+        `controller_failures` their number.
+    """
+    n = len(plans.outcomes)
+    figures = {
+        f"outcomes.{name}": proportion(int(np.sum(plans.outcomes == name)), n)
+        for name in (SAFE, *plans.constraint_names, DIVERGED)
+    }
+    figures["episodes_with_controller_failures"] = proportion(
+        int(np.sum(plans.num_failures > 0)), n
+    )
+    total = float(plans.num_failures.sum())
+    figures["controller_failures"] = Figure(total, total, total, n)
+    return figures
+
+
+def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.ndarray]:
+    """The cause that Γ would name for each plan, as a column of the constraints, (N,).
+
+    Returns:
+        By what it is read from: "cause_probability", the largest one, and where there are any
+        "predicted_margins", the smallest one.
+    """
+    first = plans.first
+    result = assessment.predict(
+        first.state if assessment.parameters.is_sharpened else first.true_state,
+        first.desired_preview,
+        first.features if assessment.uses_features else None,
+    )
+    named = {"cause_probability": result.cause_probability.argmax(axis=1)}
+    if len(plans) and np.isfinite(result.predicted_margins).any():
+        margins = np.where(np.isnan(result.predicted_margins), np.inf, result.predicted_margins)
+        named["predicted_margins"] = margins.argmin(axis=1)
+    return named
+
+
+def _cause_figures(
+    plans: Plans, named: Mapping[str, np.ndarray], cause_rule: str, is_refused: np.ndarray
+) -> dict[str, Figure]:
+    """Shares of the right causes among correctly refused plans, by any rule and by cause."""
+    figures = {}
+    for name, causes in named.items():
+        figures[f"causes.by_{name}"], by_cause = _right_causes(plans, causes, is_refused)
+        if name == cause_rule:
+            figures["causes.right_cause"] = figures[f"causes.by_{name}"]
+            figures |= {f"causes.{cause}": figure for cause, figure in by_cause.items()}
+    return figures
+
+
+def _right_causes(
+    plans: Plans, named: np.ndarray, is_refused: np.ndarray
+) -> tuple[Figure, dict[str, Figure]]:
+    """The share whose named cause (N,) is the simulated one: of all correctly refused, by cause."""
+    rows = is_refused & plans.is_unsafe
+    is_right = (named == plans.first.cause)[rows]
+    cause = plans.first.cause[rows]
+    by_cause = {
+        name: proportion(int(is_right[cause == i].sum()), int(np.sum(cause == i)))
+        for i, name in enumerate(plans.constraint_names)
+        if np.any(cause == i)
+    }
+    return proportion(int(is_right.sum()), len(is_right)), by_cause
+
+
+def _is_refused(unsafe_score: np.ndarray, threshold: float) -> np.ndarray:
+    return np.isnan(unsafe_score) | (unsafe_score > threshold)

@@ -1,0 +1,89 @@
+"""Predicted against actual: every target where it was, coloured by verdict and outcome."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FALSE_ALARM_COLOUR,
+    SAFE_COLOUR,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MISS_COLOUR = "#111111"
+# Verdict and outcome: name, of which class, colour, marker, and size; mistakes lie on top.
+_KINDS = (
+    ("accepted, safe", "safe", SAFE_COLOUR, "o", 13.0),
+    ("refused, unsafe", "unsafe", UNSAFE_COLOUR, "o", 13.0),
+    ("refused, but safe", "safe", FALSE_ALARM_COLOUR, "s", 34.0),
+    ("accepted, but unsafe", "unsafe", MISS_COLOUR, "X", 60.0),
+)
+# Title, and the coordinates that go right and up.
+_VIEWS = (("From behind the robot", 1, 2), ("From above", 1, 0))
+_LABELS = ("x [m], forwards", "y [m], to the robot's left", "z [m]")
+_WIDTH, _HEIGHT = 6.6, 2.4  # Of the picture, and of what is not panels in it [inches].
+_PANEL_WIDTH = 5.6
+
+
+def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarray) -> Figure:
+    """Targets in two views; the legend says how many there are of each kind.
+
+    Args:
+        goals: Targets in the world, (N, 3) [m].
+        is_unsafe: What came of each, (N,).
+        is_refused: What was said of each beforehand, (N,).
+
+    Raises:
+        ValueError: The arguments are not as many.
+    """
+    goals = np.asarray(goals, dtype=float)
+    shapes = [goals.shape, np.shape(is_unsafe), np.shape(is_refused)]
+    if goals.ndim != 2 or goals.shape[1] != 3 or {s[0] for s in shapes} != {len(goals)}:
+        raise ValueError(f"plans_figure: expected (N, 3), (N,), (N,); got shapes {shapes}")
+    members = (
+        ~is_unsafe & ~is_refused,
+        is_unsafe & is_refused,
+        ~is_unsafe & is_refused,
+        is_unsafe & ~is_refused,
+    )
+    totals = {"safe": int((~is_unsafe).sum()), "unsafe": int(is_unsafe.sum())}
+    with drawing_style():
+        # Both views have y to the right, and one scale.
+        span = np.ptp(goals, axis=0) if len(goals) else np.ones(3)
+        heights = [max(span[up], 0.1) / max(span[right], 0.1) for _, right, up in _VIEWS]
+        fig = new_figure(_WIDTH, _HEIGHT + _PANEL_WIDTH * sum(heights))
+        panels = fig.subplots(2, 1, sharex=True, height_ratios=heights)
+        for axes, (title, right, up) in zip(panels, _VIEWS, strict=True):
+            for rows, (name, which, colour, marker, size) in zip(members, _KINDS, strict=True):
+                is_mistake = size > _KINDS[0][-1]
+                share = 100 * rows.sum() / max(totals[which], 1)
+                axes.scatter(
+                    goals[rows, right],
+                    goals[rows, up],
+                    s=size,
+                    marker=marker,
+                    color=colour,
+                    alpha=1.0 if is_mistake else 0.55,
+                    edgecolors="white",
+                    linewidths=0.5 if is_mistake else 0.2,
+                    zorder=4 if is_mistake else 3,
+                    rasterized=True,
+                    label=f"{name}: {rows.sum()} of {totals[which]}, {share:.1f} %",
+                )
+            axes.set_aspect("equal")
+            axes.set_title(title)
+            axes.set_ylabel(_LABELS[up])
+            axes.grid(color="#eceef0", linewidth=0.7)
+            axes.set_axisbelow(True)
+        panels[-1].invert_xaxis()
+        panels[-1].set_xlabel(_LABELS[1])
+        handles, labels = panels[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside lower center", ncols=2)
+    return fig

@@ -1,0 +1,87 @@
+"""The simple way to ask whether a robot can reach a point: inverse kinematics, and no more."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.multibody.inverse_kinematics import InverseKinematics
+from pydrake.solvers import SnoptSolver
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.robot_model import RobotModel
+
+_TOLERANCE_M = 2e-3  # Well above what the solver leaves of a point it can reach.
+
+
+class Reachability:
+    """Whether a hand gets to a point while base and feet stay as they stand, within joint limits.
+
+    The method that learned verdicts are compared with: the joints between base and hand move, all
+    others are locked in the standing posture; nothing is known of balance, obstacles or motion.
+
+    Args:
+        robot: The robot, which stands at the world's origin.
+        hand: Name of the reaching frame.
+
+    Raises:
+        ValueError: There is no such frame.
+    """
+
+    def __init__(self, robot: RobotModel, hand: str):
+        frame = robot.reaching_frame(hand)
+        kinematics = RobotKinematics(robot)
+        plant = self._plant = kinematics.plant
+        self._context = kinematics.context
+        self._body = plant.GetBodyByName(frame.body)
+        self._point = np.array(frame.point, dtype=float)
+        standing = kinematics.standing_positions()
+        kinematics.set_positions(standing)
+        middle = standing.copy()
+        self.joint_names = []
+        """Joints that move: those between base and hand."""
+        for index in plant.GetJointIndices(plant.GetModelInstanceByName(robot.name)):
+            joint = plant.get_joint(index)
+            if joint.num_velocities() == 0:
+                continue
+            moves_hand = self._body.index() in plant.GetBodiesKinematicallyAffectedBy([index])
+            if moves_hand and joint.num_velocities() == 1:
+                self.joint_names.append(joint.name())
+                low, high = joint.position_lower_limit(), joint.position_upper_limit()
+                if np.isfinite(high - low):
+                    middle[joint.position_start()] = 0.5 * (low + high)
+            else:
+                joint.Lock(self._context)
+        self._guesses = (standing, middle)
+
+    def miss(self, p_WH: np.ndarray) -> float:
+        """How far from a point the hand ends at best [m].
+
+        Args:
+            p_WH: The point in the world, (3,) [m].
+
+        Raises:
+            ValueError: The point is not three finite numbers.
+        """
+        p_WH = np.asarray(p_WH, dtype=float)
+        if p_WH.shape != (3,) or not np.isfinite(p_WH).all():
+            raise ValueError(f"reachability: a point is three finite numbers [m]; got {p_WH}")
+        search = InverseKinematics(self._plant, self._context)
+        search.AddPositionCost(
+            self._plant.world_frame(), p_WH, self._body.body_frame(), self._point, np.eye(3)
+        )
+        best = np.inf
+        for guess in self._guesses:
+            result = SnoptSolver().Solve(search.prog(), guess)
+            self._plant.SetPositions(self._context, result.GetSolution(search.q()))
+            reached = self._body.EvalPoseInWorld(self._context) @ self._point
+            best = min(best, float(np.linalg.norm(reached - p_WH)))
+            if best < _TOLERANCE_M:
+                break
+        return best
+
+    def is_reachable(self, p_WH: np.ndarray) -> np.ndarray:
+        """Whether the hand gets to each of the points, (N,).
+
+        Args:
+            p_WH: Points in the world, (N, 3) [m].
+        """
+        return np.array([self.miss(point) < _TOLERANCE_M for point in p_WH], dtype=bool)

@@ -1,0 +1,211 @@
+"""Which points of a vertical plane a robot reaches from where it stands: Γ, kinematics, truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.plan_study import SAFE
+from drake_safety.evaluation.reachability import Reachability
+from drake_safety.evaluation.scorers import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario
+
+_REFINEMENT = 4  # What needs no simulation is asked at so many points a simulated one, each way.
+_EDGE_STEP_M = 0.01  # Grid on which obstacles are seen.
+_SEEN_M = 0.05  # Obstacles further from a point than this do not matter.
+_REPORT_EVERY = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReachableRegion:
+    """The targets on a plane x = const of a robot in its standing posture.
+
+    Attributes:
+        x_m: Where the plane is, in the world [m].
+        y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
+        safety_probability: Normalised Γ there, (n_z, n_y).
+        threshold: Γ_thre.
+        is_reachable: Whether inverse kinematics gets there, (n_z, n_y); None for a robot that it
+            does not know.
+        obstacle_y_m, obstacle_z_m: A grid that shows obstacles' edges, (o_y,), (o_z,) [m].
+        obstacle_distance_m: There, to the nearest obstacle, negative inside, at most a few
+            centimetres, (o_z, o_y) [m]; None where the diagram has no geometry.
+        simulated_y_m, simulated_z_m: The grid of what was simulated, (m_y,), (m_z,) [m].
+        outcomes: `SAFE` or the cause, (m_z, m_y).
+    """
+
+    x_m: float
+    y_m: np.ndarray
+    z_m: np.ndarray
+    safety_probability: np.ndarray
+    threshold: float
+    is_reachable: np.ndarray | None
+    obstacle_y_m: np.ndarray
+    obstacle_z_m: np.ndarray
+    obstacle_distance_m: np.ndarray | None
+    simulated_y_m: np.ndarray
+    simulated_z_m: np.ndarray
+    outcomes: np.ndarray
+
+    def figures(self) -> dict[str, Figure]:
+        """How often verdicts on the simulated grid are right.
+
+        Returns:
+            `share_safe`, and `sharpened.right` and `reachability.right`. Points of a grid are no
+            random sample: the intervals say how many there are, not more.
+        """
+        is_safe = self.outcomes == SAFE
+        verdicts = {"sharpened": self.safety_probability >= self.threshold}
+        if self.is_reachable is not None:
+            verdicts["reachability"] = self.is_reachable
+        figures = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
+        for name, verdict in verdicts.items():
+            on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
+            figures[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
+        return figures
+
+
+def reachable_region(
+    scenario: Scenario,
+    assessment: SafetyAssessment,
+    *,
+    threshold: float,
+    x_m: float | None = None,
+    step_m: float = 0.1,
+    variation: str = "nominal",
+    num_workers: int | None = None,
+    progress: StageProgress | None = None,
+) -> ReachableRegion:
+    """Asks everyone about a plane of the target box, and simulates it.
+
+    Args:
+        scenario: A scenario of a task whose plans have a goal.
+        assessment: Γ.
+        threshold: Γ_thre, on the normalised safety probability.
+        x_m: Where the plane is [m]; the middle of the fair box by default.
+        step_m: Between two simulated targets [m].
+        variation: Which plant.
+        num_workers: Processes.
+        progress: Called with a stage, the number done and the number wanted.
+
+    Raises:
+        ValueError: The task's plans have no goal, the plane misses the target box, or the step is
+            not positive or too large for two targets a side.
+    """
+    loop = scenario.make_loop(variation)
+    x_m, box = plane_of(loop, x_m, step_m)
+    coarse = [np.linspace(low, high, round((high - low) / step_m) + 1) for low, high in box.T]
+    fine = [
+        np.linspace(nodes[0], nodes[-1], _REFINEMENT * (len(nodes) - 1) + 1) for nodes in coarse
+    ]
+
+    targets = _targets(x_m, *coarse)
+    episodes = run_episodes(
+        scenario,
+        len(targets),
+        variation=variation,
+        num_workers=num_workers,
+        goals=targets,
+        is_standing=True,
+        progress=None if progress is None else partial(progress, "targets of the plane"),
+    )
+    outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
+
+    targets = _targets(x_m, *fine)
+    context = loop.CreateDefaultContext()
+    ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
+    reachability = None if loop.hand is None else Reachability(loop.robot, loop.hand)
+    inputs: list[list[np.ndarray]] = []
+    is_reachable = np.zeros(len(targets), dtype=bool)
+    for i, target in enumerate(targets):
+        if progress is not None and i % _REPORT_EVERY == 0:
+            progress("verdicts on the plane", i, len(targets))
+        loop.reset_standing(context, target)
+        inputs.append([port.Eval(context).copy() for port in ports])
+        if reachability is not None:
+            is_reachable[i] = reachability.is_reachable(target[None])[0]
+    if progress is not None:
+        progress("verdicts on the plane", len(targets), len(targets))
+    state, desired_preview, features = (np.array(rows) for rows in zip(*inputs, strict=True))
+    result = assessment.predict(
+        state, desired_preview, features if assessment.uses_features else None
+    )
+    shape = (len(fine[1]), len(fine[0]))
+    edge = [np.arange(low, high + 0.5 * _EDGE_STEP_M, _EDGE_STEP_M) for low, high in box.T]
+    distance = _obstacle_distance(loop, context, _targets(x_m, *edge))
+    return ReachableRegion(
+        x_m=x_m,
+        y_m=fine[0],
+        z_m=fine[1],
+        safety_probability=result.normalized.reshape(shape),
+        threshold=threshold,
+        is_reachable=None if reachability is None else is_reachable.reshape(shape),
+        obstacle_y_m=edge[0],
+        obstacle_z_m=edge[1],
+        obstacle_distance_m=None if distance is None else distance.reshape(len(edge[1]), -1),
+        simulated_y_m=coarse[0],
+        simulated_z_m=coarse[1],
+        outcomes=outcomes.reshape(len(coarse[1]), len(coarse[0])),
+    )
+
+
+def plane_of(loop: ClosedLoop, x_m: float | None, step_m: float) -> tuple[float, np.ndarray]:
+    """Where a plane is, and what of it belongs to the target box.
+
+    Args:
+        loop: The closed loop.
+        x_m: Where it is asked for [m]; None for the middle of the fair box.
+        step_m: Between two targets on it [m].
+
+    Returns:
+        Its x [m], and the lowest and highest corner (y, z) of the targets on it, (2, 2) [m].
+
+    Raises:
+        ValueError: As :func:`reachable_region`.
+    """
+    box, fair = loop.target_box, loop.fair_box
+    if box is None or fair is None:
+        raise ValueError(f"reachable region: plans of {loop.scenario.task} have no goal")
+    x_m = float(fair[:, 0].mean()) if x_m is None else x_m
+    if not box[0, 0] <= x_m <= box[1, 0]:
+        raise ValueError(
+            f"reachable region: the plane x = {x_m:g} m misses the target box, "
+            f"{box[0, 0]:g}..{box[1, 0]:g} m"
+        )
+    sides = box[1, 1:] - box[0, 1:]
+    if not 0 < step_m <= sides.min():
+        raise ValueError(
+            "reachable region: the step must be positive and no longer than the target box's "
+            f"sides, {sides} m; got {step_m:g}"
+        )
+    return x_m, box[:, 1:]
+
+
+def _targets(x_m: float, y_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
+    """The points of a grid, y changing fastest, (n_z n_y, 3) [m]."""
+    z, y = np.meshgrid(z_m, y_m, indexing="ij")
+    return np.column_stack([np.full(y.size, x_m), y.ravel(), z.ravel()])
+
+
+def _obstacle_distance(loop: ClosedLoop, context: Context, points: np.ndarray) -> np.ndarray | None:
+    """Signed distance of points (N, 3) to what is not the robot, at most `_SEEN_M`, (N,) [m]."""
+    scene_graph = getattr(loop, "scene_graph", None)
+    if scene_graph is None:
+        return None
+    plant, robot = loop.plant, loop.robot_instance
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    inspector = query.inspector()
+    distance = np.full(len(points), _SEEN_M)
+    for i, point in enumerate(points):
+        for found in query.ComputeSignedDistanceToPoint(point, _SEEN_M):
+            body = plant.GetBodyFromFrameId(inspector.GetFrameId(found.id_G))
+            if body.model_instance() != robot:
+                distance[i] = min(distance[i], found.distance)
+    return distance

@@ -1,0 +1,133 @@
+"""Motions to a goal: one plan carried out from the standing posture and watched to its end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.pushes import Push, begin_push, end_push
+from drake_safety.simulation.rollouts import Recorder, episode_rng
+
+_PORTS = ("output", "margins", "plant_state")
+
+
+@dataclass(kw_only=True, eq=False)
+class GoalMotion:
+    """One motion: rows every ``log_period_s``, and what came of it.
+
+    Attributes:
+        goal: In the world, (3,) [m].
+        push: What disturbed it, if anything did.
+        time_s: [s], (N,).
+        output: What shall reach the goal, measured, in the world, (N, 3) [m].
+        margins: (N, n_c), of the true state.
+        plant_state: (N, n_q + n_v) of the robot alone.
+        leave_time_s: When it left the safe set [s]; infinite if it did not.
+        cause: The constraint that was violated then; "" if it did not.
+        fall_time_s: When the robot fell [s]; infinite if it did not.
+        extra: Other ports that were asked for, (N, size) each.
+    """
+
+    goal: np.ndarray
+    push: Push | None
+    time_s: np.ndarray
+    output: np.ndarray
+    margins: np.ndarray
+    plant_state: np.ndarray
+    leave_time_s: float
+    cause: str
+    fall_time_s: float
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the robot left its safe set."""
+        return math.isfinite(self.leave_time_s)
+
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot fell."""
+        return math.isfinite(self.fall_time_s)
+
+    @property
+    def miss_m(self) -> float:
+        """Distance from the goal in the end [m]."""
+        return float(np.linalg.norm(self.output[-1] - self.goal))
+
+
+def run_to_goal(
+    loop: ClosedLoop,
+    goal: np.ndarray,
+    *,
+    push: Push | None = None,
+    duration_s: float,
+    seed: int = 0,
+    log_period_s: float = 0.02,
+    ports: tuple[str, ...] = (),
+    realtime_rate: float = 0.0,
+) -> GoalMotion:
+    """Carries out the plan from the standing posture to a goal, safe or not.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        goal: In the world, (3,) [m].
+        push: A push on the robot.
+        duration_s: When to end; a fall ends it sooner.
+        seed: Seed of the noise.
+        log_period_s: Time between two rows [s].
+        ports: More output ports to log, into ``extra``.
+        realtime_rate: How fast to run at most, for watching; 0 for as fast as it goes.
+
+    Raises:
+        ValueError: The task's plans have no goal, or the robot has no such body to push.
+    """
+    simulator = Simulator(loop)
+    simulator.set_target_realtime_rate(realtime_rate)
+    context = simulator.get_mutable_context()
+    loop.reset_standing(context, goal, episode_rng(seed, 0))
+    end_push(loop, context)
+    simulator.Initialize()
+    recorder = Recorder(loop, (*_PORTS, *ports))
+    margins_port = loop.GetOutputPort("margins")
+    fall_column = loop.constraint_names.index(loop.fall_name)
+    events = [] if push is None else [(push.time_s, push), (push.time_s + push.duration_s, None)]
+    leave_s = fall_s = math.inf
+    cause = ""
+    for row in range(round(duration_s / log_period_s) + 1):
+        time = row * log_period_s
+        while events and events[0][0] <= time + 1e-9:
+            instant, begun = events.pop(0)
+            _advance(simulator, instant)
+            if begun is None:
+                end_push(loop, context)
+            else:
+                begin_push(loop, context, begun)
+        _advance(simulator, time)
+        recorder.record(context)
+        margins = margins_port.Eval(context)
+        if margins.min() < 0 and not cause:
+            leave_s, cause = time, loop.constraint_names[int(np.argmin(margins))]
+        if margins[fall_column] < 0:
+            fall_s = time
+            break
+    arrays = recorder.arrays()
+    extra = {name: arrays.pop(name) for name in ports}
+    return GoalMotion(
+        goal=np.array(goal, dtype=float),
+        push=push,
+        **arrays,
+        leave_time_s=leave_s,
+        cause=cause,
+        fall_time_s=fall_s,
+        extra=extra,
+    )
+
+
+def _advance(simulator: Simulator, time: float) -> None:
+    # To advance to the present would already take the step that begins now.
+    if time > simulator.get_context().get_time():
+        simulator.AdvanceTo(time)

@@ -1,0 +1,315 @@
+"""Goals judged before anything moves: what Γ says of one, and which one near it Γ accepts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY
+from drake_safety.simulation.closed_loop import ClosedLoop
+
+SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
+"""The verdicts."""
+
+_FIRST_RADIUS_M = 0.05
+_GROWTH = 1.6  # From one ball of candidates to the next.
+_LAST_CHANCE = (
+    16  # Times as many candidates, all over the region, when no ball had an accepted one.
+)
+_ROUNDS = 6  # Of candidates about the best one that was found.
+_SPREAD = 0.25  # How far these lie from it, as a share of its distance to the goal.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GoalVerdict:
+    """What an assessment says of a goal, before anything moves.
+
+    Attributes:
+        goal: The goal in the world, (3,) [m].
+        verdict: "safe", "unsafe" or "don't know".
+        belief: (safe, unsafe, don't know), (3,).
+        safety_probability: Γ = b_safe / (1 - μ); NaN where Γ was not asked, because the goal is
+            outside what it has learned.
+        threshold: From which Γ on a goal is safe.
+        constraint_names: The n_c constraints, the possible causes.
+        cause_probability: b_unsafe split by the constraint that will be violated, (n_c,).
+        predicted_margins: Smallest margin of each constraint that is expected, (n_c,); NaN where
+            none is predicted.
+        reason: Why the answer is "don't know"; "" otherwise.
+    """
+
+    goal: np.ndarray
+    verdict: str
+    belief: np.ndarray
+    safety_probability: float
+    threshold: float
+    constraint_names: tuple[str, ...]
+    cause_probability: np.ndarray
+    predicted_margins: np.ndarray
+    reason: str = ""
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the robot may go there."""
+        return self.verdict == SAFE
+
+    @property
+    def cause(self) -> str:
+        """The constraint that is most likely to be violated; "" where nothing speaks for any."""
+        if not self.cause_probability.max(initial=0.0) > 0:
+            return ""
+        return self.constraint_names[int(np.argmax(self.cause_probability))]
+
+    @property
+    def nearest_violation(self) -> tuple[str, float]:
+        """The smallest predicted margin: whose it is, and its value [m, rad].
+
+        "" and NaN where none is predicted.
+        """
+        if not np.isfinite(self.predicted_margins).any():
+            return "", math.nan
+        lowest = int(np.nanargmin(self.predicted_margins))
+        return self.constraint_names[lowest], float(self.predicted_margins[lowest])
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values; what is unknown is None."""
+        name, margin = self.nearest_violation
+        by_name = zip(self.constraint_names, self.cause_probability.tolist(), strict=True)
+        return {
+            "goal": [_finite(value) for value in self.goal.tolist()],
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "belief": dict(zip(("safe", "unsafe", "unknown"), self.belief.tolist(), strict=True)),
+            "safety_probability": _finite(self.safety_probability),
+            "threshold": self.threshold,
+            "cause": self.cause or None,
+            "cause_probability": dict(by_name),
+            "nearest_violation": {"constraint": name, "margin": margin} if name else None,
+        }
+
+
+def assess_goal(
+    loop: ClosedLoop, assessment: SafetyAssessment, goal: np.ndarray, *, threshold: float
+) -> GoalVerdict:
+    """What an assessment says of going from the standing posture to a goal.
+
+    Nothing is simulated: the state, the plan and the features of the first instant are judged.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        assessment: What was learned from its episodes.
+        goal: In the world, (3,) [m]. One that is not finite, or outside the region that was
+            sampled in training, is answered with "don't know" and the region.
+        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+
+    Raises:
+        ValueError: The loop's plans have no goal, or the goal is not three numbers.
+    """
+    goal = _checked(goal)
+    box = target_box(loop)
+    if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
+        (verdict,) = assess_goals(loop, assessment, goal[None], threshold=threshold)
+        return verdict
+    what = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
+    names = tuple(loop.constraint_names)
+    return GoalVerdict(
+        goal=goal,
+        verdict=UNKNOWN,
+        belief=np.array(EMPTY, dtype=float),
+        safety_probability=math.nan,
+        threshold=threshold,
+        constraint_names=names,
+        cause_probability=np.zeros(len(names)),
+        predicted_margins=np.full(len(names), np.nan),
+        reason=f"the target {what} the region sampled in training, {_region(box)}",
+    )
+
+
+def assess_goals(
+    loop: ClosedLoop, assessment: SafetyAssessment, goals: np.ndarray, *, threshold: float
+) -> list[GoalVerdict]:
+    """What an assessment says of goals inside the region that was sampled in training.
+
+    Γ is taken for unknown where more than half of the belief comes from cells that know nothing.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        assessment: What was learned from its episodes.
+        goals: In the world, (N, 3) [m].
+        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+    """
+    if len(goals) == 0:
+        return []
+    said = assessment.predict(*goal_inputs(loop, goals))
+    most_unknown = 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
+    verdicts = []
+    for i, goal in enumerate(goals):
+        reason = ""
+        verdict = SAFE if said.normalized[i] >= threshold else UNSAFE
+        if said.belief[i, UNCERTAINTY] > most_unknown:
+            verdict = UNKNOWN
+            reason = "training came too seldom near what this target looks like to the assessment"
+        verdicts.append(
+            GoalVerdict(
+                goal=np.array(goal, dtype=float),
+                verdict=verdict,
+                belief=said.belief[i],
+                safety_probability=float(said.normalized[i]),
+                threshold=threshold,
+                constraint_names=tuple(loop.constraint_names),
+                cause_probability=said.cause_probability[i],
+                predicted_margins=said.predicted_margins[i],
+                reason=reason,
+            )
+        )
+    return verdicts
+
+
+def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
+    """What an assessment judges goals by: the first instant on the way from standing to each.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        goals: In the world, (N, 3) [m], N ≥ 1.
+
+    Returns:
+        State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
+    """
+    context = loop.CreateDefaultContext()
+    ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
+    rows = []
+    for goal in goals:
+        loop.reset_standing(context, goal)
+        rows.append([port.Eval(context).copy() for port in ports])
+    return tuple(np.array(column) for column in zip(*rows, strict=True))
+
+
+def nearest_accepted_goal(
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    *,
+    threshold: float,
+    rng: np.random.Generator,
+    num_candidates: int = 64,
+    resolution_m: float = 1e-3,
+) -> GoalVerdict | None:
+    """The accepted goal nearest to a given one, as far as a random search finds it.
+
+    Candidates fill growing balls about the goal, in the end the whole region, until one of them is
+    accepted. From there on the search goes down: a bisection towards the goal, then candidates
+    about the best one and in the ball that it bounds, and so on. All candidates lie on a grid of
+    ``resolution_m``: rounded to it, an accepted goal stays an accepted one.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        assessment: What was learned from its episodes.
+        goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
+        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        rng: Source of the candidates.
+        num_candidates: That are judged at a time.
+        resolution_m: Spacing of the grid of candidates [m].
+
+    Returns:
+        The verdict on it; None when the goal is not finite, or nothing in the region is accepted.
+    """
+    goal = _checked(goal)
+    if not np.isfinite(goal).all():
+        return None
+    box = target_box(loop)
+    centre = np.clip(goal, *box)
+
+    def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
+        on_grid = np.unique(np.round(candidates / resolution_m), axis=0) * resolution_m
+        # A multiple of the spacing is not yet the number that is read back from its digits.
+        on_grid = np.round(on_grid, 9)
+        inside = on_grid[np.all((on_grid >= box[0]) & (on_grid <= box[1]), axis=1)]
+        verdicts = assess_goals(loop, assessment, inside, threshold=threshold)
+        accepted = [verdict for verdict in verdicts if verdict.is_accepted]
+        return min(accepted, key=lambda one: _distance(one.goal, goal), default=None)
+
+    best = nearest_of(centre[None])
+    radius, diagonal = _FIRST_RADIUS_M, _distance(*box)
+    while best is None and radius < diagonal:
+        best = nearest_of(centre + radius * _in_unit_ball(rng, num_candidates))
+        radius *= _GROWTH
+    if best is None:
+        best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
+    if best is None:
+        return None
+
+    for _ in range(_ROUNDS):
+        best = _bisected(best, centre, nearest_of, resolution_m)
+        distance = _distance(best.goal, goal)
+        if distance < resolution_m:
+            break
+        about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
+        ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
+        candidates = np.clip(np.concatenate([about, ball]), *box)
+        is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
+        found = nearest_of(candidates[is_nearer])
+        if found is not None and _distance(found.goal, goal) < distance:
+            best = found
+    return best
+
+
+def _bisected(
+    best: GoalVerdict, centre: np.ndarray, nearest_of: Any, resolution_m: float
+) -> GoalVerdict:
+    """Moves an accepted goal straight towards the centre for as long as it stays accepted."""
+    refused = centre
+    while _distance(best.goal, refused) > resolution_m:
+        between = 0.5 * (best.goal + refused)
+        found = nearest_of(between[None])
+        if found is None:
+            refused = between
+        elif _distance(found.goal, centre) < _distance(best.goal, centre):
+            best = found
+        else:
+            break
+    return best
+
+
+def target_box(loop: ClosedLoop) -> np.ndarray:
+    """Lowest and highest corner of the goals that were sampled in training, (2, 3) [m].
+
+    Raises:
+        ValueError: The task's plans have no goal.
+    """
+    box = loop.target_box
+    if box is None:
+        raise ValueError(f"task '{type(loop).__name__}' has plans without a goal: no target to ask")
+    return box
+
+
+def _checked(goal: np.ndarray) -> np.ndarray:
+    goal = np.asarray(goal, dtype=float)
+    if goal.shape != (3,):
+        raise ValueError(f"a target is three numbers [m]; got {goal.tolist()}")
+    return goal
+
+
+def _region(box: np.ndarray) -> str:
+    return (
+        ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in zip("xyz", *box, strict=True))
+        + " m"
+    )
+
+
+def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
+    """Points spread evenly in the unit ball, (N, 3)."""
+    directions = rng.normal(size=(num_points, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions * np.cbrt(rng.uniform(size=(num_points, 1)))
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm(one - other))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,294 @@
+"""`ask` answers before anything moves, and `run --target` obeys, unless it is forced."""
+
+import json
+import re
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.cli import main
+from drake_safety.cli.target_run import alarm_row, named_push
+from drake_safety.cli.targets import join_targets, parse_target
+from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.simulation.goal_motion import GoalMotion
+from drake_safety.simulation.planning import assess_goal, goal_inputs
+from drake_safety.simulation.rollouts import episodes_info
+from drake_safety.simulation.scenario import load_scenario
+
+SCENARIO = "atlas_reaching"
+BOUNDARY_M = 0.75
+CAUSE = "collision"
+NEAR, FAR = (0.6, 0.5, 1.05), (0.9, 0.5, 1.05)
+
+
+def made_up_episodes(loop):
+    """As many episodes as goals, from the standing posture, safe where x < `BOUNDARY_M`.
+
+    What the assessment sees of them is real; what came of them is not, so that it is known.
+    """
+    goals = np.random.default_rng(0).uniform(*loop.target_box, (40, 3))
+    episodes = []
+    columns = zip(goals, *goal_inputs(loop, goals), strict=True)
+    for index, (goal, state, preview, features) in enumerate(columns):
+        margins = np.full((loop.scenario.num_steps + 1, len(loop.constraint_names)), 0.1)
+        shape = (len(margins), 1)
+        is_safe = bool(goal[0] < BOUNDARY_M)
+        column = loop.constraint_names.index(CAUSE)
+        margins[:, column] = np.linspace(0.05, 0.05 if is_safe else -0.02, len(margins))
+
+        episodes.append(
+            Episode(
+                index=index,
+                time_s=loop.scenario.step_s * np.arange(len(margins)),
+                state=np.tile(state, shape),
+                true_state=np.tile(state, shape),
+                output=np.tile(goal, shape) + np.linspace(0.0, 0.01 * index, len(margins))[:, None],
+                desired_output=np.tile(goal, shape),
+                desired_preview=np.tile(preview, shape),
+                features=np.tile(features, shape),
+                margins=margins,
+                is_safe=is_safe,
+                cause="" if is_safe else CAUSE,
+            )
+        )
+    return Episodes(episodes_info(loop, seed=0), episodes)
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """The folder of a training, and what was trained: that targets beyond a plane are unsafe."""
+    scenario = load_scenario(SCENARIO)
+    parameters = scenario.assessment
+    parameters.epochs, parameters.ensemble_size, parameters.hidden_sizes = 40, 1, [32]
+    parameters.perplexity, parameters.min_count = 5, 1
+    folder = tmp_path_factory.mktemp("reaching")
+    assessment = SafetyAssessment(parameters).fit(made_up_episodes(scenario.make_loop()))
+    assessment.save(assessment_file(folder, "sharpened"))
+    return folder, assessment
+
+
+@pytest.fixture(scope="session")
+def loop(trained):
+    return load_scenario(SCENARIO).make_loop(assessment=trained[1])
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    """A folder of one's own with that assessment."""
+    assessment_file(tmp_path, "sharpened").symlink_to(assessment_file(trained[0], "sharpened"))
+    return tmp_path
+
+
+def calibrate(folder, threshold):
+    """Writes what `evaluate` would; above one, nothing is accepted."""
+    figure = {"value": threshold, "low": threshold, "high": threshold, "n": 100}
+    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": figure}))
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    def run(*arguments):
+        """Exit code and output of a command line."""
+        monkeypatch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code or 0, capsys.readouterr().out
+
+    return run
+
+
+def test_an_accepted_target_is_told_with_its_belief_and_ends_with_zero(call, folder):
+    calibrate(folder, 0.4)
+    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)
+    assert code == 0
+    assert "0.6 0.5 1.05 m of the left hand" in told
+    assert re.search(r"verdict +safe: Γ \d\.\d+ ≥ threshold 0\.400", told)
+    assert "belief" in told
+    assert "nearest accepted" not in told
+    assert "remark" not in told
+
+
+def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call, folder):
+    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
+    assert code == 1
+    assert re.search(r"verdict +unsafe: Γ \d\.\d+ < threshold 0\.500", told)
+    assert re.search(rf"likely cause +{CAUSE}", told)
+    nearest = re.search(r"nearest accepted +(\S+ \S+ \S+) m, \S+ cm away", told)[1]
+    # What is told can be typed, and is accepted then.
+    assert call("ask", SCENARIO, "--assessment", folder, "--target", *nearest.split())[0] == 0
+    assert float(nearest.split()[0]) < FAR[0]
+
+
+@pytest.mark.parametrize("target", [NEAR, FAR])
+def test_the_answer_as_json_is_the_library_s_own(call, folder, trained, loop, target, monkeypatch):
+    verdict = assess_goal(loop, trained[1], np.array(target), threshold=DEFAULT_THRESHOLD)
+    monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted", lambda *arguments: verdict)
+    options = ("--assessment", folder, "--target", *target, "--json")
+    code, told = call("ask", SCENARIO, *options)
+    answer = json.loads(told)
+    assert answer.pop("hand") == "left"
+    assert "is not calibrated" in answer.pop("remark")
+    assert answer.pop("nearest_accepted") == (None if verdict.is_accepted else list(target))
+    assert answer == json.loads(json.dumps(verdict.to_json()))
+    assert code == (0 if verdict.is_accepted else 1)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        (("nan", 0.3, 1.0), "don't know: the target is not finite"),
+        ((0.7, -0.9, 1.0), "don't know: the target is outside the region sampled in training"),
+    ],
+)
+def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(call, folder, target, words):
+    calibrate(folder, 0.0)
+    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *target)
+    assert code == 1
+    assert words in told
+    assert "x 0.45…1, y -0.3…1.3, z 0.5…1.6 m" in told
+    assert "Γ" not in told
+    assert "belief" not in told
+
+
+def test_the_region_of_the_other_hand_is_the_mirrored_one(call, folder):
+    options = ("--assessment", folder, "--target", NEAR[0], -NEAR[1], NEAR[2])
+    assert call("ask", SCENARIO, *options, "--hand", "right")[0] == 0
+
+
+def test_a_named_target_is_the_point_of_that_name(loop):
+    for name, point in loop.named_targets.items():
+        np.testing.assert_array_equal(parse_target(loop, name), point)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--target", "green_ball"], r"'green_ball': give X Y Z, .*['blue_box', 'red_can']"),
+        (["--target", "0.7", "0.3"], "'0.7 0.3': give X Y Z"),
+        (["--target", "blue_box", "--hand", "third"], "no reaching frame 'third'; it has ['left'"),
+        (["--target", "blue_box", "--mode", "paper"], "holds no 'paper' assessment"),
+    ],
+)
+def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments, message):
+    code, told = call("ask", SCENARIO, "--assessment", folder, *arguments)
+    assert code == 2
+    assert all(part in told for part in message.split(".*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "goes to a target: pass --target X Y Z, or one of the names ['blue_box', 'red_can']"),
+        (["--push", "torso"], "goes to a target"),
+        (["--force"], "--force goes to a target that Γ refuses: pass --target too"),
+        (["--target", "blue_box", "--push", "ball"], "no such push"),
+        (["--target", "blue_box", "--push", "torso", "--push", "torso"], "takes one push"),
+        (["--target", "blue_box", "--no-recovery"], "no options ['recovery']; it has ['hand']"),
+    ],
+)
+def test_options_that_a_task_or_a_run_does_not_know_are_refused(call, folder, arguments, message):
+    code, told = call("run", SCENARIO, "--assessment", folder, *arguments)
+    assert code == 2
+    assert message in told
+    assert not (folder / "run").exists()
+
+
+@pytest.fixture
+def nothing_near(monkeypatch):
+    """Spares the search for what would be accepted."""
+    monkeypatch.setattr("drake_safety.cli.target_run.nearest_accepted", lambda *arguments: None)
+
+
+def test_a_run_obeys_a_refusal(call, folder, nothing_near):
+    calibrate(folder, 1.5)
+    code, told = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")
+    assert code == 1
+    assert "refused: nothing moved; --force goes there all the same" in told
+    assert not (folder / "run").exists()
+
+
+def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
+    calibrate(folder, 0.0)
+    started = []
+    recording = SimpleNamespace(
+        viewer=None, start=lambda: started.append(True), save=lambda timeline, events: None
+    )
+    monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
+    monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)
+    options = ("--assessment", folder, "--target", *NEAR, "--duration", 0.1)
+    assert call("run", SCENARIO, *options)[0] == 0
+    assert started == [True]
+
+
+@pytest.mark.slow
+def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothing_near):
+    calibrate(folder, 1.5)
+    options = ("--assessment", folder, "--target", "blue_box", "--duration", 0.2)
+    code, told = call("run", SCENARIO, *options, "--force")
+    assert code == 0
+    written = {path.name for path in (folder / "run").iterdir()}
+    assert written == {"recording.html", "timeline.png", "timeline.svg"}
+    assert "standing, inside the safe set throughout" in told
+
+
+def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(call, folder):
+    assert goal_threshold(folder, "sharpened")[0] == DEFAULT_THRESHOLD
+    told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
+    assert "remark" in told and "is not calibrated" in told
+    calibrate(folder, 0.25)
+    assert goal_threshold(folder, "sharpened") == (0.25, "")
+    assert goal_threshold(folder, "paper")[0] == DEFAULT_THRESHOLD
+
+
+@pytest.mark.parametrize(
+    ("words", "joined"),
+    [
+        (["--target", "1", "-2", "3e-1"], ["--target=1 -2 3e-1"]),
+        (["--target", "-1", "nan", "inf", "name"], ["--target=-1 nan inf", "name"]),
+        (["a", "--target", "box", "b"], ["a", "--target=box", "b"]),
+        (["--target", "1", "2", "--json"], ["--target=1 2", "--json"]),
+        (["--target", "1", "2", "3", "4"], ["--target=1 2 3", "4"]),
+        (["--seed", "1", "2"], ["--seed", "1", "2"]),
+        (["a", "--target"], ["a", "--target"]),
+        (["--target=1 2 3"], ["--target=1 2 3"]),
+    ],
+)
+def test_the_numbers_of_a_target_become_one_word(words, joined):
+    assert join_targets(words) == joined
+
+
+def test_a_push_is_one_that_the_scenario_names(loop):
+    assert named_push(loop, []) is None
+    assert named_push(loop, ["torso"]) is loop.pushes["torso"]
+    with pytest.raises(ValueError, match=r"has no such push .* it has \['torso'\]"):
+        named_push(loop, ["head"])
+
+
+@pytest.mark.parametrize(
+    ("gamma", "row"),
+    [
+        ([0.9, 0.6, 0.4, 0.8], 2),
+        ([0.9, 0.5, 0.7], None),
+        ([0.4, 0.9, 0.3], None),
+        ([0.9, np.nan, 0.3], 1),
+    ],
+)
+def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, row):
+    n = len(gamma)
+    motion = GoalMotion(
+        goal=np.zeros(3),
+        push=None,
+        time_s=0.02 * np.arange(n),
+        output=np.zeros((n, 3)),
+        margins=np.ones((n, 1)),
+        plant_state=np.zeros((n, 2)),
+        leave_time_s=np.inf,
+        cause="",
+        fall_time_s=np.inf,
+        extra={"normalized_safety_probability": np.array(gamma)[:, None]},
+    )
+    assert alarm_row(motion, 0.5) == row

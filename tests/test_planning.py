@@ -1,0 +1,183 @@
+"""Goals are judged before anything moves, and the nearest accepted one is found."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.planning import (
+    SAFE,
+    UNKNOWN,
+    UNSAFE,
+    assess_goal,
+    goal_inputs,
+    nearest_accepted_goal,
+)
+from goal_field import BOX, FieldAssessment, GoalTask
+
+INSIDE = np.array([0.5, 0.0, 1.0])
+
+
+def constant(gamma):
+    return lambda goals: np.full(len(goals), gamma)
+
+
+def step(signed_distance):
+    """Γ is 1 where a signed distance is positive and 0 elsewhere."""
+    return lambda goals: (signed_distance(goals) >= 0).astype(float)
+
+
+def ask(gamma, goal=INSIDE, *, threshold=0.5, **options):
+    return assess_goal(GoalTask(), FieldAssessment(gamma, **options), goal, threshold=threshold)
+
+
+def search(gamma, goal, *, seed=0, **options):
+    return nearest_accepted_goal(
+        GoalTask(),
+        FieldAssessment(gamma),
+        goal,
+        threshold=0.5,
+        rng=np.random.default_rng(seed),
+        **options,
+    )
+
+
+def test_a_goal_is_safe_from_the_threshold_on():
+    assert ask(constant(0.6), threshold=0.6).verdict == SAFE
+    assert ask(constant(0.6), threshold=0.6).is_accepted
+    assert ask(constant(0.6), threshold=0.61).verdict == UNSAFE
+    assert not ask(constant(0.6), threshold=0.61).is_accepted
+
+
+def test_a_goal_is_not_known_when_most_of_its_belief_rests_on_cells_that_know_nothing():
+    # μ = 0.3 + 0.7 e, e the share of empty cells: 0.65 is half of them.
+    assert ask(constant(1.0), unknown=0.64).verdict == SAFE
+    verdict = ask(constant(1.0), unknown=0.66)
+    assert verdict.verdict == UNKNOWN
+    assert not verdict.is_accepted
+    assert verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        ([1.5, 0.0, 1.0], "is outside the region"),
+        ([0.5, -1.0001, 1.0], "is outside the region"),
+        ([math.nan, 0.0, 1.0], "is not finite"),
+        ([math.inf, 0.0, 1.0], "is not finite"),
+    ],
+)
+def test_outside_what_was_trained_the_answer_is_the_region_and_no_number(goal, words):
+    task = GoalTask()
+    verdict = assess_goal(task, FieldAssessment(constant(1.0)), np.array(goal), threshold=0.5)
+    assert verdict.verdict == UNKNOWN
+    assert words in verdict.reason
+    assert "x 0…1, y -1…1, z 0…2 m" in verdict.reason
+    assert math.isnan(verdict.safety_probability)
+    np.testing.assert_array_equal(verdict.belief, [0.0, 0.0, 1.0])
+    assert task.num_resets == 0
+    told = json.loads(json.dumps(verdict.to_json(), allow_nan=False))
+    assert told["safety_probability"] is None
+    assert told["nearest_violation"] is None
+    assert told["cause"] is None
+
+
+def test_the_corners_of_the_region_belong_to_it():
+    for corner in BOX:
+        assert ask(constant(1.0), corner).is_accepted
+
+
+def test_a_refusal_names_the_likely_cause_and_the_margin_that_comes_nearest_to_violation():
+    verdict = ask(constant(0.25))
+    assert verdict.cause == "floor"
+    assert verdict.nearest_violation == ("wall", -0.25)
+    told = verdict.to_json()
+    assert told["cause"] == "floor"
+    assert told["nearest_violation"] == {"constraint": "wall", "margin": -0.25}
+    assert sum(told["belief"].values()) == pytest.approx(1.0)
+    assert sum(told["cause_probability"].values()) == pytest.approx(told["belief"]["unsafe"])
+
+
+def test_where_nothing_speaks_for_a_cause_none_is_named():
+    assert ask(constant(1.0)).cause == ""
+
+
+def test_goals_are_judged_by_the_first_instant_on_the_way_to_each():
+    goals = np.array([INSIDE, BOX[0]])
+    for part in goal_inputs(GoalTask(), goals):
+        np.testing.assert_array_equal(part, goals)
+
+
+def test_what_is_accepted_is_its_own_nearest_accepted_goal():
+    found = search(constant(1.0), INSIDE)
+    np.testing.assert_array_equal(found.goal, INSIDE)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("signed_distance", "distance_m"),
+    [
+        (lambda goals: 0.2 - goals[:, 0], 0.3),
+        (lambda goals: (goals - INSIDE) @ [0.6, 0.0, 0.8] - 0.15, 0.15),
+        (lambda goals: 0.3 - np.linalg.norm(goals - [0.5, 0.7, 1.0], axis=1), 0.4),
+        (lambda goals: np.abs(goals[:, 2] - 1.0) - 0.25, 0.25),
+    ],
+    ids=["plane", "oblique plane", "ball", "gap"],
+)
+def test_the_nearest_accepted_goal_is_nearly_as_near_as_the_region_s_boundary(
+    signed_distance, distance_m, seed
+):
+    found = search(step(signed_distance), INSIDE, seed=seed)
+    assert found.is_accepted
+    assert signed_distance(found.goal[None])[0] >= 0
+    assert np.all((found.goal >= BOX[0]) & (found.goal <= BOX[1]))
+    distance = np.linalg.norm(found.goal - INSIDE)
+    assert distance_m - 1e-9 <= distance <= 1.05 * distance_m + 0.005
+
+
+def test_a_small_region_far_away_is_found_all_the_same():
+    centre = np.array([0.9, -0.9, 1.9])
+    found = search(step(lambda goals: 0.2 - np.linalg.norm(goals - centre, axis=1)), BOX[0])
+    assert np.linalg.norm(found.goal - centre) <= 0.2
+
+
+def test_a_goal_outside_the_region_is_moved_into_it():
+    found = search(constant(1.0), np.array([0.5, 3.0, 1.0]))
+    np.testing.assert_array_equal(found.goal, [0.5, 1.0, 1.0])
+
+
+def test_an_accepted_goal_stays_one_when_it_is_typed_to_the_millimetre():
+    gamma = step(lambda goals: (goals - INSIDE) @ [0.48, 0.6, 0.64] - 0.1234567)
+    found = search(gamma, INSIDE)
+    typed = np.array([float(f"{value:.3f}") for value in found.goal])
+    np.testing.assert_array_equal(typed, found.goal)
+    assert ask(gamma, typed).is_accepted
+
+
+def test_the_same_generator_finds_the_same_goal():
+    gamma = step(lambda goals: 0.2 - goals[:, 0])
+    np.testing.assert_array_equal(search(gamma, INSIDE).goal, search(gamma, INSIDE).goal)
+
+
+def test_where_nothing_is_accepted_or_asked_nothing_is_found():
+    assert search(constant(0.0), INSIDE, num_candidates=4) is None
+    assert search(constant(1.0), np.array([math.nan, 0.0, 1.0])) is None
+
+
+def test_a_task_whose_plans_have_no_goal_is_not_asked():
+    class Wandering(ClosedLoop):
+        pass
+
+    loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
+    with pytest.raises(ValueError, match="'Wandering' has plans without a goal"):
+        assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)
+    with pytest.raises(ValueError, match="'Wandering' has plans without a goal"):
+        loop.reset_standing(None, INSIDE)
+
+
+def test_a_goal_is_three_numbers():
+    with pytest.raises(ValueError, match=r"three numbers \[m\]; got \[0.5, 0.0\]"):
+        ask(constant(1.0), INSIDE[:2])

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.mirror import Mirror
+from drake_safety.evaluation.reachability import Reachability
+from drake_safety.models import load_robot
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("atlas")
+
+
+@pytest.fixture(scope="module")
+def kinematics(robot):
+    return RobotKinematics(robot)
+
+
+@pytest.fixture(scope="module")
+def reachability(robot):
+    return {hand: Reachability(robot, hand) for hand in robot.reaching_frames}
+
+
+def test_where_the_hand_already_is_can_be_reached(robot, kinematics, reachability):
+    for hand, frame in robot.reaching_frames.items():
+        point = kinematics.reaching_position(kinematics.standing_positions(), frame)
+        assert reachability[hand].miss(point) < 1e-4
+
+
+def test_what_forward_kinematics_gets_to_inverse_kinematics_gets_to(
+    robot, kinematics, reachability
+):
+    rng = np.random.default_rng(0)
+    chain = [kinematics.joint_names.index(name) for name in reachability["left"].joint_names]
+    low, high = kinematics.position_limits[chain].T
+    points = []
+    for _ in range(20):
+        q = kinematics.standing_positions()
+        q[NUM_BASE_POSITIONS + np.array(chain)] = rng.uniform(low, high)
+        points.append(kinematics.reaching_position(q, robot.reaching_frame("left")))
+    # A local search may fail at a rare point; that few is what the comparison can bear.
+    assert reachability["left"].is_reachable(np.array(points)).mean() >= 0.9
+
+
+def test_a_point_that_is_too_far_is_missed_by_as_much_more_as_it_is_further(reachability):
+    near, far = (reachability["left"].miss(np.array([x, 0.3, 1.2])) for x in (3.0, 4.0))
+    assert near > 1.0
+    assert far - near == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_joints_between_base_and_hand_move_and_no_other(robot, reachability):
+    legs = {name for foot in robot.feet.values() for name in foot.joints}
+    for hand, frame in robot.reaching_frames.items():
+        names = set(reachability[hand].joint_names)
+        assert set(frame.joints) < names
+        assert not names & legs
+    left, right = (set(reachability[hand].joint_names) for hand in ("left", "right"))
+    assert left & right == set(reachability["left"].joint_names) - set(
+        robot.reaching_frame("left").joints
+    )
+
+
+def test_the_other_hand_reaches_the_mirror_image(kinematics, reachability):
+    rng = np.random.default_rng(1)
+    points = rng.uniform([0.45, -0.3, 0.5], [1.0, 1.3, 1.6], (12, 3))
+    images = Mirror(kinematics).points(points)
+    left, right = reachability["left"], reachability["right"]
+    np.testing.assert_allclose(
+        [left.miss(point) for point in points], [right.miss(point) for point in images], atol=5e-3
+    )
+    np.testing.assert_array_equal(left.is_reachable(points), right.is_reachable(images))
+
+
+def test_an_answer_does_not_depend_on_what_was_asked_before(reachability):
+    points = np.array([[0.7, 0.4, 1.0], [0.9, 1.2, 0.6], [0.6, 0.2, 1.5]])
+    forward = [reachability["left"].miss(point) for point in points]
+    backward = [reachability["left"].miss(point) for point in points[::-1]]
+    np.testing.assert_array_equal(forward, backward[::-1])
+
+
+@pytest.mark.parametrize("point", [[0.5, np.nan, 1.0], [0.5, 1.0]])
+def test_a_point_that_is_none_is_refused(reachability, point):
+    with pytest.raises(ValueError, match="a point is three finite numbers"):
+        reachability["left"].miss(np.array(point))
+
+
+def test_a_robot_without_that_hand_is_answered_with_those_it_has(robot):
+    with pytest.raises(ValueError, match=r"no reaching frame 'third'; it has \['left', 'right'\]"):
+        Reachability(robot, "third")

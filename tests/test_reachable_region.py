@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+
+from drake_safety import SafetyAssessment, run_episodes
+from drake_safety.evaluation.plan_study import SAFE
+from drake_safety.evaluation.reachable_region import plane_of, reachable_region
+from drake_safety.evaluation.region_figure import region_figure
+from shuttle_task import BOX, FAIR_X_M, shuttling
+
+
+@pytest.fixture(scope="module")
+def assessment():
+    scenario = shuttling()
+    return SafetyAssessment(scenario.assessment).fit(run_episodes(scenario, 80, num_workers=1))
+
+
+@pytest.fixture(scope="module")
+def region(assessment):
+    return reachable_region(
+        shuttling(), assessment, threshold=0.5, x_m=0.9, step_m=0.3, num_workers=1
+    )
+
+
+def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(region):
+    for fine, coarse, low, high in (
+        (region.y_m, region.simulated_y_m, *BOX[:, 1]),
+        (region.z_m, region.simulated_z_m, *BOX[:, 2]),
+    ):
+        assert (coarse[0], coarse[-1]) == (low, high)
+        assert (fine[0], fine[-1]) == (low, high)
+        # Every simulated target is one of the fine ones.
+        assert np.abs(coarse[:, None] - fine).min(axis=1).max() < 1e-12
+        assert len(fine) > 2 * len(coarse)
+    assert region.safety_probability.shape == (len(region.z_m), len(region.y_m))
+
+
+def test_the_truth_is_what_the_simulation_says_of_each_target(region):
+    y = np.broadcast_to(region.simulated_y_m, region.outcomes.shape)
+    # From the origin a mass that is carried beyond y = 1 leaves through the flank.
+    np.testing.assert_array_equal(region.outcomes == "flank", y > 1.0)
+    np.testing.assert_array_equal(region.outcomes == SAFE, y <= 1.0)
+
+
+def test_beyond_a_wall_the_truth_is_that_wall(assessment):
+    region = reachable_region(
+        shuttling(), assessment, threshold=0.5, x_m=1.2, step_m=0.6, num_workers=1
+    )
+    assert set(region.outcomes[region.outcomes != "flank"]) == {"front"}
+    assert region.figures()["share_safe"].value == 0.0
+
+
+def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
+    loop = shuttling().make_loop()
+    context = loop.CreateDefaultContext()
+    row, column = 2, 3
+    loop.reset_standing(context, np.array([0.9, region.y_m[column], region.z_m[row]]))
+    inputs = (
+        loop.GetOutputPort(name).Eval(context) for name in ("state", "desired_preview", "features")
+    )
+    expected = assessment.predict_one(*inputs).normalized
+    assert region.safety_probability[row, column] == pytest.approx(expected, abs=1e-6)
+
+
+def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
+    figures = region.figures()
+    verdict = region.safety_probability >= region.threshold
+    rows = [int(np.argmin(np.abs(region.z_m - z))) for z in region.simulated_z_m]
+    columns = [int(np.argmin(np.abs(region.y_m - y))) for y in region.simulated_y_m]
+    is_right = verdict[np.ix_(rows, columns)] == (region.outcomes == SAFE)
+    assert figures["sharpened.right"].value == pytest.approx(is_right.mean())
+    assert figures["sharpened.right"].n == region.outcomes.size
+    # A task without a hand has no kinematics to compare with.
+    assert "reachability.right" not in figures
+
+
+def test_the_plane_is_in_the_middle_of_the_fair_box_unless_it_is_said_where():
+    loop = shuttling().make_loop()
+    x, box = plane_of(loop, None, 0.1)
+    assert x == pytest.approx(0.5 * (FAIR_X_M + BOX[1, 0]))
+    np.testing.assert_array_equal(box, BOX[:, 1:])
+    assert plane_of(loop, 0.7, 0.1)[0] == 0.7
+
+
+@pytest.mark.parametrize(
+    ("x", "step", "message"),
+    [
+        (2.0, 0.1, r"x = 2 m misses the target box, 0.6..1.4 m"),
+        (0.9, 0.0, "the step must be positive"),
+        (0.9, 1.0, "no longer than the target box's sides"),
+    ],
+)
+def test_a_plane_that_cannot_be_is_refused(x, step, message):
+    with pytest.raises(ValueError, match=message):
+        plane_of(shuttling().make_loop(), x, step)
+
+
+def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(region):
+    figure = region_figure(region, ["front", "flank"])
+    (axes,) = figure.axes
+    left, right = axes.get_xlim()
+    assert left > right
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    share = np.mean(region.outcomes == "flank")
+    assert f"flank {100 * share:.0f} %" in labels
+    assert not any(label.startswith("front") for label in labels)
+    assert f"Γ = {region.threshold:.2f}" in labels
+    assert "inverse kinematics" not in labels
