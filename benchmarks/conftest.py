@@ -52,6 +52,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "fits the scenario, else a set that is simulated once and kept in pytest's cache.",
     )
     group.addoption("--num-episodes", type=int, default=2048, help="Nominal episodes to train on.")
+    group.addoption(
+        "--reference-episodes",
+        type=int,
+        default=100,
+        help="Episodes that are simulated again in finer steps, some 4 CPU seconds each.",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

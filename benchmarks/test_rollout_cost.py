@@ -3,126 +3,42 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
-from pydrake.geometry import HalfSpace
-from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    CoulombFriction,
-    DiscreteContactApproximation,
-)
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
-from pydrake.systems.primitives import TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
+from bare_plant import SEED, BarePlant, costs_beside, log_motion
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
+from pydrake.systems.framework import DiagramBuilder
 from threadpoolctl import threadpool_limits
 
-from drake_safety import Scenario, run_episode, run_episodes
-from drake_safety.control.robot import add_robot, add_to_package_map
+from drake_safety import Scenario, run_episodes
+from drake_safety.control.robot import add_robot
 from drake_safety.models import load_robot
 from drake_safety.simulation.balls import add_ball
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.rollouts import episode_rng
+from drake_safety.simulation.ground import add_ground
 
-SEED = 0
 NUM_EPISODES = 24  # Candidates for the comparison with the bare plant.
 ROUNDS = 3
 THROUGHPUT_EPISODES = 128
 WARM_UP_EPISODES = 16
 
 
-@dataclass(kw_only=True, eq=False)
-class Motion:
-    """One episode's start, its joint commands and its end."""
-
-    index: int
-    duration_s: float
-    start: Context  # The loop's root.
-    commands: PiecewisePolynomial
-    end_state: np.ndarray
-
-
-class BarePlant:
-    """The scenario's plant with its implicit PD, driven by logged commands from C++ alone."""
-
-    def __init__(self, loop: ClosedLoop):
-        scenario = loop.scenario
-        robot = load_robot(scenario.robot)
-        variation = scenario.variation("nominal")
-        builder = DiagramBuilder()
-        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-        instance = add_robot(plant, robot, variation, scene_graph=scene_graph)
-        parser = Parser(plant)
-        add_to_package_map(parser.package_map())
-        parser.AddModels(url="package://drake_safety_models/scenes/ground.urdf")
-        mu = variation.foot_friction or robot.foot_friction
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(mu, mu)
-        )
-        add_ball(plant)
-        plant.SetUseSampledOutputPorts(False)
-        plant.Finalize()
-        port = plant.get_desired_state_input_port(instance)
-        self._source = builder.AddSystem(
-            TrajectorySource(PiecewisePolynomial(np.zeros((port.size(), 1))))
-        )
-        builder.Connect(self._source.get_output_port(), port)
-        self._plant, self._loop_plant = plant, loop.plant
-        self._diagram: Diagram = builder.Build()
-
-    def follow(self, motion: Motion) -> np.ndarray:
-        """Simulates the motion; its last state."""
-        self._source.UpdateTrajectory(motion.commands)
-        simulator = Simulator(self._diagram)
-        context = simulator.get_mutable_context()
-        plant_context = self._plant.GetMyMutableContextFromRoot(context)
-        start = self._loop_plant.GetMyContextFromRoot(motion.start)
-        plant_context.get_mutable_discrete_state().SetFrom(start.get_discrete_state())
-        plant_context.get_mutable_parameters().SetFrom(start.get_parameters())
-        simulator.Initialize()
-        simulator.AdvanceTo(motion.duration_s)
-        return self._plant.GetPositionsAndVelocities(plant_context)
-
-
-def log_motion(loop: ClosedLoop, index: int) -> Motion:
-    """Runs an episode again and logs what the plant's servos are told, whenever it changes."""
-    duration_s = float(run_episode(loop, index, seed=SEED).time_s[-1])
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, episode_rng(SEED, index))
-    plant = loop.plant
-    plant_context = plant.GetMyContextFromRoot(context)
-    start = context.Clone()
-    port = plant.get_desired_state_input_port(loop.robot_instance)
-    breaks: list[float] = []
-    samples: list[np.ndarray] = []
-
-    def log(root: Context) -> EventStatus:
-        command = port.Eval(plant_context)
-        if not samples or np.any(command != samples[-1]):
-            # In the middle of a step: no rounding of times can move it across a plant step.
-            breaks.append(root.get_time() - 0.5 * loop.scenario.time_step_s)
-            samples.append(command.copy())
-        return EventStatus.DidNothing()
-
-    simulator.set_monitor(log)
-    simulator.Initialize()
-    simulator.AdvanceTo(duration_s)
-    breaks.append(duration_s + 1.0)
-    samples.append(samples[-1])
-    return Motion(
-        index=index,
-        duration_s=duration_s,
-        start=start,
-        commands=PiecewisePolynomial.ZeroOrderHold(breaks, np.transpose(samples)),
-        end_state=plant.GetPositionsAndVelocities(plant_context),
-    )
+def bare_plant(loop: ClosedLoop) -> BarePlant:
+    """The scenario's plant with its implicit PD."""
+    scenario = loop.scenario
+    robot = load_robot(scenario.robot)
+    variation = scenario.variation("nominal")
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+    instance = add_robot(plant, robot, variation, scene_graph=scene_graph)
+    add_ground(plant, variation.foot_friction or robot.foot_friction)
+    add_ball(plant)
+    plant.SetUseSampledOutputPorts(False)
+    plant.Finalize()
+    return BarePlant(builder, plant, plant.get_desired_state_input_port(instance), loop)
 
 
 @pytest.mark.benchmark(timer=time.process_time)
@@ -131,31 +47,10 @@ def test_the_closed_loop_beside_its_bare_plant(
 ) -> None:
     with threadpool_limits(1):
         loop = scenario.make_loop()
-        bare = BarePlant(loop)
-        motions = [log_motion(loop, index) for index in range(NUM_EPISODES)]
-        for motion in motions:
-            np.testing.assert_allclose(bare.follow(motion), motion.end_state, atol=1e-9)
-        cost = {"loop": np.full((ROUNDS, len(motions)), np.inf)}
-        cost["plant"] = cost["loop"].copy()
-        pairs = iter([(round_, i) for round_ in range(ROUNDS) for i in range(len(motions))])
-        now = (0, 0)
-
-        def follow_bare() -> None:
-            nonlocal now
-            now = next(pairs)
-            started = time.process_time()
-            bare.follow(motions[now[1]])
-            cost["plant"][now] = time.process_time() - started
-
-        def run_loop() -> None:
-            started = time.process_time()
-            run_episode(loop, motions[now[1]].index, seed=SEED)
-            cost["loop"][now] = time.process_time() - started
-
-        benchmark.pedantic(run_loop, setup=follow_bare, rounds=cost["loop"].size)
+        port = loop.plant.get_desired_state_input_port(loop.robot_instance)
+        motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
+        loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
     spans = np.array([motion.duration_s for motion in motions])
-    # The quickest of the rounds, of either: what else runs on the machine only ever adds.
-    loop_s, plant_s = (cost[name].min(axis=0) for name in ("loop", "plant"))
     is_whole = spans > scenario.episode_duration_s - 1e-9
     for name, chosen, limit in (
         ("rollout / bare plant, whole episodes", is_whole, 1.6),

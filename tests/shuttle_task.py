@@ -108,7 +108,7 @@ class Shuttling(ClosedLoop):
         self._set(context, start, drawn if goal is None else np.asarray(goal))
         return 0
 
-    def reset_standing(self, context, goal):
+    def reset_standing(self, context, goal, rng=None):
         self._set(context, np.zeros(3), np.asarray(goal))
 
     def _set(self, context, start, goal):

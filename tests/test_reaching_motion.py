@@ -86,6 +86,13 @@ def test_noise_stands_only_where_it_was_configured():
         assert np.abs(episode.features - quiet.features).max() > 1e-4
 
 
+def test_episodes_from_the_standing_posture_have_noise_of_their_own():
+    one, other = (run_episode(porter("blurred"), i, goal=EASY, is_standing=True) for i in (0, 1))
+    np.testing.assert_array_equal(one.true_state, other.true_state)
+    np.testing.assert_array_equal(one.state[0], other.state[0])
+    assert (np.abs(one.state - other.state)[1:].max(axis=1) > 1e-4).all()
+
+
 def test_the_preview_foresees_the_joints_of_an_easy_reach():
     loop, goal = atlas(), np.array([0.65, 0.3, 1.05])
     context = loop.CreateDefaultContext()

@@ -131,7 +131,7 @@ def run_episode(
     if goal is None:
         first_step = loop.reset(context, rng)
     elif is_standing:
-        loop.reset_standing(context, goal)
+        loop.reset_standing(context, goal, rng)
     else:
         first_step = loop.reset(context, rng, goal)
     safe = loop.GetOutputPort("safe")

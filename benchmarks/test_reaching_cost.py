@@ -1,0 +1,96 @@
+"""What reaching costs beside its bare plant, and whether finer steps would tell otherwise."""
+
+import copy
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from bare_plant import SEED, BarePlant, costs_beside, log_motion
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
+from pydrake.systems.framework import DiagramBuilder
+from threadpoolctl import threadpool_limits
+
+from drake_safety import Scenario, load_scenario, run_episodes
+from drake_safety.control.obstacles import add_obstacles, filter_collisions
+from drake_safety.control.robot import add_robot
+from drake_safety.models import load_robot
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.ground import add_ground
+
+SCENARIO = "atlas_reaching"
+NUM_EPISODES, ROUNDS = 6, 3
+FINE_TIME_STEP_S, FINE_CONTROL_PERIOD_S = 0.0005, 0.001
+
+
+@pytest.fixture(scope="module")
+def reaching() -> Scenario:
+    return load_scenario(SCENARIO)
+
+
+def bare_plant(loop: ClosedLoop) -> BarePlant:
+    """The scenario's plant and scene under torques."""
+    scenario = loop.scenario
+    robot = load_robot(scenario.robot)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+    variation = scenario.variation("nominal")
+    instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=False)
+    add_ground(plant, variation.foot_friction or robot.foot_friction)
+    obstacles = add_obstacles(plant, scenario.parameters.obstacles)
+    add_obstacles(plant, scenario.parameters.decorations)
+    plant.SetUseSampledOutputPorts(False)
+    plant.Finalize()
+    filter_collisions(plant, scene_graph, robot, obstacles)
+    return BarePlant(builder, plant, plant.get_actuation_input_port(instance), loop)
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_reaching_beside_its_bare_plant(
+    benchmark: Any, report: Callable[..., None], reaching: Scenario
+) -> None:
+    with threadpool_limits(1):
+        loop = reaching.make_loop()
+        port = loop.plant.get_actuation_input_port(loop.robot_instance)
+        motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
+        loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
+    spans = np.array([motion.duration_s for motion in motions])
+    report(
+        f"simulated second, {SCENARIO}",
+        loop_s.sum() / spans.sum(),
+        "CPU-s",
+        at_most=0.25,
+        peers={
+            "bare plant": plant_s.sum() / spans.sum(),
+            "ratio": loop_s.sum() / plant_s.sum(),
+        },
+        note=f"{1 / reaching.control_period_s:.0f} Hz control, "
+        f"{1e3 * reaching.time_step_s:g} ms plant, {len(motions)} episodes",
+    )
+
+
+def test_labels_beside_those_of_finer_steps(
+    benchmark: Any, report: Callable[..., None], reaching: Scenario, pytestconfig: pytest.Config
+) -> None:
+    """The same starts and targets, under a quicker controller in finer steps of the plant."""
+    num_episodes = pytestconfig.getoption("reference_episodes")
+    fine = copy.deepcopy(reaching)
+    fine.time_step_s, fine.control_period_s = FINE_TIME_STEP_S, FINE_CONTROL_PERIOD_S
+    episodes = run_episodes(reaching, num_episodes, seed=SEED)
+    reference = benchmark.pedantic(
+        run_episodes, args=(fine, num_episodes), kwargs={"seed": SEED}, rounds=1
+    )
+    is_same = np.array([a.is_safe == b.is_safe for a, b in zip(episodes, reference, strict=True)])
+    is_same_cause = [a.cause == b.cause for a, b in zip(episodes, reference, strict=True)]
+    report(
+        f"labels as in finer steps, {SCENARIO}",
+        100 * is_same.mean(),
+        "%",
+        at_least=98.0,
+        peers={"causes %": 100 * float(np.mean(is_same_cause))},
+        note=f"{num_episodes} episodes, {episodes.num_unsafe} unsafe, against "
+        f"{1 / fine.control_period_s:.0f} Hz control, {1e3 * fine.time_step_s:g} ms plant; "
+        f"others: {np.flatnonzero(~is_same).tolist()}",
+    )
