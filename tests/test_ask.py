@@ -30,7 +30,7 @@ def made_up_episodes(loop):
 
     What the assessment sees of them is real; what came of them is not, so that it is known.
     """
-    goals = np.random.default_rng(0).uniform(*loop.target_box, (40, 3))
+    goals = np.random.default_rng(0).uniform(*loop.target_box, (160, 3))
     episodes = []
     columns = zip(goals, *goal_inputs(loop, goals), strict=True)
     for index, (goal, state, preview, features) in enumerate(columns):
@@ -46,7 +46,7 @@ def made_up_episodes(loop):
                 time_s=loop.scenario.step_s * np.arange(len(margins)),
                 state=np.tile(state, shape),
                 true_state=np.tile(state, shape),
-                output=np.tile(goal, shape) + np.linspace(0.0, 0.01 * index, len(margins))[:, None],
+                output=np.tile(goal, shape) + np.linspace(0.0, 0.0025 * index, len(margins))[:, None],
                 desired_output=np.tile(goal, shape),
                 desired_preview=np.tile(preview, shape),
                 features=np.tile(features, shape),
