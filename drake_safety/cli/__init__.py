@@ -35,7 +35,7 @@ def main() -> None:
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(prog_name="drake-safety", standalone_mode=False))
     except (ValueError, OSError) as error:
         console.print("error", error, style="red", highlight=False, soft_wrap=True)
         sys.exit(2)
