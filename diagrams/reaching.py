@@ -400,14 +400,13 @@ class Reaching(ClosedLoop):
     @property
     def mirror_options(self) -> dict[str, str]:
         """The hand on the other side, if the robot has one there."""
-        mirror = Mirror(self.kinematics)
         try:
-            return {"hand": mirror.hand(self.hand)}
-        except ValueError:
+            return {"hand": Mirror(self.kinematics).hand(self.hand)}
+        except ValueError:  # No mirror, or nothing in it.
             return {}
 
     def goal_of(self, episode: Episode) -> np.ndarray:
-        """The target of an episode in the world, (3,) [m]."""
+        """The target of an episode in the world, (3,) [m], as exact as feet are placed."""
         return self._ends_of_plan(episode)[1]
 
     def is_fair(self, episode: Episode) -> bool:

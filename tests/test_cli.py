@@ -19,6 +19,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.evaluation import figure_style
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.balls import Throw
@@ -166,6 +167,7 @@ def evaluate_shuttle(monkeypatch, run, *arguments):
     return call(monkeypatch, "evaluate", file, *options, *arguments)
 
 
+@pytest.mark.slow
 def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, capsys, shuttle_run):
     _, folder = shuttle_run
     arguments = ("--other-hand", 10, "--plane-step", 0.6, "--learning-curve", "40,60")
@@ -189,10 +191,11 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     assert not any(key.startswith(("throws.", "segments.")) for key in report)
 
 
+@pytest.mark.slow
 def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
     arguments = ("--plane-step", 0)
-    # After the first time, even a simulation that always fails is not needed.
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
     first = json.loads((folder / "evaluation.json").read_text())
     hash_ = load_scenario(file).simulation_hash()
@@ -205,6 +208,7 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
     def forbidden(*arguments, **options):
         raise AssertionError("simulated again")
 
+    # Once all are there, even a simulation that always fails is not needed.
     monkeypatch.setattr(rollouts, "run_episode", forbidden)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
     again = json.loads((folder / "evaluation.json").read_text())

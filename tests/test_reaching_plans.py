@@ -1,0 +1,136 @@
+"""What reaching announces of its plans: goals, fair targets, the other hand, failures."""
+
+import numpy as np
+import pytest
+
+from drake_safety import load_scenario, run_episode
+from drake_safety.control.mirror import Mirror
+from drake_safety.diagrams.reaching import FairTargets, TargetSampling
+from drake_safety.learning.segments import Episode
+from legged_robots import edited
+from reaching_loops import EASY, LOOPS, easy_episode, evaluated, goal_of, porter, porting, started
+
+# Feet, and so the frame of a plan, are placed by a search that ends at this error.
+PLACED_M = 1e-4
+IN_A_BOARD = np.array([0.45, 0.15, 0.77])
+
+
+def first_row(loop, context):
+    """An episode that ended as it began: what there is to judge a plan by."""
+    names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
+    rows = {name: evaluated(loop, context, name)[None].copy() for name in (*names, "margins")}
+    return Episode(index=0, time_s=np.zeros(1), is_safe=True, cause="", **rows)
+
+
+def clearance_of(loop, episode):
+    return episode.features[0, loop.feature_names.index("plan_clearance")]
+
+
+@pytest.mark.parametrize("robot", LOOPS)
+@pytest.mark.parametrize("hand", ["left", "right"])
+def test_the_goal_of_an_episode_is_where_its_plan_ends(robot, hand):
+    loop = LOOPS[robot](hand=hand)
+    for seed in range(4):
+        context = started(loop, seed)
+        # The porter's preview ends before its plan does.
+        found = loop.goal_of(first_row(loop, context))
+        np.testing.assert_allclose(found, goal_of(loop, context), atol=PLACED_M)
+
+
+def test_noise_on_what_is_seen_does_not_move_the_goal():
+    for variation in ("noisy", "blurred"):
+        loop = porter(variation)
+        context = started(loop, 3, EASY)
+        np.testing.assert_allclose(loop.goal_of(first_row(loop, context)), EASY, atol=PLACED_M)
+
+
+def test_an_episode_that_ended_early_still_has_its_goal():
+    loop = porter()
+    episode = run_episode(loop, 0, goal=IN_A_BOARD)
+    assert not episode.is_safe
+    np.testing.assert_allclose(loop.goal_of(episode), IN_A_BOARD, atol=PLACED_M)
+
+
+@pytest.mark.parametrize("robot", LOOPS)
+@pytest.mark.parametrize("hand", ["left", "right"])
+def test_fair_is_a_goal_in_the_box_whose_plan_is_clear_of_obstacles(robot, hand):
+    loop = LOOPS[robot](hand=hand)
+    low, high = loop.fair_box
+    verdicts = []
+    for seed in range(60):
+        episode = first_row(loop, started(loop, seed))
+        goal = loop.goal_of(episode)
+        is_inside = bool(np.all((goal >= low) & (goal <= high)))
+        clearance = clearance_of(loop, episode)
+        # The features see the plan at other instants: within millimetres they may disagree.
+        if abs(clearance) > 0.01:
+            assert loop.is_fair(episode) == (is_inside and clearance > 0)
+            verdicts.append(loop.is_fair(episode))
+    assert any(verdicts)
+
+
+@pytest.mark.parametrize("hand", ["left", "right"])
+def test_a_plan_into_an_obstacle_is_not_fair_though_its_goal_is_in_the_box(hand, tmp_path):
+    bounds = {"x_m": [0.15, 0.5], "z_m": [0.5, 0.8]}
+    scenario = load_scenario(porting(tmp_path, parameters={"fair": bounds}))
+    loop = scenario.make_loop(hand=hand)
+    side = [1.0, 1.0 if hand == "left" else -1.0, 1.0]
+    clear, blocked = (first_row(loop, started(loop, 0, goal * side)) for goal in (EASY, IN_A_BOARD))
+    low, high = loop.fair_box
+    assert np.all((loop.goal_of(blocked) >= low) & (loop.goal_of(blocked) <= high))
+    assert loop.is_fair(clear)
+    assert not loop.is_fair(blocked)
+
+
+def test_fair_bounds_are_the_targets_own_unless_they_are_given():
+    target = TargetSampling(x_m=[0.2, 0.5], y_m=[-0.1, 0.4], z_m=[0.3, 0.9])
+    np.testing.assert_array_equal(FairTargets().box(target), target.box)
+    narrowed = FairTargets(x_m=[0.3, 0.4]).box(target)
+    np.testing.assert_array_equal(narrowed, [[0.3, -0.1, 0.3], [0.4, 0.4, 0.9]])
+    for bounds in ([0.4], [0.4, 0.3], [0.1, 0.2, 0.3]):
+        with pytest.raises(ValueError, match=r"fair: x_m must be \[lowest, highest\] or empty"):
+            FairTargets(x_m=bounds)
+
+
+def test_what_is_fair_decides_nothing_that_is_simulated(tmp_path):
+    plain, fair = tmp_path / "plain", tmp_path / "fair"
+    for folder in (plain, fair):
+        folder.mkdir()
+    scenarios = [
+        load_scenario(porting(plain)),
+        load_scenario(porting(fair, parameters={"fair": {"x_m": [0.2, 0.3]}})),
+    ]
+    assert scenarios[0].simulation_hash() == scenarios[1].simulation_hash()
+    boxes = [scenario.make_loop().fair_box for scenario in scenarios]
+    assert not np.array_equal(*boxes)
+
+
+@pytest.mark.parametrize("robot", LOOPS)
+def test_each_hand_names_the_other_as_its_image_and_the_boxes_are_mirrored(robot):
+    left, right = (LOOPS[robot](hand=hand) for hand in ("left", "right"))
+    assert left.mirror_options == {"hand": "right"}
+    assert right.mirror_options == {"hand": "left"}
+    mirror = Mirror(left.kinematics)
+    image = np.sort(mirror.points(left.fair_box), axis=0)
+    np.testing.assert_array_equal(right.fair_box, image)
+
+
+def test_a_robot_without_a_mirror_has_no_other_hand(tmp_path):
+    path = porting(tmp_path)
+    edited(tmp_path / "robot.yaml", mirror={})
+    assert load_scenario(path).make_loop().mirror_options == {}
+
+
+def test_an_easy_reach_has_no_failure_of_its_controller():
+    assert easy_episode().num_controller_failures == 0
+
+
+def test_ticks_without_a_solution_are_counted():
+    loop = porter()
+    context = started(loop, 0, EASY)
+    controller = loop.GetSubsystemByName("whole_body_controller")
+    state = controller.GetMyMutableContextFromRoot(context).get_mutable_discrete_state_vector()
+    values = state.get_value().copy()
+    values[-1] = 3
+    state.SetFromVector(values)
+    assert loop.num_controller_failures(context) == 3
