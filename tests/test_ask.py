@@ -46,7 +46,8 @@ def made_up_episodes(loop):
                 time_s=loop.scenario.step_s * np.arange(len(margins)),
                 state=np.tile(state, shape),
                 true_state=np.tile(state, shape),
-                output=np.tile(goal, shape) + np.linspace(0.0, 0.0025 * index, len(margins))[:, None],
+                output=np.tile(goal, shape)
+                + np.linspace(0.0, 0.0025 * index, len(margins))[:, None],
                 desired_output=np.tile(goal, shape),
                 desired_preview=np.tile(preview, shape),
                 features=np.tile(features, shape),
