@@ -54,7 +54,6 @@ from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
 _MAX_TRIES = 100
-_PUSH_PERIOD_S = 0.02
 
 
 @dataclass(kw_only=True)
@@ -253,7 +252,7 @@ class Reaching(ClosedLoop):
             controller.GetOutputPort("actuation"), plant.get_actuation_input_port(instance)
         )
         self._push_source = builder.AddNamedSystem(
-            "push_source", PushSource(plant, instance, period_s=_PUSH_PERIOD_S)
+            "push_source", PushSource(plant, instance, period_s=scenario.control_period_s)
         )
         builder.Connect(
             self._push_source.get_output_port(), plant.get_applied_spatial_force_input_port()
@@ -417,7 +416,7 @@ class Reaching(ClosedLoop):
         if self.mirror is not None:
             push = replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
         self.set_push(context, push)
-        end_s = push.time_s + push.duration_s + _PUSH_PERIOD_S
+        end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
     def set_push(self, context: Context, push: Push) -> None:

@@ -188,7 +188,10 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
         (["--force"], "--force goes to a target that Γ refuses: pass --target too"),
         (["--target", "blue_box", "--push", "ball"], "no such push"),
         (["--target", "blue_box", "--push", "torso", "--push", "torso"], "takes one push"),
-        (["--target", "blue_box", "--no-recovery"], "no options ['recovery']; it has ['hand']"),
+        (
+            ["--target", "blue_box", "--no-recovery"],
+            "no options ['recovery']; it has ['hand', 'exploring']",
+        ),
     ],
 )
 def test_options_that_a_task_or_a_run_does_not_know_are_refused(call, folder, arguments, message):

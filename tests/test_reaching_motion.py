@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
@@ -11,6 +9,7 @@ from drake_safety.control.kinematic_preview import chain_joints
 from drake_safety.control.whole_body_qp import solve_qp
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
+from drake_safety.simulation.pushes import Push
 from drake_safety.systems import whole_body_controller
 from reaching_loops import (
     EASY,
@@ -127,19 +126,30 @@ def test_an_unsolved_program_shows_in_the_solver_status():
     assert evaluated(loop, context, "solver_status")[0] != 0
 
 
-def test_a_push_may_be_applied_to_any_body():
+def test_a_push_may_be_given_to_any_body():
     loop = porter()
     moved = []
     for force_n in (0.0, 40.0):
         context = loop.CreateDefaultContext()
         loop.reset_standing(context, EASY)
-        push = ExternallyAppliedSpatialForce()
-        push.body_index = loop.plant.GetBodyByName(loop.robot.base).index()
-        push.F_Bq_W = SpatialForce(tau=[0.0, 0.0, 0.0], f=[0.0, force_n, 0.0])
-        loop.GetInputPort("applied_spatial_force").FixValue(context, [push])
+        body = loop.robot.base
+        loop.set_push(context, Push(body=body, force_n=[0.0, force_n, 0.0], time_s=0.0))
         Simulator(loop, context).AdvanceTo(0.1)
         moved.append(positions(loop, context)[5])
     assert moved[1] - moved[0] > 1e-3
+
+
+def test_a_reset_forgets_the_push_of_an_earlier_run():
+    loop = porter()
+    context = loop.CreateDefaultContext()
+    alone = []
+    for is_pushed in (True, False):
+        loop.reset_standing(context, EASY)
+        if is_pushed:
+            loop.set_push(context, Push(body=loop.robot.base, force_n=[0.0, 40.0, 0.0], time_s=0.0))
+        Simulator(loop, context).AdvanceTo(0.1)
+        alone.append(positions(loop, context)[5])
+    assert alone[0] - alone[1] > 1e-3
 
 
 def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):

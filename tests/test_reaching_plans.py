@@ -51,6 +51,57 @@ def test_an_episode_that_ended_early_still_has_its_goal():
     np.testing.assert_allclose(loop.goal_of(episode), IN_A_BOARD, atol=PLACED_M)
 
 
+def exploring(tmp_path, **options):
+    """The porter, half of whose plans make detours and half of whose episodes are pushed."""
+    changes = {
+        "detours": {"share": 0.5, "lowest_m": [-0.05, -0.1, 0.0], "highest_m": [0.0, 0.1, 0.1]},
+        "random_pushes": {"share": 0.5, "time_s": [0.1, 0.3], "force_n": [1.0, 5.0]},
+    }
+    return load_scenario(porting(tmp_path, parameters=changes)).make_loop(**options)
+
+
+@pytest.mark.parametrize("hand", ["left", "right"])
+def test_the_goal_of_a_plan_with_a_detour_is_where_it_ends(hand, tmp_path):
+    loop = exploring(tmp_path, hand=hand)
+    detours = []
+    for seed in range(8):
+        context = started(loop, seed)
+        episode = first_row(loop, context)
+        np.testing.assert_allclose(loop.goal_of(episode), goal_of(loop, context), atol=PLACED_M)
+        path = episode.desired_preview[0].reshape(-1, 3)
+        along = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+        beside = path - path[0] - np.outer((path - path[0]) @ along, along)
+        detours.append(np.linalg.norm(beside, axis=1).max())
+    assert min(detours) < 1e-6
+    assert max(detours) > 0.01
+
+
+def test_what_is_judged_is_the_straight_plan_undisturbed(tmp_path):
+    training, judging = exploring(tmp_path), exploring(tmp_path, exploring=False)
+    assert dict(judging.judging_options) == {"exploring": False}
+    first_steps = {True: set(), False: set()}
+    for seed in range(8):
+        for loop in (training, judging):
+            context = loop.CreateDefaultContext()
+            first_step = loop.reset(context, np.random.default_rng(seed))
+            first_steps[loop is judging].add(first_step)
+        a, b = (first_row(loop, started(loop, seed)) for loop in (training, judging))
+        np.testing.assert_array_equal(a.true_state, b.true_state)
+        np.testing.assert_allclose(training.goal_of(a), judging.goal_of(b), atol=1e-9)
+    assert first_steps[True] == {0}
+    assert len(first_steps[False]) > 1
+    # A goal of one's own is reached straight, too.
+    assert training.reset(training.CreateDefaultContext(), np.random.default_rng(0), EASY) == 0
+
+
+def test_a_push_is_over_when_what_is_learned_from_begins(tmp_path):
+    loop = exploring(tmp_path)
+    episodes = [run_episode(loop, i) for i in range(6)]
+    pushed = [e for e in episodes if e.first_step > 0]
+    assert 0 < len(pushed) < len(episodes)
+    assert all(e.time_s[e.first_step] >= 0.1 + 0.2 for e in pushed if e.is_safe)
+
+
 @pytest.mark.parametrize("robot", LOOPS)
 @pytest.mark.parametrize("hand", ["left", "right"])
 def test_fair_is_a_goal_in_the_box_whose_plan_is_clear_of_obstacles(robot, hand):

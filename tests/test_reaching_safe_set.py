@@ -202,6 +202,45 @@ def test_features_of_the_state_are_what_they_are_called(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
+def test_features_of_motion_are_velocities_and_where_they_lead(name):
+    of = safe_set(name)
+    kinematics = of.kinematics
+    q = leaning(kinematics, [0.01, -0.02, -0.05])
+    hand = of.model.reaching_position(q)
+    preview = in_stance(kinematics, q, straight(hand, hand))
+    v = 0.2 * np.random.default_rng(1).normal(size=kinematics.num_velocities)
+    found = dict(zip(of.feature_names, of.features(q, v, preview), strict=True))
+
+    def moved(duration_s):
+        kinematics.set_positions(q)
+        return q + duration_s * kinematics.plant.MapVelocityToQDot(kinematics.context, v)
+
+    tiny_s = 1e-6
+    before, after = moved(-tiny_s), moved(tiny_s)
+    R_SW = in_stance(kinematics, q, np.eye(3)) - in_stance(kinematics, q, np.zeros(3))
+    for point, of_body in (
+        ("center_of_mass", kinematics.center_of_mass),
+        ("hand", of.model.reaching_position),
+    ):
+        rate = (of_body(after) - of_body(before)) / (2 * tiny_s) @ R_SW
+        seen = [found[f"{point}_velocity_{axis}"] for axis in "xyz"]
+        np.testing.assert_allclose(seen, rate, atol=1e-6)
+    pendulum_s = np.sqrt(found["center_of_mass_height"] / 9.81)
+    for angle, axis, sign in ((0, "x", 1), (90, "y", 1), (180, "x", -1), (270, "y", -1)):
+        lead = (
+            found[f"center_of_mass_margin_{angle}deg"] - found[f"capture_point_margin_{angle}deg"]
+        )
+        speed = sign * found[f"center_of_mass_velocity_{axis}"]
+        assert lead == pytest.approx(pendulum_s * speed, abs=1e-9)
+    soon = q.copy()
+    soon[7:] += 0.1 * v[6:]
+    assert found["soon_joint_limits"] == pytest.approx(margins(of, soon)["joint_limits"])
+    at_rest = features(of, q, preview)
+    assert at_rest["soon_joint_limits"] == at_rest["now_joint_limits"]
+    assert at_rest["capture_point_support"] != found["capture_point_support"]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
 def test_the_goal_is_seen_from_the_shoulder(name):
     of = safe_set(name)
     kinematics = of.kinematics
@@ -290,7 +329,7 @@ def test_mirrored_features_of_the_mirrored_robot_are_those_of_the_other_hand(nam
     for _ in range(5):
         q = leaning(kinematics, rng.uniform(-0.03, 0.0, 3), rng.uniform(-0.05, 0.05, 3))
         q[7:] += rng.uniform(-0.05, 0.05, kinematics.num_joints)
-        v = rng.normal(size=kinematics.num_velocities)
+        v = 0.3 * rng.normal(size=kinematics.num_velocities)
         hand = left.model.reaching_position(q)
         path = straight(hand, hand + rng.uniform(0.0, 0.3, 3))
         preview = in_stance(kinematics, q, path)

@@ -57,6 +57,23 @@ def test_the_peak_speed_of_a_minimum_jerk_motion_is_fifteen_eighths_of_the_mean(
     assert plan.MakeDerivative().value(1.0)[0, 0] == pytest.approx(15 / 8 / 2.0)
 
 
+def test_a_detour_moves_the_middle_and_neither_end():
+    start, goal, detour = np.array([[0.0, 1.0], [2.0, 1.0], [-0.5, 0.25]])
+    plan = interpolate(start, goal, 2.0, 1.0, detour=detour)
+    for time, expected in ((1.0, start), (2.0, (start + goal) / 2 + detour), (3.0, goal)):
+        np.testing.assert_allclose(plan.value(time).ravel(), expected, atol=1e-12)
+    rate = plan.MakeDerivative()
+    for time in (1.0, 3.0):
+        np.testing.assert_allclose(rate.value(time).ravel(), np.zeros(2), atol=1e-12)
+
+
+def test_no_detour_is_a_detour_of_nothing():
+    ends = np.array([0.0, 1.0]), np.array([2.0, 1.5])
+    straight, same = interpolate(*ends, 2.0), interpolate(*ends, 2.0, detour=np.zeros(2))
+    for time in np.linspace(0, 2, 9):
+        np.testing.assert_allclose(straight.value(time), same.value(time), atol=1e-12)
+
+
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, math.nan])
 def test_an_interpolation_takes_time(duration_s):
     with pytest.raises(ValueError, match="duration_s must be positive"):

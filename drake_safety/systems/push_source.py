@@ -23,8 +23,8 @@ class PushSource(LeafSystem):
         output_ports:
         - applied_spatial_force
 
-    The port fits the plant's ``applied_spatial_force`` input. A push begins and ends at the first
-    multiple of ``period_s`` that is not before its time.
+    The port fits the plant's ``applied_spatial_force`` input. A push begins and ends with the
+    plant's first step after the first multiple of ``period_s`` that is not before its time.
 
     Args:
         plant: The finalized plant.
@@ -41,7 +41,6 @@ class PushSource(LeafSystem):
         }
         self._parameter = self.DeclareNumericParameter(BasicVector(np.zeros(_SIZE)))
         state = self.DeclareDiscreteState(1)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
         self.DeclareAbstractOutputPort(
             "applied_spatial_force",
