@@ -69,10 +69,10 @@ class RandomPushes:
         if rng.random() >= self.share:
             return None
         direction = rng.uniform(-np.pi, np.pi)
-        strength = rng.uniform(*self.force_n)
+        strength = rng.uniform(self.force_n[0], self.force_n[1])
         return Push(
             body=self.body or body,
             force_n=[strength * np.cos(direction), strength * np.sin(direction), 0.0],
-            time_s=rng.uniform(*self.time_s),
+            time_s=rng.uniform(self.time_s[0], self.time_s[1]),
             duration_s=self.duration_s,
         )
