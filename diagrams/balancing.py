@@ -11,7 +11,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot import ObservationNoise, add_robot, apply_mass_scale
+from drake_safety.control.robot import ObservationNoise, add_robot, apply_masses
 from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
@@ -308,7 +308,7 @@ class Balancing(ClosedLoop):
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         joints = np.clip(start.joints, *kinematics.position_limits.T)
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
+        apply_masses(self.plant, plant_context, self.robot, self.variation)
         q = kinematics.positions_at(start.X_WB, joints)
         self.plant.SetPositionsAndVelocities(
             plant_context, self.robot_instance, np.concatenate([q, start.v])

@@ -25,7 +25,7 @@ from drake_safety.control.robot import (
     ObservationNoise,
     actuation_matrix,
     add_robot,
-    apply_mass_scale,
+    apply_masses,
     model_file,
 )
 from drake_safety.learning.assessment import SafetyAssessment
@@ -518,7 +518,7 @@ class Reaching(ClosedLoop):
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
+        apply_masses(self.plant, plant_context, self.robot, self.variation)
         v = np.zeros(kinematics.num_velocities)
         self.plant.SetPositionsAndVelocities(
             plant_context, self.robot_instance, np.concatenate([q, v])
