@@ -130,7 +130,9 @@ class SafetyAssessment:
             )
         self.adaptation_: Adaptation | None = None
         self.shift_ = np.zeros((self.embedding_.num_members, self.grid_.num_cells))
-        self.beliefs_ = self.prior_beliefs()
+        self.beliefs_ = adaptation.prior_beliefs(
+            self._training, self.grid_, parameters, self.num_causes
+        )
         if progress is not None:
             progress("beliefs", 1.0)
         return self
