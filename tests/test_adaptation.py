@@ -305,7 +305,7 @@ def test_the_papers_update_can_be_asked_for_in_the_sharpened_mode(sharpened):
 
 def test_a_twin_is_missing_or_begins_elsewhere():
     episodes = make_episodes(3, noise=0.002)
-    with pytest.raises(ValueError, match="episode 2 .* has no nominal twin"):
+    with pytest.raises(ValueError, match=r"episode 2 .* has no nominal twin"):
         feedback_sets(episodes, episodes[:2])
     shifted = [
         dataclasses.replace(e, true_state=e.true_state + 0.1 * (e.index == 1)) for e in episodes

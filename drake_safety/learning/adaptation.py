@@ -256,7 +256,8 @@ def shifted_beliefs(
         is_inside = cells >= 0
         b = member_shift[cells[is_inside]]
         logit, score = training.logit[is_inside], training.score[is_inside]
-        score = np.clip(score + sigmoid(logit + b) - base[is_inside], 0.0, 1.0)
+        # Without a shift the difference is zero to the bit, and so are the scores the same.
+        score = np.clip(score + (sigmoid(logit + b) - base[is_inside]), 0.0, 1.0)
         cause = training.cause[is_inside]
         # What has become possible has the cause that is nearest.
         cause = np.where(cause >= 0, cause, training.nearest[is_inside])
