@@ -9,15 +9,16 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContact
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance
+from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot import ObservationNoise, add_robot, apply_mass_scale
+from drake_safety.control.robot import ObservationNoise, add_robot, apply_masses
 from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.balls import Ball, Throw, add_ball
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
@@ -301,33 +302,59 @@ class Balancing(ClosedLoop):
         )
         self._set(context, rng, start)
 
+    def reset_to(
+        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
+    ) -> None:
+        """Begins with a given state and plan; see :meth:`ClosedLoop.reset_to`."""
+        start.check(self.kinematics)
+        self._enter(context, start)
+        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        if rng is None:
+            self._observers.silence(context)
+
+    def start_of(self, context: Context) -> EpisodeStart:
+        """What an episode that goes on from here begins with."""
+        state = self.GetOutputPort("plant_state").Eval(context)
+        q, v = np.split(state, [self.kinematics.num_positions])
+        controller_context = self._controller.GetMyContextFromRoot(context)
+        return EpisodeStart(
+            q=q,
+            v=v,
+            plan=self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context)),
+            foot_positions=self._controller.foot_positions(controller_context).copy(),
+        )
+
     def _set(self, context: Context, rng: np.random.Generator, start: Start) -> None:
-        kinematics = self.kinematics
+        joints = np.clip(start.joints, *self.kinematics.position_limits.T)
+        q = self.kinematics.positions_at(start.X_WB, joints)
+        self._enter(
+            context, EpisodeStart(q=q, v=start.v, plan=start.plan, foot_positions=start.p_WC)
+        )
+        self._observers.reseed(context, rng)
+
+    def _enter(self, context: Context, start: EpisodeStart) -> None:
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
-        joints = np.clip(start.joints, *kinematics.position_limits.T)
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
-        q = kinematics.positions_at(start.X_WB, joints)
+        apply_masses(self.plant, plant_context, self.robot, self.variation)
         self.plant.SetPositionsAndVelocities(
-            plant_context, self.robot_instance, np.concatenate([q, start.v])
+            plant_context, self.robot_instance, np.concatenate([start.q, start.v])
         )
         if self.ball is not None:
             self.ball.park(plant_context)
-        stance_pose = fit_stance(start.p_WC, kinematics.nominal_contacts)
+        p_WC, stance_pose = start.feet(self.kinematics), start.stance_pose(self.kinematics)
         self._planner.set_plan(
             self._planner.GetMyMutableContextFromRoot(context), start.plan, stance_pose
         )
         self._controller.set_foot_positions(
-            self._controller.GetMyMutableContextFromRoot(context), start.p_WC
+            self._controller.GetMyMutableContextFromRoot(context), p_WC
         )
         if self._recovery_switch is not None:
             step_planner = self._recovery_switch.step_planner
             step_planner.set_stance(
-                step_planner.GetMyMutableContextFromRoot(context), start.p_WC, stance_pose
+                step_planner.GetMyMutableContextFromRoot(context), p_WC, stance_pose
             )
-        self._observers.reseed(context, rng)
 
     @property
     def trigger_port(self) -> str:

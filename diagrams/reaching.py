@@ -27,13 +27,14 @@ from drake_safety.control.robot import (
     ObservationNoise,
     actuation_matrix,
     add_robot,
-    apply_mass_scale,
+    apply_masses,
     model_file,
 )
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.pushes import Push, RandomPushes
@@ -376,6 +377,11 @@ class Reaching(ClosedLoop):
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
 
+    @property
+    def monitor_period_s(self) -> float:
+        """Time between two looks at the margins [s]."""
+        return self.scenario.parameters.monitor_period_s
+
     def num_controller_failures(self, context: Context) -> int:
         """Ticks whose quadratic program had no solution."""
         return self._controller.num_failures(self._controller.GetMyContextFromRoot(context))
@@ -454,6 +460,23 @@ class Reaching(ClosedLoop):
         self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
         self._observers.silence(context)
 
+    def reset_to(
+        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
+    ) -> None:
+        """Begins with a given state and plan; see :meth:`ClosedLoop.reset_to`."""
+        start.check(self.kinematics)
+        self._enter(context, start)
+        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        if rng is None:
+            self._observers.silence(context)
+
+    def start_of(self, context: Context) -> EpisodeStart:
+        """What an episode that goes on from here begins with."""
+        state = self.GetOutputPort("plant_state").Eval(context)
+        q, v = np.split(state, [self.kinematics.num_positions])
+        plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
+        return EpisodeStart(q=q, v=v, plan=plan)
+
     def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
         sampling = self.scenario.parameters.start
         kinematics = self.kinematics
@@ -499,32 +522,38 @@ class Reaching(ClosedLoop):
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
             raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
-        kinematics = self.kinematics
+        stance_pose = fit_stance(
+            self.kinematics.contact_positions(q), self.kinematics.nominal_contacts
+        )
+        x, y, yaw = stance_pose
+        X_SW = RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0]).inverse()
+        plan = interpolate(
+            X_SW @ self._controller.model.reaching_position(q),
+            X_SW @ goal,
+            self.scenario.parameters.plan_duration_s,
+            detour=None if detour is None else X_SW.rotation() @ detour,
+        )
+        v = np.zeros(self.kinematics.num_velocities)
+        self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
+
+    def _enter(self, context: Context, start: EpisodeStart) -> None:
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_mass_scale(self.plant, plant_context, self.robot, self.variation.mass_scale)
-        v = np.zeros(kinematics.num_velocities)
+        apply_masses(self.plant, plant_context, self.robot, self.variation)
         self.plant.SetPositionsAndVelocities(
-            plant_context, self.robot_instance, np.concatenate([q, v])
+            plant_context, self.robot_instance, np.concatenate([start.q, start.v])
         )
-        model = self._controller.model
         self._controller.set_reference(
-            self._controller.GetMyMutableContextFromRoot(context), model.reference(q)
-        )
-        stance_pose = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
-        x, y, yaw = stance_pose
-        X_SW = RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0]).inverse()
-        plan = interpolate(
-            X_SW @ model.reaching_position(q),
-            X_SW @ goal,
-            self.scenario.parameters.plan_duration_s,
-            detour=None if detour is None else X_SW.rotation() @ detour,
+            self._controller.GetMyMutableContextFromRoot(context),
+            self._controller.model.reference(start.q),
         )
         self._planner.set_plan(
-            self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose
+            self._planner.GetMyMutableContextFromRoot(context),
+            start.plan,
+            start.stance_pose(self.kinematics),
         )
 
 

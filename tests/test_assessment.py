@@ -72,7 +72,13 @@ def test_one_input_alone_is_assessed_as_among_many(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
     for row in range(0, len(held_out), 97):
         one = assessment.predict_one(*inputs(held_out, row))
-        for name in ("safety_probability", "normalized", "belief", "cause_probability"):
+        for name in (
+            "safety_probability",
+            "normalized",
+            "belief",
+            "cause_probability",
+            "calibrated",
+        ):
             np.testing.assert_allclose(getattr(one, name), getattr(result, name)[row], atol=2e-4)
         np.testing.assert_allclose(one.embedding, result.embedding[row], atol=2e-3)
         np.testing.assert_allclose(one.predicted_margins, result.predicted_margins[row], atol=1e-4)
@@ -178,9 +184,9 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
         SafetyAssessment.load(tmp_path / "foreign")
     metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
     save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match="schema version 0, this version reads 1"):
+    with pytest.raises(ValueError, match="schema version 0, this version reads 2"):
         SafetyAssessment.load(tmp_path / "old")
-    metadata["schema_version"] = "1"
+    metadata["schema_version"] = "2"
     save_file(load_file(path), tmp_path / "hollow", metadata)
     with pytest.raises(ValueError, match="damaged safety assessment"):
         SafetyAssessment.load(tmp_path / "hollow")

@@ -39,7 +39,7 @@ def call(monkeypatch, *arguments):
 
 def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
-    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate"]
+    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate", "adapt"]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")
 
@@ -60,6 +60,7 @@ def test_a_table_of_scenarios_is_printed(monkeypatch, capsys):
         ),
         (["run", "laikago_balancing", "--assessment", "x"], "error x holds no 'sharpened'"),
         (["evaluate", "laikago_balancing", "--assessment", "x"], "error x holds no 'sharpened'"),
+        (["adapt", "laikago_balancing", "--assessment", "x"], "error x holds no 'sharpened'"),
         (
             ["ask", "laikago_balancing", "--assessment", "x", "--target", "1", "-2", "3"],
             "error x holds no 'sharpened'",

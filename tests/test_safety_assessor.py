@@ -26,17 +26,21 @@ class AssessmentDouble:
             horizon=2,
         )
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
+        self.shift_ = np.zeros((1, 6))
+        self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
         self.asked = []
 
-    def predict_row(self, state, desired_preview, features, beliefs):
+    def predict_row(self, state, desired_preview, features, beliefs, shift):
         self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
         if not np.isfinite(state).all():
             safe, belief = 0.0, [0.0, 0.0, 1.0]
         else:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
-        return np.array([safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan])
+        return np.array(
+            [safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan, safe + shift[0, 0]]
+        )
 
 
 def running(assessment=None, features=FEATURES):
@@ -65,6 +69,7 @@ def test_its_ports_have_the_sizes_the_assessment_was_learned_with():
         "embedding": 2,
         "cause_probability": 2,
         "predicted_margins": 2,
+        "calibrated_safety_probability": 1,
     }
     assert {n: assessor.GetInputPort(n).size() for n in inputs} == inputs
     assert {n: assessor.GetOutputPort(n).size() for n in outputs} == outputs
@@ -86,6 +91,7 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
         "embedding": [3.0, -4.0],
         "cause_probability": [0.2, 0.3],
         "predicted_margins": [0.01, np.nan],
+        "calibrated_safety_probability": [0.25],
     }
     for name, numbers in expected.items():
         np.testing.assert_allclose(value(assessor, context, name), numbers)
@@ -144,6 +150,29 @@ def test_new_beliefs_change_the_verdict_of_one_context_only():
     assert value(assessor, other_context, "safety_probability")[0] == 0.25
     np.testing.assert_array_equal(assessor.get_beliefs(context), 2 * assessment.beliefs_)
     np.testing.assert_array_equal(assessor.get_beliefs(other_context), assessment.beliefs_)
+
+
+def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
+    assessment, assessor, simulator, context = running()
+    simulator.AdvanceTo(0.01)
+    adapted = AssessmentDouble()
+    adapted.embedding_ = assessment.embedding_
+    adapted.beliefs_, adapted.shift_ = 2 * assessment.beliefs_, np.full((1, 6), 0.125)
+    assessor.adopt(context, adapted)
+    assert value(assessor, context, "safety_probability")[0] == 0.25
+    simulator.AdvanceTo(PERIOD_S + 0.001)
+    assert value(assessor, context, "safety_probability")[0] == 0.5
+    assert value(assessor, context, "calibrated_safety_probability")[0] == 0.625
+    np.testing.assert_array_equal(assessor.get_shift(context), adapted.shift_)
+    assert np.all(assessor.get_shift(assessor.CreateDefaultContext()) == 0.0)
+
+
+def test_beliefs_over_other_maps_and_shifts_of_another_shape_are_refused():
+    _, assessor, _, context = running()
+    with pytest.raises(ValueError, match="has other maps"):
+        assessor.adopt(context, AssessmentDouble())
+    with pytest.raises(ValueError, match=r"must have shape \(1, 6\); got \(6,\)"):
+        assessor.set_shift(context, np.zeros(6))
 
 
 def test_beliefs_of_another_shape_are_refused_with_both_named():

@@ -35,6 +35,27 @@ def fresh_episodes_folder(
     return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
 
 
+def feedback_folder(folder: Path, scenario_hash: str, seed: int) -> Path:
+    """Where ``adapt`` keeps pairs of actual episodes and their twins, a folder a plant.
+
+    Args:
+        folder: The folder of the training.
+        scenario_hash: Of the actual plant's simulation: another simulation is another set.
+        seed: Of the set.
+    """
+    return folder / "feedback" / f"{scenario_hash[:12]}-{seed}"
+
+
+def adapted_folder(folder: Path, variation: str) -> Path:
+    """Where ``adapt`` writes the adapted assessments; other commands take it for a training's.
+
+    Args:
+        folder: The folder of the training.
+        variation: What they are adapted to.
+    """
+    return folder / f"adapted-{variation}"
+
+
 def assessment_file(folder: Path, mode: str) -> Path:
     """Where ``train`` keeps the assessment of a mode."""
     return folder / f"{mode}.safetensors"

@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dposv
 from drake_safety.control.robot import (
     PlantVariation,
     add_robot,
-    apply_mass_scale,
+    apply_masses,
     posture_positions,
 )
 from drake_safety.control.robot_model import ReachingFrame, RobotModel
@@ -57,8 +57,8 @@ class RobotKinematics:
             )
         self.context = self.plant.CreateDefaultContext()
         self._last_contacts: tuple[bytes, np.ndarray] = (b"", np.empty((0, 3)))
-        if variation is not None and variation.mass_scale != 1.0:
-            apply_mass_scale(self.plant, self.context, robot, variation.mass_scale)
+        if variation is not None:
+            apply_masses(self.plant, self.context, robot, variation)
         self.num_positions = self.plant.num_positions()
         self.num_velocities = self.plant.num_velocities()
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES

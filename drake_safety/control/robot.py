@@ -37,6 +37,23 @@ class ObservationNoise:
 
 
 @dataclass(kw_only=True)
+class Payload:
+    """A small mass fastened to a body of the robot."""
+
+    mass_kg: float = 1.0
+    position_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Its centre in the body's frame, (3,)."""
+    body: str = ""
+    """The body that carries it; the robot's base by default."""
+
+    def __post_init__(self) -> None:
+        if not self.mass_kg > 0:
+            raise ValueError(f"payload: mass_kg must be positive; got {self.mass_kg}")
+        if len(self.position_m) != 3 or not np.isfinite(self.position_m).all():
+            raise ValueError(f"payload: position_m is three numbers [m]; got {self.position_m}")
+
+
+@dataclass(kw_only=True)
 class PlantVariation:
     """How one plant differs from the published robot: a reality gap, as data."""
 
@@ -52,6 +69,8 @@ class PlantVariation:
     """Noise on what the controllers and the assessor measure."""
     input_noise: ObservationNoise = field(default_factory=ObservationNoise)
     """Noise on the assessor's inputs alone; the closed loop's motion never sees it."""
+    payload: Payload | None = None
+    """What the robot carries and its controllers know nothing of."""
 
     def __post_init__(self) -> None:
         for name in ("mass_scale", "foot_friction"):
@@ -65,6 +84,7 @@ class PlantVariation:
                 )
 
 
+_PAYLOAD_RADIUS_M = 0.05
 _FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
@@ -147,7 +167,7 @@ def add_robot(
 ) -> ModelInstanceIndex:
     """Adds a robot to a plant that is not finalised: model, servos, friction.
 
-    The mass of the variation is a parameter of the Context: see :func:`apply_mass_scale`.
+    The variation's masses are parameters of the Context: see :func:`apply_masses`.
     Dry joint friction is a second actuator on the joint that holds velocity zero with at most
     the friction torque, solved implicitly with the contact.
 
@@ -296,3 +316,35 @@ def apply_mass_scale(
                 scale * M_BBo_B.get_mass(), M_BBo_B.get_com(), M_BBo_B.get_unit_inertia()
             )
             body.SetSpatialInertiaInBodyFrame(context, scaled)
+
+
+def apply_masses(
+    plant: MultibodyPlant, context: Context, robot: RobotModel, variation: PlantVariation
+) -> None:
+    """Gives ``robot`` the masses of a variation in a plant's Context: its scale, its payload.
+
+    Args:
+        plant: The finalised plant.
+        context: The plant's Context, whose parameters change.
+        robot: The robot.
+        variation: What differs from the published robot.
+
+    Raises:
+        ValueError: The robot has no such body for the payload.
+    """
+    apply_mass_scale(plant, context, robot, variation.mass_scale)
+    payload = variation.payload
+    if payload is None:
+        return
+    instance = plant.GetModelInstanceByName(robot.name)
+    name = payload.body or robot.base
+    bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
+    _require(name in bodies, robot, "body", name, bodies)
+    body = plant.GetBodyByName(name, instance)
+    p_PcmBo_B = -np.array(payload.position_m)
+    M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, _PAYLOAD_RADIUS_M).Shift(
+        p_PcmBo_B
+    )
+    M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)
+    M_BBo_B += M_PBo_B
+    body.SetSpatialInertiaInBodyFrame(context, M_BBo_B)

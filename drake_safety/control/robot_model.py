@@ -245,6 +245,11 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
 
 def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
     """What a schema of nested dataclasses does not know, with what it knows there."""
+    optional = get_args(schema)
+    if len(optional) == 2 and optional[1] is type(None):
+        if raw is None:
+            return
+        schema = optional[0]
     if is_dataclass(schema):
         hints = get_type_hints(schema)
         known = [entry.name for entry in fields(schema)]

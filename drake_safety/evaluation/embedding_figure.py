@@ -90,12 +90,12 @@ def _draw_segments(
     points = assessment.predict(
         segments.state, segments.desired_preview, segments.features
     ).embedding
-    _draw_grid(axes, assessment.grid_)
+    draw_grid(axes, assessment.grid_)
     dots = axes.scatter(
         points[:, 0],
         points[:, 1],
         c=segments.score,
-        cmap=_safety_colours().reversed(),
+        cmap=safety_colours().reversed(),
         vmin=0.0,
         vmax=1.0,
         s=5.0,
@@ -105,7 +105,7 @@ def _draw_segments(
     )
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
-    bar = _add_colour_bar(fig, axes, dots, "unsafety score λ")
+    bar = add_colour_bar(fig, axes, dots, "unsafety score λ")
     if bar.solids is not None:
         bar.solids.set_alpha(1.0)
 
@@ -126,10 +126,10 @@ def _draw_safety(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    shade = ScalarMappable(Normalize(0.0, max(most, cells[:, SAFE].max())), _safety_colours())
+    shade = ScalarMappable(Normalize(0.0, max(most, cells[:, SAFE].max())), safety_colours())
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     colours = shade.to_rgba(cells[:, SAFE])
-    _draw_cells(axes, grid, colours, is_empty)
+    draw_cells(axes, grid, colours, is_empty)
     brightness = colours[:, :3] @ [0.299, 0.587, 0.114]
     for (x, y), number, light, empty in zip(
         grid.centres, count, brightness > 0.6, is_empty, strict=True
@@ -141,7 +141,7 @@ def _draw_safety(
             )
     axes.set_title("Belief of each cell: safe")
     axes.set_xlabel("numbers: segments learned from; hatched: EMPTY")
-    _add_colour_bar(fig, axes, shade, "belief mass of safe")
+    add_colour_bar(fig, axes, shade, "belief mass of safe")
 
 
 def _draw_causes(
@@ -159,7 +159,7 @@ def _draw_causes(
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
     colours = np.column_stack([1.0 - depth * (1.0 - palette[cause]), np.ones(len(cells))])
     colours[:, :3] *= 0.97
-    _draw_cells(axes, grid, colours, is_empty)
+    draw_cells(axes, grid, colours, is_empty)
     axes.set_title("Most likely cause")
     axes.legend(
         handles=[Patch(color=c, label=spoken(n)) for c, n in zip(palette, names, strict=True)],
@@ -177,18 +177,19 @@ def _draw_uncertainty(fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray) ->
 
     ramp = LinearSegmentedColormap.from_list("unknown", ["#fbfbfc", "#b3a5c9", "#3f2a63"])
     shade = ScalarMappable(Normalize(0.0, 1.0), ramp)
-    _draw_cells(axes, grid, shade.to_rgba(cells[:, UNCERTAINTY]), cells[:, UNCERTAINTY] >= 1.0)
+    draw_cells(axes, grid, shade.to_rgba(cells[:, UNCERTAINTY]), cells[:, UNCERTAINTY] >= 1.0)
     axes.set_title("Belief of each cell: unknown")
-    _add_colour_bar(fig, axes, shade, "uncertainty μ")
+    add_colour_bar(fig, axes, shade, "uncertainty μ")
 
 
-def _draw_grid(axes: Axes, grid: Grid) -> None:
+def draw_grid(axes: Axes, grid: Grid) -> None:
+    """The lines between the cells."""
     edges = np.linspace(-grid.half_width, grid.half_width, grid.resolution + 1)
     axes.vlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
     axes.hlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
 
 
-def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
+def draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
     """Squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
@@ -208,7 +209,7 @@ def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarra
     axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
 
 
-def _safety_colours() -> Colormap:
+def safety_colours() -> Colormap:
     """From unsafe (0) over a pale middle to safe (1)."""
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -216,7 +217,8 @@ def _safety_colours() -> Colormap:
     return LinearSegmentedColormap.from_list("safety", stops)
 
 
-def _add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:
+def add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:
+    """A colour bar beside a panel."""
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
     bar.outline.set_visible(False)
     return bar

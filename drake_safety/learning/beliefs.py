@@ -143,3 +143,35 @@ def fuse_cells(
             summed = np.bincount(cells, weights=weight * beliefs[:, column], minlength=num_cells)
         fused[is_filled, column] = (summed / divisor)[is_filled]
     return fused
+
+
+def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarray) -> np.ndarray:
+    """G: the average of the certain beliefs in every grid cell, with an uncertainty of its own.
+
+    Args:
+        beliefs: Beliefs, mu = 0, (N, 3 + n_c).
+        cells: Cell of each belief, -1 for outside, (N,).
+        uncertainty: mu of each cell, (V,).
+
+    Returns:
+        Beliefs (V, 3 + n_c); empty where there is none to average.
+
+    Raises:
+        ValueError: `cells` has another length than `beliefs`.
+    """
+    if cells.shape != beliefs.shape[:1]:
+        raise ValueError(
+            f"average_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
+        )
+    num_cells, num_columns = len(uncertainty), beliefs.shape[1]
+    is_inside = cells >= 0
+    beliefs, cells = beliefs[is_inside], cells[is_inside]
+    count = np.bincount(cells, minlength=num_cells)
+    averaged = empty(num_cells, num_columns - 3)
+    is_filled = count > 0
+    known = (1.0 - uncertainty[is_filled]) / count[is_filled]
+    for column in range(num_columns):
+        summed = np.bincount(cells, weights=beliefs[:, column], minlength=num_cells)
+        averaged[is_filled, column] = known * summed[is_filled]
+    averaged[is_filled, UNCERTAINTY] = uncertainty[is_filled]
+    return averaged

@@ -157,6 +157,17 @@ class Embedding:
             for width, w in zip(widths, following, strict=True)
         ]
 
+    @property
+    def has_heads(self) -> bool:
+        """Whether the maps predict safety or margins besides y."""
+        return self.has_safety_head or self.num_margins > 0
+
+    def is_same(self, other: Embedding) -> bool:
+        """Whether the maps are the same to the bit."""
+        return self.weights.keys() == other.weights.keys() and all(
+            np.array_equal(w, other.weights[name]) for name, w in self.weights.items()
+        )
+
     def scaled(self, factors: np.ndarray) -> Embedding:
         """The same maps with y multiplied by a factor each, (K,); their safety heads follow."""
         weights = {name: w.copy() for name, w in self.weights.items()}
@@ -226,6 +237,18 @@ class Embedding:
         for zero, weight in self._following:
             z = self._product(np.maximum(z, zero, out=z), weight)
         return z.reshape(self.num_members, -1)
+
+    def unsafe_logit_one(self, points: np.ndarray) -> list[float]:
+        """Logit of every member's safety head at its own point of one input.
+
+        Args:
+            points: y by every member, (K, 2).
+        """
+        hidden = np.matmul(points[:, None, :], self.weights["safety.0.weight"])
+        hidden += self.weights["safety.0.bias"][:, None, :]
+        np.maximum(hidden, 0.0, out=hidden)
+        logit = np.matmul(hidden, self.weights["safety.1.weight"])[:, 0, 0]
+        return (logit + self.weights["safety.1.bias"][:, 0]).tolist()
 
     def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
         w = self.weights

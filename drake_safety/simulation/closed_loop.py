@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episode
     from drake_safety.simulation.balls import Throw
+    from drake_safety.simulation.episode_start import EpisodeStart
     from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
 
@@ -182,6 +183,11 @@ class ClosedLoop(Diagram):
         goal, box = self.goal_of(episode), self.fair_box
         return box is None or bool(np.all((goal >= box[0]) & (goal <= box[1])))
 
+    @property
+    def monitor_period_s(self) -> float:
+        """Time between two looks at the safe set's margins [s]."""
+        return self.scenario.control_period_s
+
     def num_controller_failures(self, context: Context) -> int:
         """How often a controller had no command of its own since the episode began.
 
@@ -213,6 +219,29 @@ class ClosedLoop(Diagram):
             with a push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
+
+    def reset_to(
+        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
+    ) -> None:
+        """Begins with a given plant state and plan; tasks with a robot override this.
+
+        Args:
+            context: The diagram's Context; what an earlier episode left is overwritten.
+            rng: Source of the noise that follows; None takes the noise out of this instant.
+            start: Where and how it begins.
+
+        Raises:
+            ValueError: The start does not fit the robot.
+        """
+        raise ValueError(f"task '{type(self).__name__}' cannot begin with a given start")
+
+    def start_of(self, context: Context) -> EpisodeStart:
+        """What an episode that goes on from here begins with; see :meth:`reset_to`.
+
+        Args:
+            context: The diagram's Context.
+        """
+        raise ValueError(f"task '{type(self).__name__}' cannot begin with a given start")
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None

@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context, EventStatus
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
 from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
+from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
 
 _LOGGER = logging.getLogger("drake_safety")
@@ -100,6 +101,7 @@ def run_episode(
     seed: int = 0,
     goal: np.ndarray | None = None,
     is_standing: bool = False,
+    start: EpisodeStart | None = None,
 ) -> Episode:
     """Simulates one episode: until it leaves the safe set, or its time is over.
 
@@ -111,14 +113,18 @@ def run_episode(
             ``reset`` takes one.
         is_standing: Whether it begins in the robot's own posture instead of a random one; takes a
             goal.
+        start: What it begins with, in place of a random state and plan: the twin of an episode
+            that began so. The noise is that of the set and the index.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
         that were finite.
 
     Raises:
-        ValueError: The task takes no goal, or not this one.
+        ValueError: The task takes no goal or start, or not this one, or both are given.
     """
+    if start is not None and (goal is not None or is_standing):
+        raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
     if goal is not None:
         _check_takes_goal(loop)
     elif is_standing:
@@ -128,7 +134,9 @@ def run_episode(
     context = simulator.get_mutable_context()
     rng = episode_rng(seed, index)
     first_step = 0
-    if goal is None:
+    if start is not None:
+        loop.reset_to(context, rng, start)
+    elif goal is None:
         first_step = loop.reset(context, rng)
     elif is_standing:
         loop.reset_standing(context, goal, rng)

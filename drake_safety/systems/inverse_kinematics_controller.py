@@ -96,13 +96,17 @@ class InverseKinematicsController(LeafSystem):
         """
         context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
 
-    def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        kinematics = self._kinematics
+    def foot_positions(self, context: Context) -> np.ndarray:
+        """Where the feet are to stand now: centres of the contact spheres, (n_c, 3) [m]."""
         if self._feet_port.HasValue(context):
             feet = self._feet_port.Eval(context)
         else:
             feet = context.get_numeric_parameter(self._feet_index).get_value()
-        p_WC = feet.reshape(-1, 3)
+        return feet.reshape(-1, 3)
+
+    def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        kinematics = self._kinematics
+        p_WC = self.foot_positions(context)
         half_yaw = 0.5 * fit_stance(p_WC, kinematics.nominal_contacts)[2]
         n_b = NUM_BASE_POSITIONS
         q = np.zeros(kinematics.num_positions)

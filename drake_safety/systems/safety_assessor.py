@@ -25,11 +25,14 @@ class SafetyAssessor(LeafSystem):
         - cause_probability
         - embedding
         - predicted_margins
+        - calibrated_safety_probability
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
-    b_safe / (1 - μ), 0 where nothing is known. The beliefs of the grid are a numeric parameter
-    of the Context (:meth:`set_beliefs`); the embedding is immutable. A state, preview or feature
+    b_safe / (1 - μ), 0 where nothing is known; ``calibrated_safety_probability`` is what the maps'
+    heads say, shifted by what feedback has shown. The beliefs of the grid and the shift are numeric
+    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
+    between simulations and during them. The embedding is immutable. A state, preview or feature
     that is not finite has the EMPTY belief (0, 0, 1).
 
     Args:
@@ -42,11 +45,15 @@ class SafetyAssessor(LeafSystem):
         info = assessment.info_
         self._assessment = assessment
         self._shape = assessment.beliefs_.shape
+        self._shift_shape = assessment.shift_.shape
         self._uses_features = assessment.uses_features
         self.constraint_names = list(info.constraint_names)
         n_c = len(self.constraint_names)
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
+        )
+        self._shift_index = self.DeclareNumericParameter(
+            BasicVector(np.asarray(assessment.shift_, dtype=float).ravel())
         )
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
@@ -61,6 +68,7 @@ class SafetyAssessor(LeafSystem):
             "cause_probability": n_c,
             "embedding": 2,
             "predicted_margins": n_c,
+            "calibrated_safety_probability": 1,
         }
         state = self.DeclareDiscreteState(sum(sizes.values()))
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
@@ -99,6 +107,47 @@ class SafetyAssessor(LeafSystem):
             )
         context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
+    def get_shift(self, context: Context) -> np.ndarray:
+        """The shift in a Context, shaped as the assessment's ``shift_``."""
+        values = context.get_numeric_parameter(self._shift_index).get_value()
+        return values.reshape(self._shift_shape)
+
+    def set_shift(self, context: Context, shift: np.ndarray) -> None:
+        """Replaces what is added to the maps' logit in every cell.
+
+        Args:
+            context: This system's Context.
+            shift: Shaped as the assessment's ``shift_``.
+
+        Raises:
+            ValueError: Another shape.
+        """
+        shift = np.asarray(shift, dtype=float)
+        if shift.shape != self._shift_shape:
+            raise ValueError(
+                f"safety assessor: shifts must have shape {self._shift_shape}; got {shift.shape}"
+            )
+        context.get_mutable_numeric_parameter(self._shift_index).SetFromVector(shift.ravel())
+
+    def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
+        """Takes over beliefs and shift of an assessment that was adapted from this system's own.
+
+        Args:
+            context: This system's Context.
+            adapted: What ``adapt`` returned.
+
+        Raises:
+            ValueError: It has other maps.
+        """
+        if adapted.embedding_ is not self._assessment.embedding_ and not (
+            adapted.embedding_.is_same(self._assessment.embedding_)
+        ):
+            raise ValueError(
+                "safety assessor: the assessment to adopt has other maps; build the diagram anew"
+            )
+        self.set_beliefs(context, adapted.beliefs_)
+        self.set_shift(context, adapted.shift_)
+
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(
             self._assessment.predict_row(
@@ -106,5 +155,6 @@ class SafetyAssessor(LeafSystem):
                 self._preview_port.Eval(context),
                 self._features_port.Eval(context) if self._uses_features else None,
                 self.get_beliefs(context),
+                self.get_shift(context),
             )
         )

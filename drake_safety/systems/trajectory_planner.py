@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -161,6 +162,12 @@ class TrajectoryPlanner(LeafSystem):
     def get_plan(self, context: Context) -> PiecewisePolynomial:
         """The plan in a Context, in the stance frame."""
         return context.get_abstract_parameter(self._plan_index).get_value()[0]
+
+    def plan_from_now(self, context: Context) -> PiecewisePolynomial:
+        """The plan in a Context over the time from now on, in the stance frame."""
+        plan = copy.copy(self.get_plan(context))
+        plan.shiftRight(-context.get_time())
+        return plan
 
     def _stance_pose(self, context: Context) -> np.ndarray:
         if self._stance_port.HasValue(context):

@@ -1,0 +1,280 @@
+"""``drake-safety adapt``: adapts Γ to an actual robot, and says what that was worth."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.console import (
+    Stages,
+    console,
+    interval,
+    new_table,
+    open_stages,
+    print_path,
+)
+from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.training_folder import (
+    MODES,
+    adapted_folder,
+    assessment_file,
+    feedback_folder,
+    load_assessment,
+)
+
+if TYPE_CHECKING:
+    from drake_safety.evaluation.adaptation_study import AdaptationStudy
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import Episodes
+    from drake_safety.simulation.feedback import EpisodePairs
+    from drake_safety.simulation.scenario import Scenario
+
+_SCRATCH_SIZES = (40, 160, 400)
+
+
+def adapt(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    feedback: Annotated[
+        int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
+    ] = 160,
+    variation: Annotated[str, typer.Option(help="Which plant is the actual one.")] = "actual",
+    evaluate: Annotated[
+        int,
+        typer.Option(help="Fresh actual episodes to judge by; 0 leaves judging out.", min=0),
+    ] = 0,
+    orders: Annotated[int, typer.Option(help="Judging: orders of the feedback.", min=1)] = 5,
+    oracle: Annotated[
+        int,
+        typer.Option(
+            help="Judging: other actual episodes to train a rival from scratch on.", min=0
+        ),
+    ] = 0,
+    scratch: Annotated[
+        bool,
+        typer.Option("--scratch", help="Judging: also train from scratch on the feedback itself."),
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 2_000_000,
+    workers: WorkersOption = None,
+) -> None:
+    """Adapt Γ to what an actual robot does, and judge it before and after.
+
+    Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT. Episodes
+    are kept there: an adaptation that was stopped goes on when it is called again.
+    """
+    from drake_safety.evaluation.adaptation_figure import adaptation_figure
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    priors = {mode: load_assessment(assessment, mode) for mode in MODES}
+    used = range(seed, seed + 3)
+    if priors[MODES[0]].info_.seed in used:
+        raise ValueError(
+            f"adapt: seeds {used.start} to {used.stop - 1} would be used, and "
+            f"{priors[MODES[0]].info_.seed} is the training episodes' own; choose another"
+        )
+    folder = adapted_folder(assessment, variation)
+    with open_stages() as stages:
+        pairs = _run_pairs(loaded, feedback, variation, seed, assessment, workers, stages)
+        sets = pairs.feedback()
+        adapted = {}
+        for mode, prior in priors.items():
+            adapted[mode] = prior.adapt(sets)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = []
+        for mode, one in adapted.items():
+            one.save(assessment_file(folder, mode))
+            files.append(assessment_file(folder, mode))
+        pictures = []
+        interval_sets = priors[MODES[0]].parameters.adaptation.update_interval
+        if len(sets) >= interval_sets:
+            for mode, prior in priors.items():
+                pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
+        studies: dict[str, AdaptationStudy] = {}
+        if evaluate:
+            judge = _Judge(loaded, variation, seed, assessment, workers, stages)
+            studies = judge.studies(priors, pairs, evaluate, orders, oracle, scratch)
+            from drake_safety.evaluation.adaptation_figure import study_figure
+
+            for published in ("calibrated", "grid"):
+                pictures += save(
+                    study_figure(studies, published=published), folder / f"study_{published}"
+                )
+    differing, num_pairs = pairs.gap
+    report = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "scenario_hash": pairs.actual.info.scenario_hash,
+        "nominal_hash": pairs.nominal.info.scenario_hash,
+        "variation": variation,
+        "seed": seed,
+        "feedback_sets": num_pairs,
+        "differing_pairs": differing,
+        "shift": {mode: one.adaptation_.shift for mode, one in adapted.items() if one.adaptation_},
+        "versions": versions(),
+        **{
+            f"{mode}.{key}": figure.to_json()
+            for mode, found in studies.items()
+            for key, figure in found.figures.items()
+        },
+    }
+    file = folder / "adaptation.json"
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    console.print(_adaptation_table(adapted, differing, num_pairs, variation))
+    for mode, found in studies.items():
+        for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
+            console.print(_study_table(found, mode, published, variation))
+    for path in files:
+        print_path("assessment", path)
+    print_path("figures   ", file)
+    for picture in pictures:
+        print_path("picture   ", picture)
+
+
+def _run_pairs(
+    scenario: Scenario,
+    num_pairs: int,
+    variation: str,
+    seed: int,
+    folder: Path,
+    workers: int | None,
+    stages: Stages,
+) -> EpisodePairs:
+    from drake_safety.simulation.feedback import run_pairs
+
+    return run_pairs(
+        scenario,
+        num_pairs,
+        variation=variation,
+        seed=seed,
+        num_workers=workers,
+        path=feedback_folder(folder, scenario.simulation_hash(variation), seed),
+        progress=partial(stages, "actual episodes and their twins"),
+        extra={"command": command_line()},
+    )
+
+
+class _Judge:
+    """Simulates what the study needs, and conducts it."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        variation: str,
+        seed: int,
+        folder: Path,
+        workers: int | None,
+        stages: Stages,
+    ):
+        self._scenario, self._variation, self._seed = scenario, variation, seed
+        self._folder, self._workers, self._stages = folder, workers, stages
+
+    def _run(self, what: str, num_episodes: int, offset: int) -> Episodes:
+        from drake_safety.simulation.rollouts import run_episodes
+
+        seed = self._seed + offset
+        scenario_hash = self._scenario.simulation_hash(self._variation)
+        episodes = run_episodes(
+            self._scenario,
+            num_episodes,
+            variation=self._variation,
+            seed=seed,
+            num_workers=self._workers,
+            path=feedback_folder(self._folder, scenario_hash, seed) / self._variation,
+            progress=partial(self._stages, what),
+            extra={"command": command_line()},
+        )
+        return episodes[:num_episodes]
+
+    def studies(
+        self,
+        priors: dict[str, SafetyAssessment],
+        pairs: EpisodePairs,
+        num_test: int,
+        num_orders: int,
+        num_oracle: int,
+        has_scratch: bool,
+    ) -> dict[str, AdaptationStudy]:
+        """One study a mode."""
+        from drake_safety.evaluation.adaptation_study import TestSet, study, trained_rivals
+
+        fresh = self._run("fresh actual episodes", num_test, 1)
+        learned_from = {}
+        if num_oracle:
+            learned_from["oracle"] = self._run("episodes of the oracle", num_oracle, 2)
+        if has_scratch:
+            learned_from |= {
+                f"scratch.{n}": pairs.actual[:n] for n in _SCRATCH_SIZES if n <= len(pairs.actual)
+            }
+        found = {}
+        for mode, prior in priors.items():
+            rivals: dict[str, Any] = {}
+            if learned_from:
+                rivals = trained_rivals(
+                    prior, learned_from, num_workers=self._workers, progress=self._stages
+                )
+            found[mode] = study(
+                prior,
+                pairs.feedback(),
+                TestSet.of(fresh, prior.parameters.shortest),
+                num_orders=num_orders,
+                seed=self._seed,
+                rivals=rivals,
+                progress=lambda stage, done, total, mode=mode: self._stages(
+                    f"{mode}: {stage}", done, total
+                ),
+            )
+        return found
+
+
+def _adaptation_table(
+    adapted: dict[str, SafetyAssessment], differing: int, num_pairs: int, variation: str
+) -> Table:
+    table = new_table(
+        "mode",
+        "method",
+        "shift b",
+        title=f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently",
+    )
+    for mode, one in adapted.items():
+        found = one.adaptation_
+        if found is not None:
+            shift = f"{found.shift:+.2f}" if found.method == "shift" else "-"
+            table.add_row(mode, found.method, shift)
+    return table
+
+
+def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
+    columns = ("brier", "auc", "unsafe_recall", "safe_recall")
+    figures = found.figures
+    table = new_table(
+        "",
+        *columns,
+        "better in",
+        "gap closed",
+        title=f"{mode}, {published}: fresh episodes of '{variation}', {found.num_orders} orders of "
+        "feedback (mean, least and largest)",
+    )
+    names = {"prior": "before feedback"}
+    names |= {f"adapted.{n}": f"after {n} sets" for n in found.sizes}
+    names |= {f"scratch.{n}": f"from scratch on {n}" for n in _SCRATCH_SIZES}
+    names["oracle"] = "oracle"
+    for who, label in names.items():
+        key = f"{who}.{published}"
+        if f"{key}.brier" not in figures:
+            continue
+        won, closed = figures.get(f"{key}.orders_won"), figures.get(f"{key}.gap_closed")
+        table.add_row(
+            label,
+            *(interval(figures[f"{key}.{column}"]) for column in columns),
+            f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
+            f"{100 * closed.value:.0f} %" if closed is not None else "",
+        )
+    return table

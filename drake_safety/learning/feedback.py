@@ -1,0 +1,239 @@
+"""Feedback of an actual robot: its episodes beside their nominal twins, reduced to segments."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.learning.segments import DIVERGED, Episodes, EpisodesInfo, split, unsafety_score
+
+START_TOLERANCE = 1e-2
+"""By how much a twin's first true state may differ: logged positions are not exact."""
+_logger = logging.getLogger("drake_safety")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeedbackSet:
+    """One actual episode and its nominal twin from the same state along the same plan.
+
+    Both are known by what adaptation needs: the inputs x at every start row of the actual one, and
+    when either ended.
+
+    Attributes:
+        info: What the actual episodes share.
+        nominal_hash: Scenario hash of the twin.
+        index: Number of the pair.
+        state: State as the assessor sees it, (N, n_s).
+        true_state: State without observation noise, (N, n_s).
+        desired_preview: Coming desired outputs, (N, H*n_z).
+        features: Features, (N, n_f).
+        steps_since_start: Rows from the episode's `first_step` to each start, (N,).
+        remaining_steps: R, steps until the actual episode ends, (N,).
+        nominal_remaining_steps: Steps until the twin ends, (N,); 0 where it has ended.
+        is_unsafe: Whether the actual episode ended unsafely.
+        nominal_is_unsafe: Whether the twin did.
+        cause: Column of the constraint that ended the actual episode, -1 when safe.
+    """
+
+    info: EpisodesInfo
+    nominal_hash: str
+    index: int
+    state: np.ndarray
+    true_state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    steps_since_start: np.ndarray
+    remaining_steps: np.ndarray
+    nominal_remaining_steps: np.ndarray
+    is_unsafe: bool
+    nominal_is_unsafe: bool
+    cause: int
+
+    def __len__(self) -> int:
+        return len(self.remaining_steps)
+
+    @property
+    def differs(self) -> bool:
+        """Whether one of the two is safe and the other is not."""
+        return self.is_unsafe != self.nominal_is_unsafe
+
+
+def feedback_sets(actual: Episodes, nominal: Episodes) -> list[FeedbackSet]:
+    """Pairs actual episodes with their nominal twins, by index.
+
+    A pair of which one simulation diverged says nothing and is left out.
+
+    Args:
+        actual: Episodes of the actual robot.
+        nominal: Their twins; others may be among them.
+
+    Raises:
+        ValueError: The two sets are of different tasks, a twin is missing, or begins elsewhere.
+    """
+    _check_same_task(actual.info, nominal.info)
+    twins = {episode.index: episode for episode in nominal}
+    sets = []
+    for episode in actual:
+        twin = twins.get(episode.index)
+        if twin is None:
+            raise ValueError(
+                f"feedback of '{actual.info.scenario}': episode {episode.index} of the variation "
+                f"'{actual.info.variation}' has no nominal twin; there are {len(twins)} twins"
+            )
+        apart = np.abs(episode.true_state[0] - twin.true_state[0]).max(initial=0.0)
+        if not apart <= START_TOLERANCE:
+            raise ValueError(
+                f"feedback of '{actual.info.scenario}': the twin of episode {episode.index} begins "
+                f"elsewhere; their first states differ by {apart:.3g}"
+            )
+        if DIVERGED in (episode.cause, twin.cause):
+            _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
+            continue
+        if episode.num_steps == episode.first_step:
+            continue
+        segments = split(Episodes(actual.info, [episode]), stride=1, discount=1.0, shortest=1)
+        sets.append(
+            FeedbackSet(
+                info=actual.info,
+                nominal_hash=nominal.info.scenario_hash,
+                index=episode.index,
+                state=segments.state,
+                true_state=segments.true_state,
+                desired_preview=segments.desired_preview,
+                features=segments.features,
+                steps_since_start=segments.start_row - episode.first_step,
+                remaining_steps=segments.remaining_steps,
+                nominal_remaining_steps=np.maximum(twin.num_steps - segments.start_row, 0),
+                is_unsafe=not episode.is_safe,
+                nominal_is_unsafe=not twin.is_safe,
+                cause=int(segments.cause[0]),
+            )
+        )
+    return sets
+
+
+def _check_same_task(actual: EpisodesInfo, nominal: EpisodesInfo) -> None:
+    for name in ("scenario", "step_s", "horizon", "state_names", "output_names", "feature_names"):
+        here, there = getattr(actual, name), getattr(nominal, name)
+        if here != there:
+            raise ValueError(
+                f"feedback: actual and nominal episodes differ in {name}: {here} and {there}"
+            )
+
+
+def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> None:
+    """Refuses feedback of another scenario than an assessment was learned from.
+
+    Args:
+        feedback: The feedback sets.
+        learned: What the training episodes share.
+
+    Raises:
+        ValueError: There is none, or it is another's; both sides are named.
+    """
+    if not feedback:
+        raise ValueError(f"feedback of '{learned.scenario}': there is none to adapt to")
+    for one in feedback:
+        sides = {
+            name: (getattr(one.info, name), getattr(learned, name))
+            for name in (
+                "scenario",
+                "step_s",
+                "horizon",
+                "constraint_names",
+                "state_names",
+                "output_names",
+                "feature_names",
+            )
+        }
+        sides["the nominal twin's scenario hash"] = (one.nominal_hash, learned.scenario_hash)
+        for what, (got, expected) in sides.items():
+            if got != expected:
+                raise ValueError(
+                    f"feedback set {one.index} and the assessment differ in {what}: the feedback "
+                    f"has {got}, the assessment was learned with {expected}"
+                )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeedbackSegments:
+    """Segments of several feedback sets, as an update takes them.
+
+    Attributes:
+        set_index: Position of the segment's set, (N,).
+        state: State that Psi is given, (N, n_s).
+        desired_preview: Coming desired outputs, (N, H*n_z).
+        features: Features, (N, n_f).
+        score: lambda of the actual episode, (N,).
+        nominal_score: lambda of the twin, (N,).
+        is_unsafe: Whether the actual episode ended unsafely, (N,).
+        nominal_is_unsafe: Whether the twin did, (N,).
+        cause: Column of the constraint that ended the actual episode, -1 when safe, (N,).
+    """
+
+    set_index: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    score: np.ndarray
+    nominal_score: np.ndarray
+    is_unsafe: np.ndarray
+    nominal_is_unsafe: np.ndarray
+    cause: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+def segments_of(
+    feedback: Sequence[FeedbackSet], *, stride: int, shortest: int, discount: float, plain: bool
+) -> FeedbackSegments:
+    """The segments of feedback sets, cut as the training episodes were.
+
+    A twin that has left the safe set before a segment begins scores 1 there.
+
+    Args:
+        feedback: The feedback sets.
+        stride: Rows between two starts.
+        shortest: Steps that a safe episode's segment has at least.
+        discount: gamma of the unsafety score.
+        plain: Whether nominal plants, taken for the actual one, show the state without noise, as
+            the paper's mode has learned it.
+
+    Raises:
+        ValueError: No set has a segment of that length.
+    """
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in FeedbackSegments.__annotations__}
+    for position, one in enumerate(feedback):
+        is_taken = one.steps_since_start % stride == 0
+        if not one.is_unsafe:
+            is_taken &= one.remaining_steps >= shortest
+        rows = np.flatnonzero(is_taken)
+        is_unsafe = np.full(rows.size, one.is_unsafe)
+        nominal_is_unsafe = np.full(rows.size, one.nominal_is_unsafe)
+        state = one.true_state if plain and one.info.variation == "nominal" else one.state
+        piece = {
+            "set_index": np.full(rows.size, position),
+            "state": state[rows],
+            "desired_preview": one.desired_preview[rows],
+            "features": one.features[rows],
+            "score": unsafety_score(one.remaining_steps[rows], is_unsafe, discount),
+            "nominal_score": unsafety_score(
+                one.nominal_remaining_steps[rows], nominal_is_unsafe, discount
+            ),
+            "is_unsafe": is_unsafe,
+            "nominal_is_unsafe": nominal_is_unsafe,
+            "cause": np.full(rows.size, one.cause),
+        }
+        for name, values in piece.items():
+            parts[name].append(values)
+    segments = FeedbackSegments(**{name: np.concatenate(values) for name, values in parts.items()})
+    if not len(segments):
+        raise ValueError(
+            f"feedback of '{feedback[0].info.scenario}': none of {len(feedback)} sets has a "
+            f"segment of {shortest} steps"
+        )
+    return segments

@@ -1,0 +1,260 @@
+"""What an assessment says of inputs: beliefs read from the grid where the maps send them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.learning import beliefs as belief_masses
+from drake_safety.learning.embedding import Embedding, EmbeddingOutput
+from drake_safety.learning.grid import OUTSIDE, Grid
+
+LOGIT_LIMIT = 8.0
+"""Largest logit that a head is believed."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Assessments:
+    """What an assessment says of N inputs.
+
+    Attributes:
+        safety_probability: Gamma = b_safe, (N,). At most 1 - mu: not a calibrated probability.
+        normalized: b_safe / (1 - mu), the safe share of what is known, (N,); 0 where nothing is.
+        belief: (b_safe, b_unsafe, mu), (N, 3); empty for inputs that are not finite.
+        embedding: y by the first map, (N, 2); NaN for inputs that are not finite.
+        cause_probability: b_unsafe split by the constraint that will be violated, (N, n_c).
+        predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
+            margins], (N, n_c); NaN for inputs that are not finite, without a margin head, and
+            always in the paper's mode.
+        unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN where there is none.
+        calibrated: Safety probability by the maps' heads, shifted by what feedback of the actual
+            robot has shown, (N,); 0 where nothing is known. Without heads it is `normalized`.
+    """
+
+    safety_probability: np.ndarray
+    normalized: np.ndarray
+    belief: np.ndarray
+    embedding: np.ndarray
+    cause_probability: np.ndarray
+    predicted_margins: np.ndarray
+    unsafe_logit: np.ndarray
+    calibrated: np.ndarray
+
+
+@dataclass(kw_only=True, eq=False, slots=True)
+class Assessment:
+    """What an assessment says of one input; the fields of `Assessments` without the axis N."""
+
+    safety_probability: float
+    normalized: float
+    belief: np.ndarray
+    cause_probability: np.ndarray
+    embedding: np.ndarray
+    predicted_margins: np.ndarray
+    calibrated: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseLogit:
+    """L, one logit of an unsafe end from what the maps' heads say.
+
+    It is the mean of the safety heads' logit and of a logit of the smallest predicted margin; a
+    head that is missing leaves the other alone.
+
+    Attributes:
+        intercept: Logit where the smallest margin is zero.
+        slope: Logits by which a margin of one unit is safer.
+        margin_unit: That unit [unit of the margins].
+        margin_range: Margins are clipped to this range [unit of the margins].
+    """
+
+    intercept: float
+    slope: float
+    margin_unit: float
+    margin_range: tuple[float, float]
+
+    def of_output(self, output: EmbeddingOutput) -> np.ndarray:
+        """L of all inputs of an `EmbeddingOutput`, (N,); NaN without heads."""
+        heads = []
+        if output.margins.shape[2]:
+            margins = output.margins.mean(axis=0).min(axis=1)
+            heads.append(self.of_margin(margins))
+        safety = np.clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT).mean(axis=0)
+        if not heads or np.isfinite(safety).any():
+            heads.append(safety)
+        return np.mean(heads, axis=0)
+
+    def of_margin(self, margin: np.ndarray) -> np.ndarray:
+        """The logit of smallest margins (N,)."""
+        scaled = np.clip(margin, *self.margin_range) / self.margin_unit
+        return np.clip(self.intercept - self.slope * scaled, -LOGIT_LIMIT, LOGIT_LIMIT)
+
+    def of_one(self, logits: list[float], margin: float | None) -> float:
+        """L in plain floats, for the online run.
+
+        Args:
+            logits: Of each member's safety head; none without heads.
+            margin: Smallest predicted margin, if there is a margin head.
+        """
+        total, count = 0.0, 0
+        if logits:
+            total += sum(min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT) for z in logits) / len(logits)
+            count += 1
+        if margin is not None:
+            low, high = self.margin_range
+            z = self.intercept - self.slope * min(max(margin, low), high) / self.margin_unit
+            total += min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT)
+            count += 1
+        return total / count
+
+
+def sigmoid(z: np.ndarray) -> np.ndarray:
+    """1 / (1 + exp(-z)) of logits that are not beyond some hundreds."""
+    return 1.0 / (1.0 + np.exp(-z))
+
+
+def predict(
+    x: np.ndarray,
+    *,
+    embedding: Embedding,
+    grid: Grid,
+    beliefs: np.ndarray,
+    shift: np.ndarray,
+    base_logit: BaseLogit | None,
+    is_sharpened: bool,
+) -> Assessments:
+    """Assesses inputs; rows that are not finite get the empty belief.
+
+    Args:
+        x: Inputs, (N, n_x).
+        embedding: The maps.
+        grid: The grid of their cells.
+        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
+        shift: What is added to L in each cell, (K, R*R).
+        base_logit: L; None without heads.
+        is_sharpened: Whether beliefs are interpolated between cell centres.
+    """
+    output = embedding.evaluate(x)
+    num_members, _, num_columns = beliefs.shape
+    columns = np.concatenate([beliefs, shift[..., None]], axis=2)
+    masses = np.zeros((len(x), num_columns))
+    total_shift = np.zeros(len(x))
+    num_inside = np.zeros(len(x), dtype=int)
+    for values, points in zip(columns, output.embedding, strict=True):
+        read, is_outside = _read(values, points, grid, is_sharpened)
+        total_shift += read[:, -1]
+        num_inside += ~is_outside
+        read = read[:, :-1]
+        read[is_outside] = belief_masses.empty((), num_columns - 3)
+        masses += read
+    masses /= num_members
+    safe = masses[:, belief_masses.SAFE]
+    # As a sum, not as 1 - mu: rounding must not lift the share above one.
+    known = safe + masses[:, belief_masses.UNSAFE]
+    normalized = np.divide(safe, known, out=np.zeros_like(safe), where=known > 0.0)
+    calibrated = normalized.copy()
+    if base_logit is not None:
+        is_known = known > 0.0
+        logit = base_logit.of_output(output)[is_known]
+        calibrated[is_known] = sigmoid(-logit - total_shift[is_known] / num_inside[is_known])
+    margins = np.full((len(x), num_columns - 3), np.nan)
+    if output.margins.shape[2]:
+        margins = output.margins.mean(axis=0)
+    return Assessments(
+        # Gamma(x) = b_safe of the cell v = L(x)
+        safety_probability=safe.copy(),
+        normalized=normalized,
+        belief=masses[:, :3].copy(),
+        embedding=output.embedding[0],
+        cause_probability=masses[:, 3:].copy(),
+        predicted_margins=margins,
+        unsafe_logit=output.unsafe_logit.mean(axis=0),
+        calibrated=calibrated,
+    )
+
+
+def _read(
+    values: np.ndarray, points: np.ndarray, grid: Grid, is_sharpened: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cell values (R*R, c) at points (N, 2) of one map, zero outside, and which lie outside."""
+    if is_sharpened:
+        cells, weights = grid.bilinear(points)
+        return np.einsum("nk,nkc->nc", weights, values[cells]), cells[:, 0] == OUTSIDE
+    cells = grid.locate(points)
+    is_outside = cells == OUTSIDE
+    return np.where(is_outside[:, None], 0.0, values[cells]), is_outside
+
+
+def predict_row(
+    parts: tuple[np.ndarray, ...],
+    *,
+    embedding: Embedding,
+    grid: Grid,
+    beliefs: np.ndarray,
+    shift: np.ndarray,
+    base_logit: BaseLogit | None,
+    is_sharpened: bool,
+) -> np.ndarray:
+    """`predict` of one input as one vector, for the online run: what it costs is most of the tick.
+
+    Args:
+        parts: Vectors that the input consists of, in their order, (n_x,) together.
+        embedding: The maps.
+        grid: The grid of their cells.
+        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
+        shift: What is added to L in each cell, (K, R*R).
+        base_logit: L; None without heads.
+        is_sharpened: Whether beliefs are interpolated between cell centres.
+
+    Returns:
+        The fields of `Assessment` one after the other, in their order, (8 + 2 n_c,).
+    """
+    num_members, num_cells, num_columns = beliefs.shape
+    row = np.empty(2 + 2 * num_columns)
+    masses = row[2 : 2 + num_columns]
+    margins = row[4 + num_columns : -1]
+    output = embedding.evaluate_one(*parts)
+    rows: list[int] = []
+    weights: list[float] = []
+    if output is None:
+        row[2 + num_columns : -1] = np.nan
+    elif is_sharpened:
+        for member, (first, second) in enumerate(output[:, :2].tolist()):
+            corners = grid.bilinear_one(first, second)
+            if corners is not None:
+                start = member * num_cells
+                rows += [start + cell for cell in corners[0]]
+                weights += corners[1]
+        if rows:
+            np.dot(weights, beliefs.reshape(-1, num_columns).take(rows, axis=0), out=masses)
+            masses /= num_members
+            # A map that sends the input outside its grid knows nothing of it.
+            masses[belief_masses.UNCERTAINTY] += 1.0 - len(rows) / (4 * num_members)
+    else:
+        cell = grid.locate_one(*output[0, :2].tolist())
+        if cell != OUTSIDE:
+            rows, weights = [cell], [1.0]
+            masses[:] = beliefs[0, cell]
+    if not rows:
+        masses[:] = 0.0
+        masses[belief_masses.UNCERTAINTY] = 1.0
+    safe, unsafe = masses[:2].tolist()
+    known = safe + unsafe
+    row[0] = safe
+    row[1] = row[-1] = safe / known if known > 0.0 else 0.0
+    if output is not None:
+        row[2 + num_columns : 4 + num_columns] = output[0, :2]
+        margins[:] = np.nan
+        if embedding.num_margins:
+            np.add.reduce(output[:, 2:], out=margins)
+            margins /= num_members
+        if known > 0.0 and base_logit is not None:
+            logit = base_logit.of_one(
+                embedding.unsafe_logit_one(output[:, :2]) if embedding.has_safety_head else [],
+                float(margins.min()) if embedding.num_margins else None,
+            )
+            logit += float(np.dot(weights, shift.ravel().take(rows))) / sum(weights)
+            row[-1] = 1.0 / (1.0 + math.exp(logit))
+    return row

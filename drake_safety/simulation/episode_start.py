@@ -1,0 +1,75 @@
+"""EpisodeStart: where and how an episode begins, for one that is to begin as another one did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
+
+
+@dataclass(kw_only=True, eq=False)
+class EpisodeStart:
+    """A plant state and a plan: what the nominal twin of an actual episode begins with.
+
+    Attributes:
+        q: Positions in Drake's order: base quaternion (w, x, y, z), base position, joints, (n_q,).
+        v: Velocities: of the base in the world, angular first, then of the joints, (n_v,).
+        plan: Desired output over time since the start, in the stance frame, (n_z, 1) [m].
+        foot_positions: Where the controller believes the feet to stand: centres of the contact
+            spheres, (n_c, 3) [m]. None for where ``q`` has them, on the ground.
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    plan: PiecewisePolynomial
+    foot_positions: np.ndarray | None = None
+
+    def feet(self, kinematics: RobotKinematics) -> np.ndarray:
+        """Where the feet stand, (n_c, 3) [m].
+
+        Args:
+            kinematics: The robot.
+        """
+        if self.foot_positions is not None:
+            return self.foot_positions
+        p_WC = kinematics.contact_positions(self.q).copy()
+        p_WC[:, 2] = kinematics.foot_radii
+        return p_WC
+
+    def stance_pose(self, kinematics: RobotKinematics) -> np.ndarray:
+        """The frame of the plan, [x, y, yaw] in the world (3,) [m, rad].
+
+        Args:
+            kinematics: The robot.
+        """
+        return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
+
+    def check(self, kinematics: RobotKinematics) -> None:
+        """Refuses what no plant can begin with.
+
+        Args:
+            kinematics: The robot.
+
+        Raises:
+            ValueError: A part has another size than the robot, is not finite, or the quaternion
+                is none.
+        """
+        who = f"start of robot '{kinematics.robot.name}'"
+        sizes = {"q": kinematics.num_positions, "v": kinematics.num_velocities}
+        for name, size in sizes.items():
+            value = getattr(self, name)
+            if np.shape(value) != (size,) or not np.isfinite(value).all():
+                raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
+        norm = float(np.linalg.norm(self.q[:4]))
+        if not abs(norm - 1.0) < 1e-3:
+            raise ValueError(f"{who}: the quaternion must have a norm of 1; got {norm}")
+        feet = self.foot_positions
+        if feet is not None and (
+            np.shape(feet) != (kinematics.num_contacts, 3) or not np.isfinite(feet).all()
+        ):
+            raise ValueError(
+                f"{who}: foot_positions must be {kinematics.num_contacts} finite points; got {feet}"
+            )

@@ -1,0 +1,215 @@
+"""Feedback by simulation: actual episodes, and nominal twins from the same state and plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.rollouts import (
+    Progress,
+    batches,
+    episodes_info,
+    parallel_map,
+    run_episode,
+    run_episodes,
+    worker_loop,
+)
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.systems.feedback_recorder import FeedbackRecorder, RecordedWindow
+
+_TWINS = "nominal"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodePairs:
+    """Actual episodes and their nominal twins.
+
+    Attributes:
+        actual: Episodes of the actual plant.
+        nominal: Episodes of the nominal plant from the same states along the same plans.
+    """
+
+    actual: Episodes
+    nominal: Episodes
+
+    def feedback(self) -> list[FeedbackSet]:
+        """One feedback set a pair, in the order of the episodes; diverged ones are left out."""
+        return feedback_sets(self.actual, self.nominal)
+
+    @property
+    def gap(self) -> tuple[int, int]:
+        """How many pairs end differently, and how many there are."""
+        sets = self.feedback()
+        return sum(one.differs for one in sets), len(sets)
+
+
+def run_pairs(
+    scenario: Scenario,
+    num_pairs: int,
+    *,
+    variation: str = "actual",
+    seed: int = 0,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | None = None,
+    extra: dict[str, Any] | None = None,
+    **loop_options: Any,
+) -> EpisodePairs:
+    """Simulates actual episodes and their nominal twins, in worker processes.
+
+    Both of a pair draw from the same generator, so that they begin alike.
+
+    Args:
+        scenario: The scenario.
+        num_pairs: How many.
+        variation: Which plant is the actual one.
+        seed: Seed of the set.
+        num_workers: Processes; as many as there are cores by default.
+        path: Folder where episodes are kept as they finish, a folder in it for either plant;
+            those that it already holds are not simulated again.
+        progress: Called with the number of episodes done and the number wanted, two a pair.
+        extra: Stored beside the episodes' info.
+        **loop_options: For the task.
+
+    Raises:
+        ValueError: No such variation, or the folder holds other sets.
+    """
+
+    def report(offset: int) -> Progress | None:
+        if progress is None:
+            return None
+        return lambda done, total: progress(offset + done, 2 * num_pairs)
+
+    sets = {}
+    for offset, name in enumerate((variation, _TWINS)):
+        sets[name] = run_episodes(
+            scenario,
+            num_pairs,
+            variation=name,
+            seed=seed,
+            num_workers=num_workers,
+            path=None if path is None else Path(path) / name,
+            progress=report(offset * num_pairs),
+            extra=extra,
+            **loop_options,
+        )
+    return EpisodePairs(actual=sets[variation], nominal=sets[_TWINS])
+
+
+def make_recorder(
+    loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
+) -> FeedbackRecorder:
+    """The recorder that fits a loop.
+
+    Args:
+        loop: The loop of the actual robot.
+        num_steps: Assessment steps of a window; those of an episode by default.
+        capacity: Finished windows that are kept until they are taken.
+    """
+    return FeedbackRecorder(
+        episodes_info(loop, seed=0),
+        num_steps=num_steps or loop.scenario.num_steps,
+        plant_state_size=loop.GetOutputPort("plant_state").size(),
+        watch_period_s=loop.scenario.control_period_s,
+        capacity=capacity,
+    )
+
+
+def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
+    """What the nominal twin of a recorded window begins with.
+
+    Its plan goes through the desired outputs that the actual robot was given, and holds still after
+    what was seen of them.
+
+    Args:
+        loop: The nominal loop.
+        window: The window.
+    """
+    preview = window.episode.desired_preview
+    num_outputs = len(loop.output_names)
+    # The first sample of every preview is of its own row; the last preview looks further ahead.
+    plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
+    times = loop.scenario.step_s * np.arange(len(plan))
+    q, v = np.split(window.plant_state, [loop.plant.num_positions(loop.robot_instance)])
+    return EpisodeStart(
+        q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T, True)
+    )
+
+
+def run_twins(
+    scenario: Scenario,
+    windows: Sequence[RecordedWindow],
+    *,
+    seed: int = 0,
+    num_workers: int | None = None,
+    progress: Progress | None = None,
+) -> Episodes:
+    """Simulates the nominal twins of recorded windows.
+
+    Args:
+        scenario: The scenario.
+        windows: What a `FeedbackRecorder` gave.
+        seed: Of the noise.
+        num_workers: Processes; as many as there are cores by default.
+        progress: Called with the number done and the number wanted.
+
+    Raises:
+        ValueError: The task cannot begin with a given start.
+    """
+    info = episodes_info(scenario.make_loop(), seed)
+    twins: list[Episode] = []
+    results = parallel_map(
+        _twin_batch,
+        [
+            (scenario, seed, [windows[i] for i in batch])
+            for batch in batches(list(range(len(windows))))
+        ],
+        num_workers,
+    )
+    try:
+        for batch in results:
+            twins += batch
+            if progress is not None:
+                progress(len(twins), len(windows))
+    finally:
+        results.close()
+    return Episodes(info, sorted(twins, key=lambda episode: episode.index))
+
+
+def _twin_batch(scenario: Scenario, seed: int, windows: list[RecordedWindow]) -> list[Episode]:
+    loop = worker_loop(scenario, _TWINS, {})
+    return [
+        run_episode(loop, window.episode.index, seed=seed, start=window_start(loop, window))
+        for window in windows
+    ]
+
+
+def feedback_of_windows(
+    scenario: Scenario,
+    recorder: FeedbackRecorder,
+    windows: Sequence[RecordedWindow],
+    *,
+    run: Callable[..., Episodes] = run_twins,
+    **options: Any,
+) -> list[FeedbackSet]:
+    """Feedback of what a running robot has recorded: the twins are simulated here.
+
+    Args:
+        scenario: The scenario.
+        recorder: Who recorded it.
+        windows: What it gave.
+        run: Simulates the twins.
+        **options: For `run`.
+    """
+    actual = Episodes(recorder.info, [window.episode for window in windows])
+    return feedback_sets(actual, run(scenario, windows, **options))

@@ -1,0 +1,234 @@
+"""FeedbackRecorder: a running robot's motion, cut into windows that adaptation can learn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
+
+from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+
+_ROW_PORTS = (
+    "state",
+    "true_state",
+    "output",
+    "desired_output",
+    "desired_preview",
+    "features",
+    "margins",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedWindow:
+    """A stretch of a robot's motion that is labelled.
+
+    Attributes:
+        episode: The stretch as an episode; its time starts at zero.
+        plant_state: [q; v] of the robot at its first row, (n_q + n_v,).
+        start_time_s: When it began [s].
+    """
+
+    episode: Episode
+    plant_state: np.ndarray
+    start_time_s: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """What a recorder's Context holds: immutable, so that copies of the Context share it.
+
+    Attributes:
+        rows: Rows of the open window, each the ports' vectors in order.
+        times_s: When they were sampled [s].
+        plant_state: [q; v] at the first of them.
+        windows: Finished windows.
+        num_finished: How many there have been.
+        num_dropped: How many of them were dropped, as nobody took them.
+    """
+
+    rows: tuple[tuple[np.ndarray, ...], ...] = ()
+    times_s: tuple[float, ...] = ()
+    plant_state: np.ndarray | None = None
+    windows: tuple[RecordedWindow, ...] = ()
+    num_finished: int = 0
+    num_dropped: int = 0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Recording:
+        return self
+
+
+class FeedbackRecorder(LeafSystem):
+    """Records windows of a running robot; each is labelled by how it ended.
+
+    .. pydrake_system::
+
+        name: FeedbackRecorder
+        input_ports:
+        - state
+        - true_state (optional)
+        - output
+        - desired_output
+        - desired_preview
+        - features
+        - margins
+        - safe
+        - plant_state
+        output_ports:
+        - num_finished
+
+    A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` of them, and the
+    next one begins with its last row; or unsafe as soon as ``safe``, looked at every
+    ``watch_period_s``, is below one, and the next one begins when it is one again. When time
+    jumps, as at a reset, the open window is dropped. All of it lives in the Context:
+    :meth:`take_windows` empties it. Without ``true_state``, as on a robot, it is ``state``.
+
+    Args:
+        info: What the windows share as episodes.
+        num_steps: Rows of a safe window after its first.
+        plant_state_size: n_q + n_v.
+        watch_period_s: Time between two looks at ``safe`` [s].
+        capacity: Finished windows that are kept until they are taken; then the oldest go.
+
+    Raises:
+        ValueError: A window is shorter than the horizon.
+    """
+
+    def __init__(
+        self,
+        info: EpisodesInfo,
+        *,
+        num_steps: int,
+        plant_state_size: int,
+        watch_period_s: float,
+        capacity: int = 400,
+    ):
+        super().__init__()
+        if num_steps < info.horizon:
+            raise ValueError(
+                f"feedback recorder: num_steps is {num_steps}, expected at least the horizon of "
+                f"{info.horizon}"
+            )
+        if capacity < 1:
+            raise ValueError(f"feedback recorder: capacity is {capacity}, expected >= 1")
+        self.info = info
+        self._num_steps, self._capacity = num_steps, capacity
+        num_outputs, num_margins = len(info.output_names), len(info.constraint_names)
+        sizes = {
+            "state": len(info.state_names),
+            "true_state": len(info.state_names),
+            "output": num_outputs,
+            "desired_output": num_outputs,
+            "desired_preview": info.horizon * num_outputs,
+            "features": len(info.feature_names),
+            "margins": num_margins,
+            "safe": 1,
+            "plant_state": plant_state_size,
+        }
+        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
+        # Whether the safe set was left since the last row, and the margins then.
+        self.DeclareDiscreteState(1 + num_margins)
+        self._index = self.DeclareAbstractState(Value(Recording()))
+        self.DeclarePeriodicDiscreteUpdateEvent(watch_period_s, 0.0, self._watch)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(info.step_s, 0.0, self._record)
+        self.DeclareVectorOutputPort("num_finished", BasicVector(1), self._calc_num_finished)
+
+    def recording(self, context: Context) -> Recording:
+        """What a Context holds."""
+        return context.get_abstract_state(int(self._index)).get_value()
+
+    def take_windows(self, context: Context) -> list[RecordedWindow]:
+        """The finished windows of a Context, which then holds none.
+
+        Args:
+            context: This system's Context; the open window goes on.
+        """
+        recording = self.recording(context)
+        context.SetAbstractState(int(self._index), replace(recording, windows=()))
+        return list(recording.windows)
+
+    def _calc_num_finished(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([self.recording(context).num_finished])
+
+    def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
+        latch = context.get_discrete_state_vector().get_value()
+        if latch[0] == 0.0 and self._ports["safe"].Eval(context)[0] < 1.0:
+            margins = self._ports["margins"].Eval(context)
+            discrete_state.set_value(np.concatenate([[1.0], margins]))
+
+    def _row(self, context: Context) -> tuple[np.ndarray, ...]:
+        row = []
+        for name in _ROW_PORTS:
+            source = name
+            if name == "true_state" and not self._ports[name].HasValue(context):
+                source = "state"
+            row.append(self._ports[source].Eval(context).copy())
+        return tuple(row)
+
+    def _record(self, context: Context, state: State) -> None:
+        recording = self.recording(context)
+        time_s = context.get_time()
+        latch = context.get_discrete_state_vector().get_value()
+        has_left = latch[0] > 0.0 or self._ports["safe"].Eval(context)[0] < 1.0
+        if recording.times_s:
+            lapse_s = time_s - recording.times_s[-1]
+            if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
+                recording = replace(recording, rows=(), times_s=(), plant_state=None)
+        row = self._row(context)
+        if has_left:
+            if recording.rows:
+                if latch[0] > 0.0:
+                    margins = np.minimum(row[-1], latch[1:])
+                    row = (*row[:-1], margins)
+                recording = self._finished(self._extended(context, recording, row), is_safe=False)
+            recording = replace(recording, rows=(), times_s=(), plant_state=None)
+        else:
+            recording = self._extended(context, recording, row)
+            if len(recording.rows) == self._num_steps + 1:
+                recording = self._finished(recording, is_safe=True)
+                empty = replace(recording, rows=(), times_s=(), plant_state=None)
+                recording = self._extended(context, empty, row)
+        state.get_mutable_discrete_state().set_value(np.zeros(latch.size))
+        state.get_mutable_abstract_state(int(self._index)).set_value(recording)
+
+    def _extended(
+        self, context: Context, recording: Recording, row: tuple[np.ndarray, ...]
+    ) -> Recording:
+        plant_state = recording.plant_state
+        if not recording.rows:
+            plant_state = self._ports["plant_state"].Eval(context).copy()
+        return replace(
+            recording,
+            rows=(*recording.rows, row),
+            times_s=(*recording.times_s, context.get_time()),
+            plant_state=plant_state,
+        )
+
+    def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
+        columns = [np.array(column) for column in zip(*recording.rows, strict=True)]
+        arrays = dict(zip(_ROW_PORTS, columns, strict=True))
+        worst = int(np.argmin(arrays["margins"][-1]))
+        times_s = np.array(recording.times_s)
+        episode = Episode(
+            index=recording.num_finished,
+            time_s=times_s - times_s[0],
+            **arrays,
+            is_safe=is_safe,
+            cause="" if is_safe else self.info.constraint_names[worst],
+        )
+        Episodes(self.info, [episode])  # Refuses what does not fit.
+        if recording.plant_state is None:
+            raise ValueError("feedback recorder: a window without its first plant state")
+        window = RecordedWindow(
+            episode=episode, plant_state=recording.plant_state, start_time_s=float(times_s[0])
+        )
+        windows = (*recording.windows, window)
+        return replace(
+            recording,
+            windows=windows[-self._capacity :],
+            num_finished=recording.num_finished + 1,
+            num_dropped=recording.num_dropped + max(len(windows) - self._capacity, 0),
+        )

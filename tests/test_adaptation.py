@@ -1,0 +1,354 @@
+"""Adaptation: what feedback of an actual robot may change, and what it must not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drake_safety.learning import adaptation
+from drake_safety.learning.assessment import (
+    AdaptationParameters,
+    AssessmentParameters,
+    SafetyAssessment,
+)
+from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY, average_cells, from_scores, fuse
+from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
+from drake_safety.learning.feedback import feedback_sets, segments_of
+from drake_safety.learning.grid import Grid
+from drake_safety.learning.prediction import sigmoid
+from drake_safety.learning.segments import Episodes
+from lip_episodes import make_episodes
+from test_assessment import QUICK, inputs
+
+NUM_PAIRS = 40
+
+
+def pairs_with(flip, num=NUM_PAIRS, seed=3):
+    """Pairs of which `flip(episode)` says whether the actual one ends as the twin does not."""
+    nominal = make_episodes(num, seed=seed, noise=0.002)
+    actual = []
+    for episode in nominal:
+        if flip(episode):
+            is_safe = not episode.is_safe
+            cause = "" if is_safe else nominal.info.constraint_names[0]
+            episode = dataclasses.replace(episode, is_safe=is_safe, cause=cause)
+        actual.append(episode)
+    info = dataclasses.replace(nominal.info, variation="actual")
+    return feedback_sets(Episodes(info, actual), nominal)
+
+
+def worse(num=NUM_PAIRS):
+    return pairs_with(lambda episode: episode.is_safe and episode.index % 3 == 0, num)
+
+
+def better(num=NUM_PAIRS):
+    return pairs_with(lambda episode: not episode.is_safe and episode.index % 2 == 0, num)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    episodes = make_episodes(130, noise=0.002)
+    quick = QUICK | {"epochs": 6, "perplexity": 8.0}
+    return {
+        mode: SafetyAssessment(AssessmentParameters(mode=mode, **quick)).fit(episodes)
+        for mode in ("sharpened", "paper")
+    }
+
+
+@pytest.fixture(scope="module")
+def sharpened(fitted):
+    return fitted["sharpened"]
+
+
+@pytest.fixture(scope="module")
+def paper(fitted):
+    return fitted["paper"]
+
+
+def feedback_cells(assessment, feedback, is_wanted):
+    """Cells of each map that hold feedback segments which `is_wanted(segments)` chooses."""
+    segments = assessment.feedback_segments(feedback)
+    x = assessment._inputs(segments.state, segments.desired_preview, segments.features)
+    points = assessment.embedding_.embed(x)
+    return [assessment.grid_.locate(p[is_wanted(segments)]) for p in points]
+
+
+def test_without_a_differing_pair_nothing_changes(sharpened):
+    feedback = pairs_with(lambda episode: False)
+    adapted = sharpened.adapt(feedback)
+    np.testing.assert_array_equal(adapted.beliefs_, sharpened.beliefs_)
+    np.testing.assert_array_equal(adapted.shift_, 0.0)
+    assert adapted.adaptation_.num_differing == 0
+    assert adapted.adaptation_.num_sets == NUM_PAIRS
+
+
+def test_a_robot_that_fails_more_lowers_every_gamma_and_one_that_fails_less_raises_it(sharpened):
+    before = sharpened.beliefs_[..., 0]
+    lower, higher = (sharpened.adapt(sets).beliefs_[..., 0] for sets in (worse(), better()))
+    assert np.all(lower <= before + 1e-12)
+    assert lower.sum() < before.sum() - 0.1
+    assert np.all(higher >= before - 1e-12)
+    assert higher.sum() > before.sum() + 0.1
+
+
+@pytest.mark.parametrize("make", [worse, better])
+def test_gamma_never_rises_in_a_cell_whose_feedback_was_unsafe(sharpened, make):
+    feedback = make()
+    adapted = sharpened.adapt(feedback)
+    unsafe = feedback_cells(sharpened, feedback, lambda segments: segments.is_unsafe)
+    assert sum(map(len, unsafe)) > 20
+    for cells, before, after, shift in zip(
+        unsafe, sharpened.beliefs_, adapted.beliefs_, adapted.shift_, strict=True
+    ):
+        cells = cells[cells >= 0]
+        assert np.all(after[cells, 0] <= before[cells, 0] + 1e-12)
+        assert np.all(shift[cells] >= 0.0)
+
+
+def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_it(sharpened):
+    before = sharpened.beliefs_.copy()
+    adapted = sharpened.adapt(worse())
+    np.testing.assert_array_equal(sharpened.beliefs_, before)
+    assert sharpened.adaptation_ is None
+    np.testing.assert_array_equal(sharpened.shift_, 0.0)
+    again = adapted.adapt(worse())
+    np.testing.assert_array_equal(again.beliefs_, adapted.beliefs_)
+    np.testing.assert_array_equal(adapted.prior_beliefs(), before)
+
+
+def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path):
+    held_out = worse(12)
+    for mode, assessment in fitted.items():
+        adapted = assessment.adapt(worse())
+        adapted.save(tmp_path / mode)
+        loaded = SafetyAssessment.load(tmp_path / mode)
+        assert loaded.adaptation_ == adapted.adaptation_
+        segments = segments_of(held_out, stride=5, shortest=10, discount=0.99, plain=False)
+        given = inputs(segments)
+        results = [
+            adapted.predict(*given),
+            loaded.predict(*given),
+            assessment.predict(*given, beliefs=adapted.beliefs_, shift=adapted.shift_),
+        ]
+        for field in dataclasses.fields(results[0]):
+            for other in results[1:]:
+                np.testing.assert_array_equal(
+                    getattr(other, field.name), getattr(results[0], field.name)
+                )
+        for row in range(0, len(segments), 7):
+            one = adapted.predict_one(*inputs(segments, row))
+            for name in ("calibrated", "normalized", "safety_probability"):
+                assert getattr(one, name) == pytest.approx(getattr(results[0], name)[row], abs=1e-3)
+        unmoved = assessment.predict(*given)
+        assert np.abs(unmoved.normalized - results[0].normalized).max() > 0.01
+
+
+def test_grid_and_published_probability_move_the_same_way(sharpened):
+    segments = segments_of(worse(), stride=3, shortest=10, discount=0.99, plain=False)
+    before = sharpened.predict(*inputs(segments))
+    after = sharpened.adapt(worse()).predict(*inputs(segments))
+    assert np.all(after.calibrated <= before.calibrated + 1e-12)
+    assert np.all(after.normalized <= before.normalized + 1e-9)
+    unsafe = sharpened.adapt(worse()).beliefs_
+    np.testing.assert_allclose(unsafe[..., :3].sum(axis=2), 1.0)
+    np.testing.assert_allclose(unsafe[..., 3:].sum(axis=2), unsafe[..., 1], atol=1e-12)
+
+
+def test_in_the_papers_mode_a_cell_far_from_all_feedback_keeps_its_prior(paper):
+    segments = paper.feedback_segments(worse(2))
+    x = paper._inputs(segments.state, segments.desired_preview, None)
+    points = paper.embedding_.embed(x)
+    adapted = paper.adapt(worse(2))
+    cells = paper.grid_.locate(paper.training_points_[0])
+    apart = np.linalg.norm(paper.training_points_[0][:, None] - points[0], axis=2).min(axis=1)
+    # The longest length scale allowed is 40: beyond it the deviation exceeds the gate.
+    far = np.setdiff1d(cells[apart > 40.0], cells[apart <= 40.0])
+    assert far.size > 0
+    np.testing.assert_array_equal(adapted.beliefs_[0, far], paper.beliefs_[0, far])
+
+
+def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper):
+    feedback = worse()
+    segments = paper.feedback_segments(feedback)
+    x = paper._inputs(segments.state, segments.desired_preview, None)
+    points = paper.embedding_.embed(x)[0]
+    discrepancy = DiscrepancyFunction().fit(points, np.abs(segments.score - segments.nominal_score))
+    mean, deviation = discrepancy.predict(paper.training_points_[0])
+    mu = updated_uncertainty(mean, deviation, gate=0.3, least=0.1, initial=0.3)
+    adapted = paper.adapt(feedback).beliefs_[0]
+    cells = paper.grid_.locate(paper.training_points_[0])
+    visited = set(paper.grid_.locate(points))
+    count = 0
+    for cell in set(cells) - visited - {-1}:
+        members = cells == cell
+        if members.sum() < paper.parameters.min_count:
+            continue
+        masses = from_scores(
+            paper.training_score_[members], mu[members], paper.training_cause_[members], 2
+        )
+        np.testing.assert_allclose(adapted[cell], fuse(masses), atol=1e-9)
+        count += 1
+    assert count > 0
+
+
+def test_the_feedback_belief_is_the_average_with_an_uncertainty_that_decays():
+    grid = Grid(resolution=2, cell_length=1.0)
+    certain = from_scores(np.array([0.0, 1.0, 1.0]), 0.0, np.array([-1, 0, 0]), 1)
+    cells = np.array([0, 0, 3])
+    beliefs = adaptation.feedback_beliefs(certain, cells, grid, AdaptationParameters(), 40)
+    mu = 0.3 * np.exp(-0.4)
+    np.testing.assert_allclose(beliefs[0], [0.5 * (1 - mu), 0.5 * (1 - mu), mu, 0.5 * (1 - mu)])
+    np.testing.assert_allclose(beliefs[3], [0.0, 0.7, 0.3, 0.7])
+    np.testing.assert_array_equal(beliefs[1], [*EMPTY, 0.0])
+    literal = AdaptationParameters(counts_per_cell=False)
+    beliefs = adaptation.feedback_beliefs(certain, cells, grid, literal, 40)
+    np.testing.assert_allclose(beliefs[[0, 3], 2], 0.3 * np.exp(-0.4 * 39))
+
+
+def test_prior_and_feedback_are_fused_by_hand_worked_weights():
+    prior = np.array([[0.63, 0.07, 0.3], [0.5, 0.2, 0.3], [0.0, 0.0, 1.0]])
+    feedback = np.array([[0.0, 0.9, 0.1], EMPTY, [0.7, 0.0, 0.3]])
+    both = adaptation.combined(prior, feedback)
+    weights = np.array([0.7 / 0.3, 0.9 / 0.1])
+    np.testing.assert_allclose(both[0, 0], weights[0] * 0.63 / weights.sum())
+    np.testing.assert_allclose(both[0, 2], (0.7 + 0.9) / weights.sum())
+    np.testing.assert_array_equal(both[1], prior[1])
+    np.testing.assert_allclose(both[2], feedback[2])
+
+
+def test_the_average_refuses_cells_that_are_not_as_many_as_beliefs():
+    with pytest.raises(ValueError, match="average_cells"):
+        average_cells(np.zeros((3, 3)), np.zeros(2, dtype=int), np.zeros(4))
+
+
+def test_the_shift_solves_its_own_equation():
+    rng = np.random.default_rng(0)
+    logit = rng.normal(size=50)
+    nominal = rng.random(50) < 0.3
+    actual = nominal | (rng.random(50) < 0.3)
+    b = adaptation.fitted_shift(logit, actual, nominal, weight=0.5, prior_std=2.0)
+    target = sigmoid(logit) + actual.astype(float) - nominal
+    assert 0.5 * (sigmoid(logit + b) - target).sum() + b / 4.0 == pytest.approx(0.0, abs=1e-6)
+    assert b > 0.0
+    mirrored = adaptation.fitted_shift(-logit, ~actual, ~nominal, weight=0.5, prior_std=2.0)
+    assert mirrored == pytest.approx(-b, abs=1e-6)
+
+
+def test_the_shift_stays_finite_however_large_the_gap():
+    logit = np.full(4000, -8.0)
+    every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
+    b = adaptation.fitted_shift(logit, every, none, weight=1.0, prior_std=2.0)
+    assert 8.0 < b < 1e5
+    assert np.isfinite(b)
+
+
+def test_the_discrepancy_is_high_where_scores_differ_and_unknown_far_away():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-60.0, 60.0, (300, 2))
+    difference = (points[:, 0] > 0.0).astype(float)
+    discrepancy = DiscrepancyFunction().fit(points, difference)
+    mean, deviation = discrepancy.predict(np.array([[40.0, 0.0], [-40.0, 0.0], [1e3, 0.0]]))
+    assert mean[0] > 0.9
+    assert mean[1] < 0.1
+    assert deviation[:2].max() < 0.3
+    assert deviation[2] == pytest.approx(1.0)
+    assert mean[2] == pytest.approx(0.0, abs=1e-9)
+    mu = updated_uncertainty(mean, deviation, gate=0.3, least=0.1, initial=0.3)
+    np.testing.assert_allclose(mu, [0.1 + 0.9 * mean[0], 0.1 + 0.9 * mean[1], 0.3])
+
+
+def test_points_that_are_not_finite_teach_nothing_and_are_not_known():
+    points = np.array([[0.0, 0.0], [np.nan, 0.0], [5.0, 5.0]])
+    discrepancy = DiscrepancyFunction().fit(points, np.array([1.0, 0.5, 1.0]))
+    mean, deviation = discrepancy.predict(points)
+    assert mean[0] > 0.5
+    assert (mean[1], deviation[1]) == (0.0, 1.0)
+    with pytest.raises(ValueError, match="none of the feedback's points"):
+        DiscrepancyFunction().fit(points[1:2], np.ones(1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scenario": "other"}, "differ in scenario: the feedback has other"),
+        ({"step_s": 0.05}, "differ in step_s"),
+        ({"constraint_names": ["a", "b"]}, "differ in constraint_names"),
+    ],
+)
+def test_feedback_of_another_scenario_is_refused(sharpened, change, message):
+    feedback = worse(2)
+    foreign = [
+        dataclasses.replace(one, info=dataclasses.replace(one.info, **change)) for one in feedback
+    ]
+    with pytest.raises(ValueError, match=message):
+        sharpened.adapt([feedback[0], foreign[1]])
+    other = [dataclasses.replace(one, nominal_hash="elsewhere") for one in feedback]
+    with pytest.raises(ValueError, match="nominal twin's scenario hash"):
+        sharpened.adapt(other)
+    with pytest.raises(ValueError, match="there is none"):
+        sharpened.adapt([])
+
+
+def test_a_method_that_does_not_exist_or_does_not_fit_is_refused(sharpened, paper):
+    with pytest.raises(ValueError, match="cannot adapt by 'luck'"):
+        sharpened.adapt(worse(), method="luck")
+    with pytest.raises(ValueError, match="'shift' takes maps with heads"):
+        paper.adapt(worse(), method="shift")
+
+
+def test_the_papers_update_can_be_asked_for_in_the_sharpened_mode(sharpened):
+    adapted = sharpened.adapt(worse(), method="paper")
+    assert adapted.adaptation_.method == "paper"
+    np.testing.assert_array_equal(adapted.shift_, 0.0)
+    assert np.any(adapted.beliefs_[..., UNCERTAINTY] < 0.29)
+
+
+def test_a_twin_is_missing_or_begins_elsewhere():
+    episodes = make_episodes(3, noise=0.002)
+    with pytest.raises(ValueError, match=r"episode 2 .* has no nominal twin"):
+        feedback_sets(episodes, episodes[:2])
+    shifted = [
+        dataclasses.replace(e, true_state=e.true_state + 0.1 * (e.index == 1)) for e in episodes
+    ]
+    with pytest.raises(ValueError, match="twin of episode 1 begins elsewhere"):
+        feedback_sets(episodes, Episodes(episodes.info, shifted))
+
+
+def test_a_pair_that_diverged_says_nothing():
+    episodes = make_episodes(4, noise=0.002)
+    broken = [
+        dataclasses.replace(e, is_safe=False, cause="diverged") if e.index == 1 else e
+        for e in episodes
+    ]
+    feedback = feedback_sets(Episodes(episodes.info, broken), episodes)
+    assert [one.index for one in feedback] == [0, 2, 3]
+
+
+def test_a_twin_that_has_ended_scores_one():
+    (one,) = pairs_with(lambda episode: False, num=1)
+    ended = dataclasses.replace(
+        one,
+        nominal_is_unsafe=True,
+        nominal_remaining_steps=np.maximum(3 - one.steps_since_start, 0),
+        is_unsafe=False,
+        cause=-1,
+    )
+    segments = segments_of([ended], stride=1, shortest=10, discount=0.9, plain=False)
+    np.testing.assert_allclose(segments.nominal_score[:5], [0.9**3, 0.9**2, 0.9, 1.0, 1.0])
+    np.testing.assert_array_equal(segments.score, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gate", -1.0), ("least_uncertainty", 1.1), ("update_interval", 0), ("shift_std", 0.0)],
+)
+def test_adaptation_parameters_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        AdaptationParameters(**{name: value})
+
+
+def test_the_adaptation_defaults_are_the_papers_table():
+    parameters = AdaptationParameters()
+    assert (parameters.gate, parameters.least_uncertainty) == (0.3, 0.1)
+    assert (parameters.decay_rate, parameters.first_uncertainty) == (0.4, 0.3)
+    assert parameters.update_interval == 40

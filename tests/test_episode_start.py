@@ -1,0 +1,111 @@
+"""Episodes that begin with a given state and plan: the twin of what another loop did."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from drake_safety import load_scenario, run_episode
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.rollouts import episode_rng
+from gliding_task import SCENARIO
+from reaching_loops import EASY, easy_episode, evaluated, porter, started
+from test_balancing import PACKAGED, standing_loop
+from test_rollouts import ARRAYS, gliding
+
+assert SCENARIO
+
+
+def short_balancing(variation="nominal", **options):
+    scenario = load_scenario("laikago_balancing")
+    scenario.episode_duration_s = 0.4
+    scenario.parameters.push.share = 0.0
+    return scenario.make_loop(variation, **options)
+
+
+@pytest.fixture(scope="module")
+def balancing():
+    return short_balancing()
+
+
+def start_at(loop, index, seed=0, **goal):
+    """What an episode of the loop begins with, and the generator after it was drawn."""
+    context = loop.CreateDefaultContext()
+    rng = episode_rng(seed, index)
+    loop.reset(context, rng, **goal)
+    return loop.start_of(context)
+
+
+def test_a_start_gives_the_same_episode_again(balancing):
+    episode = run_episode(balancing, 4)
+    twin = run_episode(balancing, 7, start=start_at(balancing, 4))
+    for name in set(ARRAYS) - {"state", "features"}:  # What noise enters is another's.
+        np.testing.assert_array_equal(getattr(twin, name), getattr(episode, name), err_msg=name)
+    assert (twin.is_safe, twin.cause) == (episode.is_safe, episode.cause)
+    assert not np.array_equal(twin.state, episode.state)
+
+
+def test_a_reaching_start_gives_the_same_episode_again_whichever_hand_reaches():
+    for hand, mirrored in (("left", 1.0), ("right", -1.0)):
+        loop = porter("nominal", hand=hand)
+        start = start_at(loop, 0, goal=EASY * [1.0, mirrored, 1.0])
+        twin = run_episode(loop, 0, start=start)
+        for name in ARRAYS:
+            np.testing.assert_array_equal(
+                getattr(twin, name), getattr(easy_episode("nominal", hand), name), err_msg=name
+            )
+
+
+def test_a_start_in_mid_motion_takes_the_rest_of_the_plan_along(balancing):
+    context = balancing.CreateDefaultContext()
+    balancing.reset(context, np.random.default_rng(0))
+    context.SetTime(0.12)
+    ahead = evaluated(balancing, context, "desired_preview").copy()
+    twin = balancing.CreateDefaultContext()
+    balancing.reset_to(twin, None, balancing.start_of(context))
+    assert twin.get_time() == 0.0
+    np.testing.assert_allclose(evaluated(balancing, twin, "desired_preview"), ahead, atol=1e-12)
+
+
+def test_without_a_generator_the_first_instant_is_seen_as_it_is(balancing):
+    start = start_at(balancing, 0)
+    context = balancing.CreateDefaultContext()
+    balancing.reset_to(context, None, start)
+    true_state = evaluated(balancing, context, "true_state")
+    np.testing.assert_array_equal(evaluated(balancing, context, "state"), true_state)
+    balancing.reset_to(context, np.random.default_rng(0), start)
+    assert not np.array_equal(evaluated(balancing, context, "state"), true_state)
+
+
+def test_feet_that_are_not_named_stand_on_the_ground_below_where_they_are():
+    loop = standing_loop(PACKAGED)
+    start = start_at(loop, 0)
+    q = start.q.copy()
+    q[4:7] += [0.3, -0.2, 0.01]
+    feet = EpisodeStart(q=q, v=start.v, plan=start.plan).feet(loop.kinematics)
+    np.testing.assert_allclose(feet, start.foot_positions + [0.3, -0.2, 0.0], atol=1e-6)
+
+
+def test_a_start_that_does_not_fit_the_robot_is_refused(balancing):
+    good = start_at(balancing, 0)
+    context = balancing.CreateDefaultContext()
+    for changes, message in [
+        ({"q": good.q[:-1]}, "q must be 19 finite numbers"),
+        ({"v": good.v * np.nan}, "v must be 18 finite numbers"),
+        ({"q": good.q * 2}, "quaternion must have a norm of 1"),
+        ({"foot_positions": np.zeros((2, 3))}, "must be 4 finite points"),
+    ]:
+        start = copy.copy(good)
+        for name, value in changes.items():
+            setattr(start, name, value)
+        with pytest.raises(ValueError, match=message):
+            balancing.reset_to(context, None, start)
+
+
+def test_a_task_without_a_robot_cannot_begin_with_a_start_nor_a_start_with_a_goal(balancing):
+    start = start_at(balancing, 0)
+    with pytest.raises(ValueError, match="'Gliding' cannot begin with a given start"):
+        run_episode(gliding().make_loop(), start=start)
+    with pytest.raises(ValueError, match="leave out the goal"):
+        run_episode(porter(), start=start, goal=EASY)
+    assert started(porter()).get_time() == 0.0
