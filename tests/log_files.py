@@ -103,7 +103,19 @@ joint_positions: {template: "{joint}_pos", unit: deg}
 joint_velocities: {template: "{joint}_vel"}
 desired_output: {columns: [goal_x, goal_y, goal_z]}
 foot_positions:
-  columns: [feet_0, feet_1, feet_2, feet_3, feet_4, feet_5, feet_6, feet_7, feet_8, feet_9, feet_10, feet_11]
+  columns:
+    - feet_0
+    - feet_1
+    - feet_2
+    - feet_3
+    - feet_4
+    - feet_5
+    - feet_6
+    - feet_7
+    - feet_8
+    - feet_9
+    - feet_10
+    - feet_11
 """
 
 MESSAGE_MAP = """
@@ -113,7 +125,11 @@ base_position:
   columns: [pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
 base_orientation:
   topic: /odom
-  columns: [pose.pose.orientation.x, pose.pose.orientation.y, pose.pose.orientation.z, pose.pose.orientation.w]
+  columns:
+    - pose.pose.orientation.x
+    - pose.pose.orientation.y
+    - pose.pose.orientation.z
+    - pose.pose.orientation.w
   order: xyzw
 base_linear_velocity:
   topic: /odom
@@ -128,7 +144,19 @@ joint_velocities: {topic: /joint_states, template: "velocity[{joint}]"}
 desired_output: {topic: /goal, columns: [point.x, point.y, point.z]}
 foot_positions:
   topic: /feet
-  columns: ["position[0]", "position[1]", "position[2]", "position[3]", "position[4]", "position[5]", "position[6]", "position[7]", "position[8]", "position[9]", "position[10]", "position[11]"]
+  columns:
+    - "position[0]"
+    - "position[1]"
+    - "position[2]"
+    - "position[3]"
+    - "position[4]"
+    - "position[5]"
+    - "position[6]"
+    - "position[7]"
+    - "position[8]"
+    - "position[9]"
+    - "position[10]"
+    - "position[11]"
 """
 
 

@@ -114,5 +114,5 @@ def test_what_gives_no_episode_is_refused():
     with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
         episodes_from_log(log, porter())
     low = dataclasses.replace(log, q=log.q - np.eye(log.q.shape[1])[6] * 0.1)
-    with pytest.raises(ValueError, match="begins outside the safe set.*'height'"):
+    with pytest.raises(ValueError, match=r"begins outside the safe set.*'height'"):
         episodes_from_log(low, balancing_loop())

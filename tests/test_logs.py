@@ -100,8 +100,10 @@ SPOILT = {
                "line 2, column 'goal_x': 'stop' is no number"),
     "no unit quaternion": (lambda f: f.assign(quat_x=f.quat_x + (f.index == 4)), [],
                            "line 6, columns .*norm of 1.4"),
-    "quaternion order": (lambda f: f, [("order: xyzw", "order: wxyz")],
-                         "line 2: .*tilted by .*would stand if 'base_orientation.order' is xyzw"),
+    "quaternion order": (
+        lambda f: f.rename(columns={"quat_w": "quat_x", "quat_x": "quat_y", "quat_y": "quat_z",
+                                    "quat_z": "quat_w"}), [],
+        "line 2: .*tilted by .*would stand if 'base_orientation.order' is wxyz"),
     "degrees as radians": (lambda f: f, [('_pos", unit: deg', '_pos", unit: rad')],
                            "its stops are .*would stand if 'joint_positions.unit' is deg"),
     "millimetres as metres": (lambda f: f, [("base_z], unit: mm", "base_z], unit: m")],
@@ -112,8 +114,8 @@ SPOILT = {
                      r"2.5 apart, .* one of \['ms'\]"),
     "goal in millimetres": (lambda f: f.assign(goal_z=1e3 * f.goal_z), [],
                             "desired output is .* m from the base"),
-    "rates in degrees": (lambda f: f.assign(gyro_x=200.0), [("unit: deg, frame", "unit: rad, frame")],
-                         "column 'gyro_x': velocities are 200 "),
+    "rates in degrees": (lambda f: f.assign(gyro_x=200.0), [("deg, frame", "rad, frame")],
+                         "column 'gyro_x': velocities are 199 "),
     "a joint beyond its stop": (
         lambda f: f.assign(**{f"{JOINTS[2]}_pos": f[f"{JOINTS[2]}_pos"] + 200.0 * (f.index == 9)}),
         [], rf"line 11, column '{JOINTS[2]}_pos': joint .* far beyond its stops"),
@@ -125,6 +127,11 @@ def test_what_is_wrong_is_named_with_row_and_column(what, few_rows, tmp_path):
     spoil, changes, message = SPOILT[what]
     with pytest.raises(ValueError, match=message):
         read_csv(spoil(frame_of(few_rows, JOINTS)), tmp_path, *changes)
+
+
+def test_a_quaternion_order_that_turns_the_robot_around_is_told_by_its_sliding_feet(tmp_path):
+    with pytest.raises(ValueError, match=r"line 2 and .* slide by .* 'base_orient.* is xyzw"):
+        read_csv(frame_of(recorded(UNSAFE), JOINTS), tmp_path, ("order: xyzw", "order: wxyz"))
 
 
 def test_messages_that_lack_something_say_what_there_is(few_rows, tmp_path):

@@ -21,6 +21,8 @@ _FOOT_SHARE = 0.2  # Of the standing height: how far the lowest foot may seem of
 _FAR_RAD = 0.3  # Beyond a joint's stop no servo, and no offset of an encoder, gets it.
 _REACH_SHARE = 3.0  # Of the standing height: how far from the base z* can be.
 _RATE_FACTOR = 20.0  # Degrees for radians make 57, millimetres for metres 1000.
+_SLIP_M = 0.004  # Feet that stand are seen to slide by less, encoders and all.
+_SLIP_FACTOR = 3.0
 _MOVING = 1.0  # Velocities below this are not compared with derivatives.
 
 
@@ -145,6 +147,40 @@ def check_first_row(
         f"{where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the "
         f"start: {wrong}{hint}"
     )
+
+
+def check_stillness(
+    kinematics: RobotKinematics,
+    log_map: LogMap,
+    positions: Callable[[LogMap], np.ndarray],
+    where: str,
+) -> None:
+    """Refuses a quaternion in whose other order the feet would stand far more still.
+
+    x y z w read as w x y z turns an upright robot by half a turn about the vertical: it stands,
+    but as its base moves to one side its feet seem to slide to it twice as far.
+
+    Args:
+        kinematics: The robot.
+        log_map: The map as it is.
+        positions: Positions (N, n_q) at some rows, if read by a map.
+        where: The rows in words.
+
+    Raises:
+        ValueError: Says how far the feet slide in either order.
+    """
+    other = copy.deepcopy(log_map)
+    (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
+    slips = []
+    for read_by in (log_map, other):
+        feet = np.array([kinematics.contact_positions(q) for q in positions(read_by)])
+        slips.append(float(np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))))
+    if slips[0] > _SLIP_M and slips[0] > _SLIP_FACTOR * slips[1]:
+        raise ValueError(
+            f"{where}: the feet of robot '{kinematics.robot.name}' slide by {slips[0]:.3g} m, and "
+            f"by {slips[1]:.3g} m only if 'base_orientation.order' is "
+            f"{other.base_orientation.order}: it probably is"
+        )
 
 
 def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:

@@ -31,6 +31,8 @@ from drake_safety.logs.tables import read_csv, read_parquet
 FORMATS = (".csv", ".parquet", ".mcap", ".bag")
 """Suffixes of the files that can be read; a folder is a ROS 2 bag."""
 
+_NUM_LOOKS = 50  # Rows, all over a log, at which its feet are looked at.
+
 
 @dataclass(kw_only=True, eq=False)
 class RobotLog:
@@ -201,6 +203,10 @@ def _converted(
 
     checks.check_first_row(
         kinematics, log_map, lambda read_by: positions(read_by, at_s[:1])[0], where
+    )
+    some = at_s[:: max(len(at_s) // _NUM_LOOKS, 1)]
+    checks.check_stillness(
+        kinematics, log_map, lambda read_by: positions(read_by, some), f"{where} and after it"
     )
     q = positions(log_map, at_s)
     v = _velocities(log_map, kinematics, channels, times, at_s)
