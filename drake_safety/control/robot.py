@@ -25,6 +25,9 @@ from pydrake.systems.framework import Context
 
 from drake_safety.control.robot_model import RobotModel, by_pattern
 
+ENGINES = ("drake", "mujoco")
+"""Physics engines that a plant variation may choose."""
+
 
 @dataclass(kw_only=True)
 class ObservationNoise:
@@ -40,6 +43,8 @@ class ObservationNoise:
 class PlantVariation:
     """How one plant differs from the published robot: a reality gap, as data."""
 
+    engine: str = "drake"
+    """Whose physics: ``drake`` or ``mujoco``."""
     mass_scale: float = 1.0
     """Factor on every body's spatial inertia."""
     joint_friction_nm: float = 0.0
@@ -54,6 +59,10 @@ class PlantVariation:
     """Noise on the assessor's inputs alone; the closed loop's motion never sees it."""
 
     def __post_init__(self) -> None:
+        if self.engine not in ENGINES:
+            raise ValueError(
+                f"plant variation: engine must be one of {list(ENGINES)}; got '{self.engine}'"
+            )
         for name in ("mass_scale", "foot_friction"):
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -275,6 +284,25 @@ def actuation_matrix(
         if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
             matrix[row, joint_names.index(name)] = 1.0
     return matrix
+
+
+def servo_matrix(plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]) -> np.ndarray:
+    """Maps joint positions and velocities onto the robot's servos, by name.
+
+    Actuators that are the joints' dry friction hold velocity zero.
+
+    Args:
+        plant: The finalised plant.
+        robot: The robot.
+        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
+
+    Returns:
+        (2 n_u, 2 n_j), in the order of ``plant.get_desired_state_input_port(instance)``.
+
+    Raises:
+        ValueError: An actuated joint is not among the names.
+    """
+    return np.kron(np.eye(2), actuation_matrix(plant, robot, joint_names))
 
 
 def apply_mass_scale(

@@ -57,7 +57,8 @@ def begin_push(loop: ClosedLoop, context: Context, push: Push) -> None:
     body = plant.GetBodyByName(push.body, instance)
     force = ExternallyAppliedSpatialForce()
     force.body_index = body.index()
-    force.p_BoBq_B = body.CalcCenterOfMassInBodyFrame(plant.GetMyContextFromRoot(context))
+    # No variation moves a centre of mass, and the plant's own Context is not in every diagram.
+    force.p_BoBq_B = body.default_com()
     force.F_Bq_W = SpatialForce(np.zeros(3), np.array(push.force_n, dtype=float))
     loop.GetInputPort("applied_spatial_force").FixValue(context, [force])
 

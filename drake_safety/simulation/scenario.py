@@ -137,6 +137,10 @@ class Scenario:
             for name, values in text["variations"].items()
             if name in ("nominal", variation)
         }
+        for values in text["variations"].values():
+            # Sets that were recorded before there was a choice stay valid.
+            if values["engine"] == "drake":
+                del values["engine"]
         # A robot of one's own is known by its files, wherever their folder lies.
         text["robot"] = Path(self.robot).name
         task = self.task_class()
