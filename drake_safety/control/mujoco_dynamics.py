@@ -71,7 +71,7 @@ class MujocoDynamics:
             robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
         )
         self._scratch = mujoco.MjData(self.model)
-        self._commands = np.array(commands, dtype=int)
+        self.command_places = np.array(commands, dtype=int)
         self.joint_names = joint_order(plant, robot)
         self.num_command = len(self.joint_names) * (2 if servos else 1)
         model = self.model
@@ -140,7 +140,7 @@ class MujocoDynamics:
         mujoco, model, scratch = self._mujoco, self.model, self._scratch
         scratch.time = 0.0
         scratch.qpos[:], scratch.qvel[:], scratch.qacc_warmstart[:] = self._parts(state)
-        scratch.ctrl[:] = command[self._commands]
+        scratch.ctrl[:] = command[self.command_places]
         scratch.qfrc_applied[:] = 0.0
         if forces:
             self._apply(forces)

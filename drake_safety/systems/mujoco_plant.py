@@ -37,7 +37,7 @@ class MujocoPlant(LeafSystem):
 
     def __init__(self, dynamics: MujocoDynamics, plant: MultibodyPlant):
         super().__init__()
-        self._dynamics = dynamics
+        self.dynamics = dynamics
         self._plant = plant
         n_q, n_v = dynamics.num_positions, dynamics.num_velocities
         self._n_q = n_q
@@ -61,10 +61,10 @@ class MujocoPlant(LeafSystem):
             context: This system's Context.
             plant_state: Drake's ``[q; v]`` of the robot, (n_q + n_v,).
         """
-        context.SetDiscreteState(self._dynamics.state_from(np.asarray(plant_state, dtype=float)))
+        context.SetDiscreteState(self.dynamics.state_from(np.asarray(plant_state, dtype=float)))
 
     def _plant_state(self, context: Context) -> np.ndarray:
-        return self._dynamics.plant_state(context.get_discrete_state_vector().get_value())
+        return self.dynamics.plant_state(context.get_discrete_state_vector().get_value())
 
     def _forces(self, context: Context) -> list[PointForce]:
         if not self._force_port.HasValue(context):
@@ -82,7 +82,7 @@ class MujocoPlant(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = context.get_discrete_state_vector().get_value()
         command = self._command_port.Eval(context)
-        discrete_state.set_value(self._dynamics.step(state, command, self._forces(context)))
+        discrete_state.set_value(self.dynamics.step(state, command, self._forces(context)))
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._plant_state(context))
