@@ -1,7 +1,9 @@
 """Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -21,10 +23,17 @@ from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.physics import Scene, add_physics
-from drake_safety.simulation.pushes import Push
+from drake_safety.simulation.pushes import Push, RandomPushes
+from drake_safety.simulation.reaching_sampling import (
+    Detours,
+    FairTargets,
+    PostureSampling,
+    TargetSampling,
+)
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.view import View
 from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
@@ -32,84 +41,7 @@ from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
 _MAX_TRIES = 100
-
-
-@dataclass(kw_only=True)
-class PostureSampling:
-    """Random standing postures. Half-widths about the standing one, unless it says otherwise."""
-
-    base_offset_m: list[float] = field(default_factory=lambda: [0.02, 0.02])
-    """Along x and along y."""
-    base_lowering_m: float = 0.08
-    """How far at most the base is lowered."""
-    tilt_rad: float = 0.03
-    """Of roll, pitch and yaw of the base, each."""
-    joint_offset_rad: float = 0.1
-    """Of every joint that belongs to no leg."""
-    clearance_m: float = 0.02
-    """Least distance of the arms to an obstacle."""
-
-    def __post_init__(self) -> None:
-        if len(self.base_offset_m) != 2:
-            raise ValueError(f"start: base_offset_m must be [x, y]; got {self.base_offset_m}")
-        for name in (
-            "base_offset_m",
-            "base_lowering_m",
-            "tilt_rad",
-            "joint_offset_rad",
-            "clearance_m",
-        ):
-            value = np.asarray(getattr(self, name), dtype=float)
-            if not ((value >= 0) & np.isfinite(value)).all():
-                raise ValueError(
-                    f"start: {name} must be finite and not negative; got {getattr(self, name)}"
-                )
-
-
-@dataclass(kw_only=True)
-class TargetSampling:
-    """The box that targets of the trained hand are drawn from, in the world [m].
-
-    The other hand's targets come from its mirror image.
-    """
-
-    x_m: list[float] = field(default_factory=lambda: [0.45, 1.0])
-    y_m: list[float] = field(default_factory=lambda: [-0.3, 1.3])
-    z_m: list[float] = field(default_factory=lambda: [0.5, 1.6])
-
-    def __post_init__(self) -> None:
-        for name in ("x_m", "y_m", "z_m"):
-            bounds = getattr(self, name)
-            if len(bounds) != 2 or not -np.inf < bounds[0] < bounds[1] < np.inf:
-                raise ValueError(f"target: {name} must be [lowest, highest], finite; got {bounds}")
-
-    @property
-    def box(self) -> np.ndarray:
-        """Lowest and highest corner, (2, 3) [m]."""
-        return np.array([self.x_m, self.y_m, self.z_m], dtype=float).T
-
-
-@dataclass(kw_only=True)
-class FairTargets:
-    """The part of the target box in which a verdict is neither trivial nor absurd, in the world.
-
-    Bounds that are left empty are the target box's own.
-    """
-
-    x_m: list[float] = field(default_factory=list)
-    y_m: list[float] = field(default_factory=list)
-    z_m: list[float] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        for name in ("x_m", "y_m", "z_m"):
-            bounds = getattr(self, name)
-            if bounds and (len(bounds) != 2 or not bounds[0] < bounds[1]):
-                raise ValueError(f"fair: {name} must be [lowest, highest] or empty; got {bounds}")
-
-    def box(self, target: TargetSampling) -> np.ndarray:
-        """Lowest and highest corner, (2, 3) [m]."""
-        bounds = [getattr(self, name) or getattr(target, name) for name in ("x_m", "y_m", "z_m")]
-        return np.array(bounds, dtype=float).T
+_PUSH_PERIOD_S = 0.02
 
 
 @dataclass(kw_only=True)
@@ -128,6 +60,9 @@ class ReachingParameters:
     safe_set: ReachingLimits = field(default_factory=ReachingLimits)
     start: PostureSampling = field(default_factory=PostureSampling)
     target: TargetSampling = field(default_factory=TargetSampling)
+    random_pushes: RandomPushes = field(default_factory=RandomPushes)
+    """Pushes that episodes begin with, so that Γ knows what follows one."""
+    detours: Detours = field(default_factory=Detours)
     fair: FairTargets = field(default_factory=FairTargets)
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
@@ -175,6 +110,8 @@ class Reaching(ClosedLoop):
         assessment: Γ; adds the assessor.
         meshcat: Adds a visualiser.
         hand: Which hand reaches; the scenario's by default.
+        exploring: Whether episodes without a goal of their own also make detours and are pushed,
+            as the scenario says; else every plan is the straight one, undisturbed.
 
     Raises:
         ValueError: A robot without feet or reaching frames, an unknown hand, one that is neither
@@ -183,6 +120,7 @@ class Reaching(ClosedLoop):
     """
 
     Parameters = ReachingParameters
+    judging_options = MappingProxyType({"exploring": False})
     online_parameters = (
         "decorations",
         "fair",
@@ -200,6 +138,7 @@ class Reaching(ClosedLoop):
         assessment: SafetyAssessment | None = None,
         meshcat: Meshcat | None = None,
         hand: str | None = None,
+        exploring: bool = True,
     ):
         super().__init__(scenario, variation, assessment)
         parameters = scenario.parameters
@@ -207,6 +146,7 @@ class Reaching(ClosedLoop):
         robot = load_robot(scenario.robot)
         if not robot.reaching_frames:
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
+        self._is_exploring = exploring
         trained_hand = parameters.hand or next(iter(robot.reaching_frames))
         self.hand = trained_hand if hand is None else hand
         for name in (trained_hand, self.hand):
@@ -290,6 +230,10 @@ class Reaching(ClosedLoop):
         for name in ("desired_output", "desired_output_rate"):
             builder.Connect(planner.GetOutputPort(name), controller.GetInputPort(name))
         physics.connect_torques(builder, controller.GetOutputPort("actuation"))
+        self._push_source = builder.AddNamedSystem(
+            "push_source", PushSource(self.plant, physics.instance, period_s=_PUSH_PERIOD_S)
+        )
+        builder.Connect(self._push_source.get_output_port(), physics.applied_spatial_force)
 
         clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)
         self.safe_set = ReachingSafeSet(
@@ -344,7 +288,6 @@ class Reaching(ClosedLoop):
         builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
         builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
         builder.ExportOutput(plant_state, "plant_state")
-        builder.ExportInput(physics.applied_spatial_force, "applied_spatial_force")
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, physics.scene_graph, meshcat)
         self.finish(builder)
@@ -380,29 +323,30 @@ class Reaching(ClosedLoop):
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """The target of an episode in the world, (3,) [m], as exact as feet are placed."""
-        return self._ends_of_plan(episode)[1]
+        return self._shape_of_plan(episode)[1]
 
     def is_fair(self, episode: Episode) -> bool:
         """Whether the target is in the fair box, and the plan leads through no obstacle."""
-        path = np.linspace(*self._ends_of_plan(episode), _NUM_OUTLOOK)
+        start, goal, detour = self._shape_of_plan(episode)
+        path = _points_of_plan(np.linspace(0, 1, _NUM_OUTLOOK)) @ [start, goal, detour]
         radius_m = self.robot.reaching_frame(self.hand).radius_m
         is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
         return bool(is_clear) and super().is_fair(episode)
 
-    def _ends_of_plan(self, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
-        """Where the hand's motion begins and where it leads, in the world, (3,) each [m]."""
+    def _shape_of_plan(self, episode: Episode) -> np.ndarray:
+        """Start, goal and detour of the hand's motion in the world, (3, 3) [m]."""
         # The preview carries no noise, but it may end before the motion does.
-        preview = episode.desired_preview[episode.first_step].reshape(-1, 3)
+        preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        seen_s = min(self.scenario.step_s * (len(preview) - 1), duration_s)
-        progress = interpolate(np.zeros(1), np.ones(1), duration_s).value(seen_s).item()
-        start = preview[0]
-        ends = np.array([start, start + (preview[-1] - start) / progress])
+        seen_s = self.scenario.step_s * np.arange(len(preview))
+        motion = interpolate(np.zeros(1), np.ones(1), duration_s)
+        progress = motion.vector_values(seen_s.tolist()).ravel()
+        shape, *_ = np.linalg.lstsq(_points_of_plan(progress), preview, rcond=None)
         if self.mirror is not None:
-            ends = self.mirror.points(ends)
+            shape = self.mirror.points(shape)
         # An episode begins on the feet of the standing posture.
-        ends[:, :2] -= self.kinematics.nominal_base_offset
-        return ends[0], ends[1]
+        shape[:2, :2] -= self.kinematics.nominal_base_offset
+        return shape
 
     def num_controller_failures(self, context: Context) -> int:
         """Ticks whose quadratic program had no solution."""
@@ -419,19 +363,51 @@ class Reaching(ClosedLoop):
             goal: Target in the world, (3,) [m], in place of a random one.
 
         Returns:
-            0: nothing disturbs an episode.
+            0, or the first step after the push that an episode begins with.
 
         Raises:
             ValueError: The goal is not three finite numbers.
             RuntimeError: No posture that is drawn is in the safe set.
         """
         q = self._sample_posture(rng)
-        drawn = rng.uniform(*self.scenario.parameters.target.box)
+        parameters = self.scenario.parameters
+        drawn = rng.uniform(*parameters.target.box)
+        detour = push = None
+        noise_rng = rng.spawn(1)[0]
         if goal is None:
             goal = drawn if self.mirror is None else self.mirror.points(drawn)
-        self._set(context, q, goal)
-        self._observers.reseed(context, rng)
-        return 0
+            if self._is_exploring:
+                push = parameters.random_pushes.sample(rng, self.robot.base)
+                detour = parameters.detours.sample(rng)
+        if detour is not None and self.mirror is not None:
+            detour = self.mirror.points(detour)
+        self._set(context, q, goal, detour)
+        self._observers.reseed(context, noise_rng)
+        if push is None:
+            return 0
+        if self.mirror is not None:
+            push = replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
+        self.set_push(context, push)
+        end_s = push.time_s + push.duration_s + _PUSH_PERIOD_S
+        return math.ceil(end_s / self.scenario.step_s)
+
+    def set_push(self, context: Context, push: Push) -> None:
+        """Plans a push on a body of the robot, in the run that was reset.
+
+        Args:
+            context: The diagram's Context.
+            push: Where, how hard, when.
+
+        Raises:
+            ValueError: The robot has no such body.
+        """
+        self._push_source.set_push(
+            self._push_source.GetMyMutableContextFromRoot(context),
+            push.body,
+            np.asarray(push.force_n, dtype=float),
+            start_s=push.time_s,
+            duration_s=push.duration_s,
+        )
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
@@ -475,14 +451,23 @@ class Reaching(ClosedLoop):
                 q, _ = self.mirror.plant_state(q, v, np.zeros(3))
             margins = self.safe_set.margins(q, v)
             clearance = margins[self.safe_set.names.index("collision")]
-            if clearance >= sampling.clearance_m and margins.min() > 0:
+            stops = margins[self.safe_set.names.index("joint_limits")]
+            is_clear = clearance >= sampling.clearance_m and stops >= sampling.joint_margin_rad
+            if is_clear and margins.min() > 0:
                 return q
         raise RuntimeError(
             f"reaching: none of {_MAX_TRIES} random postures of robot '{self.robot.name}' is in "
-            f"the safe set with a clearance of {sampling.clearance_m} m: narrow 'start'"
+            f"the safe set with a clearance of {sampling.clearance_m} m and "
+            f"{sampling.joint_margin_rad} rad off the joints' stops: narrow 'start'"
         )
 
-    def _set(self, context: Context, q: np.ndarray, goal: np.ndarray) -> None:
+    def _set(
+        self,
+        context: Context,
+        q: np.ndarray,
+        goal: np.ndarray,
+        detour: np.ndarray | None = None,
+    ) -> None:
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
             raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
@@ -490,6 +475,7 @@ class Reaching(ClosedLoop):
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
+        self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
         v = np.zeros(kinematics.num_velocities)
         with self._physics.edited(context) as plant_context:
             self.plant.SetPositionsAndVelocities(
@@ -506,7 +492,13 @@ class Reaching(ClosedLoop):
             X_SW @ model.reaching_position(q),
             X_SW @ goal,
             self.scenario.parameters.plan_duration_s,
+            detour=None if detour is None else X_SW.rotation() @ detour,
         )
         self._planner.set_plan(
             self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose
         )
+
+
+def _points_of_plan(progress: np.ndarray) -> np.ndarray:
+    """Shares of start, goal and detour in the plan's points, (M, 3), see ``interpolate``."""
+    return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)

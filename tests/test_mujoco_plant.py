@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 import reaching_loops
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.control.robot import PlantVariation
-from drake_safety.simulation.pushes import Push, begin_push, end_push
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import parse_scenario
 from drake_safety.simulation.throws import ViolationCounter
 from legged_robots import robot_kinematics
@@ -150,15 +150,14 @@ def test_episodes_depend_on_seed_and_number_alone():
 def test_a_push_moves_the_robot_as_far_as_in_drake():
     scenario = load_scenario("atlas_reaching")
     scenario.variations = {"nominal": PlantVariation(), "mujoco": MUJOCO}
-    push = Push(body="utorso", force_n=[0.0, 300.0, 0.0])
+    push = Push(body="utorso", force_n=[0.0, 300.0, 0.0], time_s=0.0, duration_s=0.04)
     moved = []
     for variation in scenario.variations:
         loop = scenario.make_loop(variation)
         context = loop.CreateDefaultContext()
         loop.reset_standing(context, [0.6, 0.3, 1.0])
-        begin_push(loop, context, push)
+        loop.set_push(context, push)
         state = advanced(loop, context, 0.04)
-        end_push(loop, context)
         plant = loop.kinematics.plant
         robot_context = plant.CreateDefaultContext()
         plant.SetPositionsAndVelocities(robot_context, state)

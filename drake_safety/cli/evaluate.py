@@ -109,6 +109,7 @@ def evaluate(
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
     train_set = load_episodes(episodes_folder(assessment))
+    _check_same_simulation(train_set.info, loaded.simulation_hash())
     check_options(loop, options, len(train_set))
     # Episodes, throws, those that thresholds are chosen on, and the other hand's.
     used = range(seed, seed + (5 if has_goals else 4))
@@ -121,6 +122,7 @@ def evaluate(
 
         def run_set(what: str, num_episodes: int, offset: int, **loop_options: Any) -> Episodes:
             path = None
+            loop_options = {**loop.judging_options, **loop_options}
             if has_goals:
                 path = fresh_episodes_folder(
                     assessment, loaded.simulation_hash(), seed + offset, loop_options
@@ -136,7 +138,6 @@ def evaluate(
             )
 
         test_set = run_set("fresh nominal episodes", episodes, 0)
-        _check_same_simulation(train_set.info, test_set.info)
         calibration_set = run_set("calibration episodes", calibration_episodes, 3)
         shortest = sharpened.parameters.shortest_segment or None
         judged = Judged(
@@ -167,7 +168,7 @@ def evaluate(
     report = {
         "command": command_line(),
         "scenario": loaded.name,
-        "scenario_hash": test_set.info.scenario_hash,
+        "scenario_hash": train_set.info.scenario_hash,
         "seed": seed,
         "training_seed": train_set.info.seed,
         "training_episodes": len(train_set),
@@ -256,12 +257,12 @@ def _throws_picture(study: ThrowStudy) -> Picture:
     )
 
 
-def _check_same_simulation(trained: EpisodesInfo, fresh: EpisodesInfo) -> None:
-    if trained.scenario_hash != fresh.scenario_hash:
+def _check_same_simulation(trained: EpisodesInfo, scenario_hash: str) -> None:
+    if trained.scenario_hash != scenario_hash:
         raise ValueError(
             f"evaluate: the assessment's episodes were made by scenario '{trained.scenario}' with "
-            f"hash {trained.scenario_hash[:12]}, but '{fresh.scenario}' now has hash "
-            f"{fresh.scenario_hash[:12]}: train again"
+            f"hash {trained.scenario_hash[:12]}, which now has hash {scenario_hash[:12]}: train "
+            "again"
         )
 
 

@@ -118,7 +118,9 @@ def evaluate_plans(
     num_other = len(judged.test_set) if options.other_hand is None else options.other_hand
     if mirror and num_other:
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
-        sets["plans.other_hand"] = plans_of(scenario.make_loop(**mirror), episodes)
+        sets["plans.other_hand"] = plans_of(
+            scenario.make_loop(**loop.judging_options, **mirror), episodes
+        )
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     study = evaluate_plans(rules, sharpened, calibration, sets)
     figures = dict(study.figures)

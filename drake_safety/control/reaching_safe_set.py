@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, fit_stance, planar_pose
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    fit_stance,
+    planar_pose,
+)
 from drake_safety.control.obstacles import Clearance
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
@@ -17,6 +22,8 @@ from drake_safety.control.safe_sets import (
 from drake_safety.control.whole_body_model import WholeBodyModel
 
 _NUM_PREVIEWED = 6  # Samples of the plan for which the whole body is previewed.
+_GRAVITY = 9.81
+_SOON_S = 0.1  # How far ahead a velocity is trusted to go on.
 
 
 @dataclass(kw_only=True)
@@ -119,6 +126,12 @@ class ReachingSafeSet:
             "preview_last_miss",
             "preview_lowest_center_of_mass_support",
             *(f"preview_last_stop_{i}" for i in range(len(self._chain))),
+            *(f"center_of_mass_velocity_{axis}" for axis in "xyz"),
+            *(f"hand_velocity_{axis}" for axis in "xyz"),
+            "capture_point_support",
+            *(f"capture_point_margin_{name}" for name in DIRECTION_NAMES),
+            "soon_support_polygon",
+            "soon_joint_limits",
         ]
 
     def _support(self, q: np.ndarray) -> list[tuple[float, float]]:
@@ -135,6 +148,18 @@ class ReachingSafeSet:
         # A joint that turns without stops has a margin too, a finite one.
         distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
         return distance - self.limits.joint_margin_rad
+
+    def _velocities(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities of centre of mass and hand in the world, (3,) each [m/s].
+
+        The positions must have been set.
+        """
+        plant, context = self.kinematics.plant, self.kinematics.context
+        plant.SetVelocities(context, v)
+        V_WB = self._hand.body.EvalSpatialVelocityInWorld(context)
+        R_WB = self._hand.body.EvalPoseInWorld(context).rotation()
+        v_WH = V_WB.Shift(R_WB @ self._hand.point).translational()
+        return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
     def _support_margin(self, q: np.ndarray) -> float:
         corners = self._support(q)
@@ -171,7 +196,7 @@ class ReachingSafeSet:
 
         Args:
             q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured; unused but for being finite.
+            v: Velocities (n_v,), measured.
             preview: Desired positions of the hand from now to the goal, in the stance frame,
                 (M, 3) [m].
 
@@ -187,12 +212,17 @@ class ReachingSafeSet:
         R_SW = X_WS.rotation().matrix().T
         path = np.asarray(X_WS @ preview.T).T  # In the world.
         center_of_mass = kinematics.center_of_mass(q)  # Sets the positions.
+        v_WC, v_WH = self._velocities(v)
+        rate = math.sqrt(max(center_of_mass[2], 0.1 * kinematics.standing_height) / _GRAVITY)
+        capture_point = center_of_mass[:2] + rate * v_WC[:2]
         shoulder = self._shoulder.CalcPoseInWorld(kinematics.context).translation()
         hand = model.reaching_position(q)
         from_shoulder = self._reflect * (R_SW @ (path[-1] - shoulder))
         in_stance = np.asarray(X_WS.inverse() @ p_WC.T).T * self._reflect
         com_in_stance = np.asarray(X_WS.inverse() @ center_of_mass) * self._reflect
-        reach = (in_stance[:, :2] @ DIRECTIONS).max(axis=0) - com_in_stance[:2] @ DIRECTIONS
+        extent = (in_stance[:, :2] @ DIRECTIONS).max(axis=0)
+        v_SC, v_SH = self._reflect * (R_SW @ v_WC), self._reflect * (R_SW @ v_WH)
+        capture_in_stance = com_in_stance[:2] + rate * v_SC[:2]
         on_path = self.clearance.of_points(path, self._hand.radius_m)
 
         chosen = np.unique(np.linspace(0, len(path) - 1, _NUM_PREVIEWED + 1).round().astype(int))
@@ -211,6 +241,8 @@ class ReachingSafeSet:
         com_support = min(
             signed_distance_to_polygon(kinematics.center_of_mass(at)[:2], corners) for at in ahead
         )
+        soon = q.copy()
+        soon[NUM_BASE_POSITIONS:] += _SOON_S * v[NUM_BASE_VELOCITIES:]
         miss = float(np.linalg.norm(path[-1] - model.reaching_position(ahead[-1])))
         return np.concatenate(
             [
@@ -220,11 +252,19 @@ class ReachingSafeSet:
                 self._reflect * (R_SW @ (path[0] - hand)),
                 [center_of_mass[2], q[6]],
                 self.margins(q, v)[:3],
-                reach,
+                extent - com_in_stance[:2] @ DIRECTIONS,
                 [on_path.min(), on_path[-1]],
                 previewed.min(axis=0),
                 previewed[-1],
                 [miss, com_support],
                 self._joint_margins(ahead[-1])[self._chain],
+                v_SC,
+                v_SH,
+                [signed_distance_to_polygon(capture_point, corners)],
+                extent - capture_in_stance @ DIRECTIONS,
+                [
+                    signed_distance_to_polygon(q[4:6] + _SOON_S * v[3:5], corners),
+                    self._joint_margins(soon).min(),
+                ],
             ]
         )

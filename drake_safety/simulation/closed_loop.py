@@ -43,10 +43,9 @@ class ClosedLoop(Diagram):
     ``trigger_port``, which a task with a ball provides. A task whose plans have a goal, a point
     in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, and it
     overrides :meth:`goal_of` and :meth:`reset_standing`; :attr:`fair_box`, :meth:`is_fair`,
-    :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets` and, with the input port
-    ``applied_spatial_force`` of its plant, :attr:`pushes` where they say something of it. A
-    subclass wires its systems in ``__init__``, calls :meth:`check_assessment` before it wires one,
-    and ends with :meth:`finish`.
+    :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets`, :attr:`pushes` and, with them,
+    :meth:`set_push` where they say something of it. A subclass wires its systems in
+    ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -78,6 +77,9 @@ class ClosedLoop(Diagram):
 
     online_parameters: tuple[str, ...] = ()
     """Parameters that no recorded episode depends on; the scenario's hash leaves them out."""
+
+    judging_options: Mapping[str, Any] = {}
+    """Options of the diagram that verdicts are judged with, where they are not the training's."""
 
     state_names: list[str]
     output_names: list[str]
@@ -225,6 +227,15 @@ class ClosedLoop(Diagram):
             rng: Source of the noise that follows; always the same by default.
         """
         raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
+
+    def set_push(self, context: Context, push: Push) -> None:
+        """Plans a push on the robot in a run that was reset; tasks with pushes override this.
+
+        Args:
+            context: The diagram's Context.
+            push: Where, how hard, when.
+        """
+        raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.

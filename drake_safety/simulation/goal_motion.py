@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.pushes import Push, begin_push, end_push
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.rollouts import Recorder, episode_rng
 
 _PORTS = ("output", "margins", "plant_state")
@@ -89,23 +89,16 @@ def run_to_goal(
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
     loop.reset_standing(context, goal, episode_rng(seed, 0))
-    end_push(loop, context)
+    if push is not None:
+        loop.set_push(context, push)
     simulator.Initialize()
     recorder = Recorder(loop, (*_PORTS, *ports))
     margins_port = loop.GetOutputPort("margins")
     fall_column = loop.constraint_names.index(loop.fall_name)
-    events = [] if push is None else [(push.time_s, push), (push.time_s + push.duration_s, None)]
     leave_s = fall_s = math.inf
     cause = ""
     for row in range(round(duration_s / log_period_s) + 1):
         time = row * log_period_s
-        while events and events[0][0] <= time + 1e-9:
-            instant, begun = events.pop(0)
-            _advance(simulator, instant)
-            if begun is None:
-                end_push(loop, context)
-            else:
-                begin_push(loop, context, begun)
         _advance(simulator, time)
         recorder.record(context)
         margins = margins_port.Eval(context)

@@ -3,11 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce
-from pydrake.systems.framework import Context
-
-from drake_safety.simulation.closed_loop import ClosedLoop
 
 
 @dataclass(kw_only=True)
@@ -37,37 +32,47 @@ class Push:
         return float(np.linalg.norm(self.force_n))
 
 
-def begin_push(loop: ClosedLoop, context: Context, push: Push) -> None:
-    """From now on a force acts on a body of the loop's robot.
+@dataclass(kw_only=True)
+class RandomPushes:
+    """Pushes that episodes may begin with: only what follows them is learned from."""
 
-    Args:
-        loop: A closed loop with the input port ``applied_spatial_force``.
-        context: Its root Context.
-        push: Body and force; its times are the caller's to keep.
+    share: float = 0.0
+    """Share of the episodes that begin with one."""
+    body: str = ""
+    """The robot's body that is pushed; its base by default."""
+    force_n: list[float] = field(default_factory=lambda: [100.0, 800.0])
+    """Lowest and highest, in any horizontal direction [N]."""
+    time_s: list[float] = field(default_factory=lambda: [0.1, 1.5])
+    """Earliest and latest begin [s]."""
+    duration_s: float = 0.2
+    """How long each lasts [s]."""
 
-    Raises:
-        ValueError: The robot has no such body.
-    """
-    plant, instance = loop.plant, loop.robot_instance
-    if not plant.HasBodyNamed(push.body, instance):
-        bodies = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
-        raise ValueError(
-            f"push: robot '{loop.robot.name}' has no body '{push.body}'; its bodies are {bodies}"
+    def __post_init__(self) -> None:
+        if not 0 <= self.share < 1:
+            raise ValueError(f"random pushes: share must be in [0, 1); got {self.share}")
+        for name in ("force_n", "time_s"):
+            bounds = getattr(self, name)
+            if len(bounds) != 2 or not 0 <= bounds[0] <= bounds[1] < np.inf:
+                raise ValueError(
+                    f"random pushes: {name} must be [lowest, highest], not negative; got {bounds}"
+                )
+        if not self.duration_s > 0:
+            raise ValueError(f"random pushes: duration_s must be positive; got {self.duration_s}")
+
+    def sample(self, rng: np.random.Generator, body: str) -> Push | None:
+        """The push of an episode, or None for an episode without.
+
+        Args:
+            rng: Source of every draw.
+            body: The body that is pushed when :attr:`body` names none.
+        """
+        if rng.random() >= self.share:
+            return None
+        direction = rng.uniform(-np.pi, np.pi)
+        strength = rng.uniform(*self.force_n)
+        return Push(
+            body=self.body or body,
+            force_n=[strength * np.cos(direction), strength * np.sin(direction), 0.0],
+            time_s=rng.uniform(*self.time_s),
+            duration_s=self.duration_s,
         )
-    body = plant.GetBodyByName(push.body, instance)
-    force = ExternallyAppliedSpatialForce()
-    force.body_index = body.index()
-    # No variation moves a centre of mass, and the plant's own Context is not in every diagram.
-    force.p_BoBq_B = body.default_com()
-    force.F_Bq_W = SpatialForce(np.zeros(3), np.array(push.force_n, dtype=float))
-    loop.GetInputPort("applied_spatial_force").FixValue(context, [force])
-
-
-def end_push(loop: ClosedLoop, context: Context) -> None:
-    """From now on nothing pushes the loop's robot.
-
-    Args:
-        loop: A closed loop with the input port ``applied_spatial_force``.
-        context: Its root Context.
-    """
-    loop.GetInputPort("applied_spatial_force").FixValue(context, [])

@@ -118,8 +118,8 @@ class Scenario:
         """SHA-256 of all that decides what a rollout does and records, robot included.
 
         How Γ is learned is left out, but for the horizon that shapes the preview, and so are the
-        task's online parameters and the other variations: episodes stay valid when only the
-        learning, a threshold or another plant changes.
+        task's online parameters, the other variations, and whatever has its default: episodes stay
+        valid when only the learning, a threshold or another plant changes, or a parameter is new.
 
         Args:
             variation: The plant that is simulated. The nominal one always counts: controllers
@@ -130,28 +130,29 @@ class Scenario:
         """
         if variation != "nominal":
             self.variation(variation)
-        text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario))
+        text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario, defaults=Scenario()))
         text["assessment"] = {"horizon": self.assessment.horizon}
         text["variations"] = {
-            name: values
-            for name, values in text["variations"].items()
-            if name in ("nominal", variation)
+            name: _differing(self.variations[name])
+            for name in ("nominal", variation)
+            if name in self.variations
         }
-        for values in text["variations"].values():
-            # Sets that were recorded before there was a choice stay valid.
-            if values["engine"] == "drake":
-                del values["engine"]
         # A robot of one's own is known by its files, wherever their folder lies.
         text["robot"] = Path(self.robot).name
         task = self.task_class()
-        body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
-        text["parameters"] = yaml.safe_load(body) or {}
+        text["parameters"] = _differing(self.parameters)
         for name in task.online_parameters:
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
             digest.update(Path(path).read_bytes())
         return digest.hexdigest()
+
+
+def _differing(values: Any) -> dict[str, Any]:
+    """The fields of a dataclass that differ from their defaults."""
+    schema = type(values)
+    return yaml.safe_load(yaml_dump_typed(values, schema=schema, defaults=schema())) or {}
 
 
 def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:

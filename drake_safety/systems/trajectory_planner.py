@@ -12,27 +12,40 @@ from pydrake.trajectories import PiecewisePolynomial
 
 
 def interpolate(
-    start: np.ndarray, goal: np.ndarray, duration_s: float, start_time_s: float = 0.0
+    start: np.ndarray,
+    goal: np.ndarray,
+    duration_s: float,
+    start_time_s: float = 0.0,
+    *,
+    detour: np.ndarray | None = None,
 ) -> PiecewisePolynomial:
-    """The minimum-jerk quintic from rest at ``start`` to rest at ``goal``.
+    """The minimum-jerk motion from rest at ``start`` to rest at ``goal``.
+
+    With s the minimum-jerk progress from 0 to 1, ``z*(s) = start + s (goal - start) + 4 s (1 - s)
+    detour``: half-way the motion passes beside the straight line's middle by the detour.
 
     Args:
         start: (n_z,) [m].
         goal: (n_z,) [m].
         duration_s: Duration of the motion [s].
         start_time_s: When it starts [s].
+        detour: (n_z,) [m]; none for the straight line.
 
     Raises:
         ValueError: The duration is not positive.
     """
     if not duration_s > 0:
         raise ValueError(f"plan: duration_s must be positive; got {duration_s}")
-    scale = np.array([10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
-    segment = [
-        [Polynomial(np.concatenate([[a, 0.0, 0.0], (b - a) * scale]))]
-        for a, b in zip(start, goal, strict=True)
-    ]
-    return PiecewisePolynomial([np.array(segment)], [start_time_s, start_time_s + duration_s])
+    progress = np.array([0, 0, 0, 10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
+    coefficients = np.outer(np.subtract(goal, start), progress)
+    if detour is not None:
+        bump = -4 * np.convolve(progress, progress)
+        bump[: len(progress)] += 4 * progress
+        coefficients = np.pad(coefficients, ((0, 0), (0, len(bump) - len(progress))))
+        coefficients += np.outer(detour, bump)
+    coefficients[:, 0] += start
+    segment = np.array([[Polynomial(row)] for row in coefficients])
+    return PiecewisePolynomial([segment], [start_time_s, start_time_s + duration_s])
 
 
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -1,0 +1,107 @@
+"""PushSource: a force on a body of the robot, from one instant to another."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+_BODY, _FORCE, _START, _DURATION = 0, slice(1, 4), 4, 5
+_SIZE = 6
+_TOLERANCE_S = 1e-9
+
+
+class PushSource(LeafSystem):
+    """Pushes one body of a robot at its centre of mass; which one, how and when is a parameter.
+
+    .. pydrake_system::
+
+        name: PushSource
+        output_ports:
+        - applied_spatial_force
+
+    The port fits the plant's ``applied_spatial_force`` input. A push begins and ends at the first
+    multiple of ``period_s`` that is not before its time.
+
+    Args:
+        plant: The finalized plant.
+        instance: The robot in it.
+        period_s: Time between two looks at the clock [s].
+    """
+
+    def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
+        super().__init__()
+        self._robot_name = plant.GetModelInstanceName(instance)
+        self._bodies = {
+            plant.get_body(index).name(): plant.get_body(index)
+            for index in plant.GetBodyIndices(instance)
+        }
+        self._parameter = self.DeclareNumericParameter(BasicVector(np.zeros(_SIZE)))
+        state = self.DeclareDiscreteState(1)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
+        self.DeclareAbstractOutputPort(
+            "applied_spatial_force",
+            lambda: Value[list[ExternallyAppliedSpatialForce]](),
+            self._calc_force,
+            {self.discrete_state_ticket(state)},
+        )
+
+    def set_push(
+        self,
+        context: Context,
+        body: str,
+        force_n: np.ndarray,
+        *,
+        start_s: float,
+        duration_s: float,
+    ) -> None:
+        """Plans the push of a run; it replaces an earlier one.
+
+        Args:
+            context: This system's Context.
+            body: Name of the body.
+            force_n: Force in the world, (3,) [N].
+            start_s: When it begins [s].
+            duration_s: How long it lasts [s].
+
+        Raises:
+            ValueError: The robot has no such body.
+        """
+        if body not in self._bodies:
+            raise ValueError(
+                f"push: robot '{self._robot_name}' has no body '{body}'; its bodies are "
+                f"{list(self._bodies)}"
+            )
+        index = float(int(self._bodies[body].index()))
+        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(
+            np.array([index, *force_n, start_s, duration_s], dtype=float)
+        )
+
+    def clear_push(self, context: Context) -> None:
+        """Nothing pushes the robot from the next look at the clock on.
+
+        Args:
+            context: This system's Context.
+        """
+        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(np.zeros(_SIZE))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        push = context.get_numeric_parameter(self._parameter).get_value()
+        elapsed = context.get_time() - push[_START] + _TOLERANCE_S
+        discrete_state.set_value([float(0.0 <= elapsed < push[_DURATION])])
+
+    def _calc_force(self, context: Context, output: Value) -> None:
+        if not context.get_discrete_state_vector().GetAtIndex(0):
+            output.set_value([])
+            return
+        push = context.get_numeric_parameter(self._parameter).get_value()
+        body = next(b for b in self._bodies.values() if int(b.index()) == int(push[_BODY]))
+        force = ExternallyAppliedSpatialForce()
+        force.body_index = body.index()
+        force.p_BoBq_B = body.default_com()
+        force.F_Bq_W = SpatialForce(np.zeros(3), push[_FORCE].copy())
+        output.set_value([force])
