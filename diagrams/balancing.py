@@ -5,22 +5,20 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot import ObservationNoise, add_robot, apply_masses
+from drake_safety.control.robot import ObservationNoise
 from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
-from drake_safety.simulation.balls import Ball, Throw, add_ball
+from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.physics import Scene, add_physics
 from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
@@ -72,7 +70,8 @@ class Balancing(ClosedLoop):
         ball: Whether the plant has a ball; by default it has when pushes are sampled.
 
     Raises:
-        ValueError: A robot without feet or gains, or an assessment of another diagram.
+        ValueError: A robot without feet or gains, an assessment of another diagram, or a ball
+            with an engine that has none.
     """
 
     Parameters = BalancingParameters
@@ -97,28 +96,24 @@ class Balancing(ClosedLoop):
         robot = load_robot(scenario.robot)
         builder = DiagramBuilder()
 
-        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
-        plant.set_name("plant")
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-        instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph)
-        add_ground(plant, self.variation.foot_friction or robot.foot_friction)
         has_ball = parameters.push.share > 0 if ball is None else ball
-        ball_instance = add_ball(plant) if has_ball else None
-        # What the ports say is of now, not of the last step: no copies are kept for it.
-        plant.SetUseSampledOutputPorts(False)
-        plant.Finalize()
-        self.plant, self.robot, self.robot_instance = plant, robot, instance
-        self.ball = (
-            Ball(plant, scene_graph, ball_instance, robot.base)
-            if ball_instance is not None
-            else None
+        physics = add_physics(
+            builder,
+            robot,
+            self.variation,
+            Scene(has_ball=has_ball),
+            time_step_s=scenario.time_step_s,
+            servos=True,
         )
+        self._physics = physics
+        self.plant, self.robot, self.robot_instance = physics.plant, robot, physics.instance
+        self.ball = physics.ball
 
         nominal = scenario.variation("nominal")
         kinematics = RobotKinematics(robot, nominal)
         self.kinematics = kinematics
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
-        plant_state = plant.get_state_output_port(instance)
+        plant_state = physics.state
 
         noise = self.variation.observation_noise
         observers = Observers(builder, kinematics, plant_state, scenario.control_period_s)
@@ -188,9 +183,9 @@ class Balancing(ClosedLoop):
                 switch.GetOutputPort("desired_foot_positions"),
                 controller.GetInputPort("desired_foot_positions"),
             )
-        servos = builder.AddNamedSystem("servo_map", MatrixGain(D=self._servo_matrix()))
-        builder.Connect(controller.GetOutputPort("desired_joint_state"), servos.get_input_port())
-        builder.Connect(servos.get_output_port(), plant.get_desired_state_input_port(instance))
+        physics.connect_servos(
+            builder, kinematics.joint_names, controller.GetOutputPort("desired_joint_state")
+        )
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
         monitor = builder.AddNamedSystem(
@@ -246,10 +241,10 @@ class Balancing(ClosedLoop):
         builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
         builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
         builder.ExportOutput(plant_state, "plant_state")
-        if ball_instance is not None:
-            builder.ExportOutput(plant.get_state_output_port(ball_instance), "ball_state")
+        if physics.ball_state is not None:
+            builder.ExportOutput(physics.ball_state, "ball_state")
         if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+            MeshcatVisualizer.AddToBuilder(builder, physics.scene_graph, meshcat)
         self.finish(builder)
         self._default = self.CreateDefaultContext()
 
@@ -257,20 +252,6 @@ class Balancing(ClosedLoop):
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
-
-    def _servo_matrix(self) -> np.ndarray:
-        """Maps [q; v] of the joints onto the plant's actuators; friction holds velocity zero."""
-        indices = self.plant.GetJointActuatorIndices(self.robot_instance)
-        actuators = [self.plant.get_joint_actuator(index) for index in indices]
-        column = {name: i for i, name in enumerate(self.kinematics.joint_names)}
-        n_a, n_j = len(actuators), len(column)
-        D = np.zeros((2 * n_a, 2 * n_j))
-        for row, actuator in enumerate(actuators):
-            if not actuator.name().endswith("_friction"):
-                j = column[actuator.joint().name()]
-                D[row, j] = 1.0
-                D[n_a + row, n_j + j] = 1.0
-        return D
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin as a ball hits."""
@@ -336,13 +317,12 @@ class Balancing(ClosedLoop):
         # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_masses(self.plant, plant_context, self.robot, self.variation)
-        self.plant.SetPositionsAndVelocities(
-            plant_context, self.robot_instance, np.concatenate([start.q, start.v])
-        )
-        if self.ball is not None:
-            self.ball.park(plant_context)
+        with self._physics.edited(context) as plant_context:
+            self.plant.SetPositionsAndVelocities(
+                plant_context, self.robot_instance, np.concatenate([start.q, start.v])
+            )
+            if self.ball is not None:
+                self.ball.park(plant_context)
         p_WC, stance_pose = start.feet(self.kinematics), start.stance_pose(self.kinematics)
         self._planner.set_plan(
             self._planner.GetMyMutableContextFromRoot(context), start.plan, stance_pose
@@ -370,5 +350,6 @@ class Balancing(ClosedLoop):
         """Sets the ball in flight; see :meth:`ClosedLoop.throw_ball`."""
         if self.ball is None:
             raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
-        self.ball.throw(self.plant.GetMyMutableContextFromRoot(context), throw, lead_s)
+        with self._physics.edited(context) as plant_context:
+            self.ball.throw(plant_context, throw, lead_s)
         return context.get_time() + lead_s

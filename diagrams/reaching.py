@@ -8,35 +8,22 @@ from types import MappingProxyType
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.systems.primitives import MatrixGain
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.obstacles import (
-    Clearance,
-    Obstacle,
-    add_obstacles,
-    collision_geometries,
-    filter_collisions,
-)
+from drake_safety.control.obstacles import Clearance, Obstacle
 from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
-from drake_safety.control.robot import (
-    ObservationNoise,
-    actuation_matrix,
-    add_robot,
-    apply_masses,
-    model_file,
-)
+from drake_safety.control.robot import ObservationNoise, model_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.ground import add_ground
 from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.physics import Scene, add_physics
 from drake_safety.simulation.pushes import Push, RandomPushes
 from drake_safety.simulation.reaching_sampling import (
     Detours,
@@ -166,30 +153,23 @@ class Reaching(ClosedLoop):
             robot.reaching_frame(name)
         builder = DiagramBuilder()
 
-        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, scenario.time_step_s)
-        plant.set_name("plant")
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-        instance = add_robot(plant, robot, self.variation, scene_graph=scene_graph, servos=False)
-        add_ground(plant, self.variation.foot_friction or robot.foot_friction)
-        obstacles = add_obstacles(plant, parameters.obstacles)
-        decorations = add_obstacles(plant, parameters.decorations)
-        plant.SetUseSampledOutputPorts(False)
-        plant.Finalize()
-        for decoration, model in zip(parameters.decorations, decorations, strict=True):
-            if collision_geometries(plant, [model]):
-                raise ValueError(
-                    f"reaching: decoration '{decoration.model}' has collision geometry, which no "
-                    "margin would tell of; list it under 'obstacles'"
-                )
-        filter_collisions(plant, scene_graph, robot, obstacles)
-        self.plant, self.robot, self.robot_instance = plant, robot, instance
-        self.scene_graph = scene_graph
+        physics = add_physics(
+            builder,
+            robot,
+            self.variation,
+            Scene(obstacles=parameters.obstacles, decorations=parameters.decorations),
+            time_step_s=scenario.time_step_s,
+            servos=False,
+        )
+        self._physics = physics
+        self.plant, self.robot, self.robot_instance = physics.plant, robot, physics.instance
+        self.scene_graph = physics.scene_graph
 
         nominal = scenario.variation("nominal")
         kinematics = RobotKinematics(robot, nominal)
         self.kinematics = kinematics
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
-        plant_state = plant.get_state_output_port(instance)
+        plant_state = physics.state
         self.mirror = None if self.hand == trained_hand else Mirror(kinematics)
         if self.mirror is not None and self.mirror.hand(trained_hand) != self.hand:
             raise ValueError(
@@ -237,7 +217,7 @@ class Reaching(ClosedLoop):
             WholeBodyController(
                 kinematics,
                 hand=self.hand,
-                actuation_matrix=actuation_matrix(plant, robot, kinematics.joint_names),
+                actuation_matrix=physics.actuation_matrix(kinematics.joint_names),
                 period_s=scenario.control_period_s,
                 # After the noise of its instant was drawn, within the plant's step.
                 offset_s=0.5 * scenario.time_step_s,
@@ -249,20 +229,12 @@ class Reaching(ClosedLoop):
         )
         for name in ("desired_output", "desired_output_rate"):
             builder.Connect(planner.GetOutputPort(name), controller.GetInputPort(name))
-        builder.Connect(
-            controller.GetOutputPort("actuation"), plant.get_actuation_input_port(instance)
-        )
+        physics.connect_torques(builder, controller.GetOutputPort("actuation"))
         self._push_source = builder.AddNamedSystem(
-            "push_source", PushSource(plant, instance, period_s=scenario.control_period_s)
+            "push_source",
+            PushSource(self.plant, physics.instance, period_s=scenario.control_period_s),
         )
-        builder.Connect(
-            self._push_source.get_output_port(), plant.get_applied_spatial_force_input_port()
-        )
-        if self.variation.joint_friction_nm:
-            # Without a desired state Drake disarms the servos that are the joints' friction.
-            port = plant.get_desired_state_input_port(instance)
-            rest = builder.AddNamedSystem("rest", ConstantVectorSource(np.zeros(port.size())))
-            builder.Connect(rest.get_output_port(), port)
+        builder.Connect(self._push_source.get_output_port(), physics.applied_spatial_force)
 
         clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)
         self.safe_set = ReachingSafeSet(
@@ -318,7 +290,7 @@ class Reaching(ClosedLoop):
         builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
         builder.ExportOutput(plant_state, "plant_state")
         if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+            MeshcatVisualizer.AddToBuilder(builder, physics.scene_graph, meshcat)
         self.finish(builder)
         self._default = self.CreateDefaultContext()
 
@@ -541,11 +513,10 @@ class Reaching(ClosedLoop):
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        apply_masses(self.plant, plant_context, self.robot, self.variation)
-        self.plant.SetPositionsAndVelocities(
-            plant_context, self.robot_instance, np.concatenate([start.q, start.v])
-        )
+        with self._physics.edited(context) as plant_context:
+            self.plant.SetPositionsAndVelocities(
+                plant_context, self.robot_instance, np.concatenate([start.q, start.v])
+            )
         self._controller.set_reference(
             self._controller.GetMyMutableContextFromRoot(context),
             self._controller.model.reference(start.q),

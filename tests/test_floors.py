@@ -26,13 +26,14 @@ ALLOWED = {
 }
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags"}
-# What only an extra brings, and the room that may import it.
-EXTRAS = {"logs": "drake_safety/logs/"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco"}
+# What only an extra brings, and the files that may import it.
+EXTRAS = {"logs": "drake_safety/logs/", "mujoco": "drake_safety/control/mujoco"}
 ONLY_IN = {
     "torch": "drake_safety/learning/embedding.py",
     "tslearn": "drake_safety/learning/distance.py",
     "dtaidistance": "drake_safety/learning/distance.py",
+    "mujoco": "drake_safety/control/mujoco_model.py",
 }
 PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}

@@ -25,6 +25,9 @@ from pydrake.systems.framework import Context
 
 from drake_safety.control.robot_model import RobotModel, by_pattern
 
+ENGINES = ("drake", "mujoco")
+"""Physics engines that a plant variation may choose."""
+
 
 @dataclass(kw_only=True)
 class ObservationNoise:
@@ -57,6 +60,8 @@ class Payload:
 class PlantVariation:
     """How one plant differs from the published robot: a reality gap, as data."""
 
+    engine: str = "drake"
+    """Whose physics: ``drake`` or ``mujoco``."""
     mass_scale: float = 1.0
     """Factor on every body's spatial inertia."""
     joint_friction_nm: float = 0.0
@@ -73,6 +78,10 @@ class PlantVariation:
     """What the robot carries and its controllers know nothing of."""
 
     def __post_init__(self) -> None:
+        if self.engine not in ENGINES:
+            raise ValueError(
+                f"plant variation: engine must be one of {list(ENGINES)}; got '{self.engine}'"
+            )
         for name in ("mass_scale", "foot_friction"):
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -84,7 +93,7 @@ class PlantVariation:
                 )
 
 
-_PAYLOAD_RADIUS_M = 0.05
+PAYLOAD_RADIUS_M = 0.05
 _FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
@@ -297,6 +306,25 @@ def actuation_matrix(
     return matrix
 
 
+def servo_matrix(plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]) -> np.ndarray:
+    """Maps joint positions and velocities onto the robot's servos, by name.
+
+    Actuators that are the joints' dry friction hold velocity zero.
+
+    Args:
+        plant: The finalised plant.
+        robot: The robot.
+        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
+
+    Returns:
+        (2 n_u, 2 n_j), in the order of ``plant.get_desired_state_input_port(instance)``.
+
+    Raises:
+        ValueError: An actuated joint is not among the names.
+    """
+    return np.kron(np.eye(2), actuation_matrix(plant, robot, joint_names))
+
+
 def apply_mass_scale(
     plant: MultibodyPlant, context: Context, robot: RobotModel, scale: float
 ) -> None:
@@ -342,9 +370,7 @@ def apply_masses(
     _require(name in bodies, robot, "body", name, bodies)
     body = plant.GetBodyByName(name, instance)
     p_PcmBo_B = -np.array(payload.position_m)
-    M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, _PAYLOAD_RADIUS_M).Shift(
-        p_PcmBo_B
-    )
+    M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M).Shift(p_PcmBo_B)
     M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)
     M_BBo_B += M_PBo_B
     body.SetSpatialInertiaInBodyFrame(context, M_BBo_B)

@@ -65,7 +65,10 @@ def episodes_info(
         state_names=list(loop.state_names),
         output_names=list(loop.output_names),
         feature_names=list(loop.feature_names),
-        versions={name: importlib.metadata.version(name) for name in ("drake", "numpy")},
+        versions={
+            name: importlib.metadata.version(name)
+            for name in dict.fromkeys(("drake", "numpy", loop.variation.engine))
+        },
     )
 
 

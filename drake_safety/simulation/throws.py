@@ -100,12 +100,20 @@ class ViolationCounter:
 
     Args:
         loop: A closed loop with a ``plant``, a ``robot_instance`` and ``kinematics``.
+
+    Raises:
+        ValueError: The plant's contacts and efforts are not Drake's.
     """
 
     _POSITION_SLACK_RAD = 0.02
     _PENETRATION_M = 5e-3
 
     def __init__(self, loop: ClosedLoop):
+        if loop.variation.engine != "drake":
+            raise ValueError(
+                "throws: contacts and efforts are read from Drake's plant; variation "
+                f"'{loop.variation_name}' is simulated by engine '{loop.variation.engine}'"
+            )
         self._loop = loop
         plant = loop.plant
         self._bodies = set(plant.GetBodyIndices(loop.robot_instance))

@@ -1,0 +1,172 @@
+"""MuJoCo's step as a function of states in Drake's convention."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_safety.control.mujoco_model import build_model, import_mujoco, joint_order
+from drake_safety.control.robot import PlantVariation
+from drake_safety.control.robot_model import RobotModel
+
+_LOGGER = logging.getLogger("drake_safety")
+_NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
+
+
+@dataclass(kw_only=True)
+class PointForce:
+    """A force and a torque at a point of a body."""
+
+    body: str
+    p_BoBq_B: np.ndarray
+    """The point in the body's frame, (3,) [m]."""
+    torque_W: np.ndarray
+    """In the world, (3,) [N·m]."""
+    force_W: np.ndarray
+    """In the world, (3,) [N]."""
+
+
+class MujocoDynamics:
+    """One robot and its scene in MuJoCo.
+
+    A state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, where its solver begins included: a step
+    depends on nothing else, so that equal arguments give equal bits. MuJoCo's free joint has the
+    position before the quaternion, the velocity of the origin in the world before the angular
+    velocity in the *body*; Drake's has quaternion before position, and angular velocity in the
+    world before that of the origin. The object keeps one scratch MjData; every method sets what it
+    needs first.
+
+    Args:
+        robot: The robot.
+        plant: A finalised Drake plant of the robot and its scene.
+        scene_graph: The plant's scene graph.
+        variation: What differs from the published robot.
+        time_step_s: Step [s].
+        servos: Whether the command is a joint state for robot.yaml's servos, not torques.
+
+    Raises:
+        ValueError: As :func:`~drake_safety.control.mujoco_model.build_model`.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        variation: PlantVariation,
+        *,
+        time_step_s: float,
+        servos: bool,
+    ):
+        self._mujoco = mujoco = import_mujoco()
+        if mujoco.get_mju_user_warning() is None:
+            # MuJoCo would write its warnings to a file in whatever folder one is in.
+            mujoco.set_mju_user_warning(lambda text: _LOGGER.debug("MuJoCo: %s", text))
+        self.robot = robot
+        self.model, commands = build_model(
+            robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
+        )
+        self._scratch = mujoco.MjData(self.model)
+        self.command_places = np.array(commands, dtype=int)
+        self.joint_names = joint_order(plant, robot)
+        self.num_command = len(self.joint_names) * (2 if servos else 1)
+        model = self.model
+        self.num_positions, self.num_velocities = model.nq, model.nv
+        self.num_state = model.nq + 2 * model.nv
+        # The base is free and first in both; the joints' orders are each engine's own.
+        joints = [model.joint(name) for name in self.joint_names]
+        self._q_joints = np.array([joint.qposadr[0] for joint in joints], dtype=int)
+        self._v_joints = np.array([joint.dofadr[0] for joint in joints], dtype=int)
+
+    def _parts(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n_q, n_v = self.num_positions, self.num_velocities
+        return state[:n_q], state[n_q : n_q + n_v], state[n_q + n_v :]
+
+    def state_from(self, plant_state: np.ndarray) -> np.ndarray:
+        """MuJoCo's state, its solver cold, of a state in Drake's convention.
+
+        Args:
+            plant_state: Drake's ``[q; v]``, (n_q + n_v,); the quaternion need not be normalised.
+        """
+        q, v = plant_state[: self.num_positions], plant_state[self.num_positions :]
+        state = np.zeros(self.num_state)
+        qpos, qvel, _ = self._parts(state)
+        quaternion = q[:4] / np.linalg.norm(q[:4])
+        inverse = quaternion * [1.0, -1.0, -1.0, -1.0]
+        qpos[:3], qpos[3:7] = q[4:7], quaternion
+        qpos[self._q_joints] = q[_NUM_BASE_POSITIONS:]
+        qvel[:3] = v[3:6]
+        self._mujoco.mju_rotVecQuat(qvel[3:6], v[:3], inverse)
+        qvel[self._v_joints] = v[_NUM_BASE_VELOCITIES:]
+        return state
+
+    def plant_state(self, state: np.ndarray) -> np.ndarray:
+        """A state in Drake's convention, ``[q; v]`` (n_q + n_v,).
+
+        Args:
+            state: MuJoCo's, (num_state,).
+        """
+        qpos, qvel, _ = self._parts(state)
+        plant_state = np.empty(self.num_positions + self.num_velocities)
+        q, v = plant_state[: self.num_positions], plant_state[self.num_positions :]
+        q[:4], q[4:7] = qpos[3:7], qpos[:3]
+        q[_NUM_BASE_POSITIONS:] = qpos[self._q_joints]
+        self._mujoco.mju_rotVecQuat(v[:3], qvel[3:6], qpos[3:7])
+        v[3:6] = qvel[:3]
+        v[_NUM_BASE_VELOCITIES:] = qvel[self._v_joints]
+        return plant_state
+
+    def step(
+        self, state: np.ndarray, command: np.ndarray, forces: list[PointForce] | None = None
+    ) -> np.ndarray:
+        """The state one step later.
+
+        Args:
+            state: MuJoCo's, (num_state,).
+            command: Joint torques (n_j,) [N·m], or with servos joint positions and velocities
+                (2 n_j,) [rad, rad/s], in the order of ``joint_names``.
+            forces: What else acts during the step.
+
+        Raises:
+            RuntimeError: The simulation is unstable, or an argument is not finite.
+            ValueError: A force acts on a body that the robot does not have.
+        """
+        if not (np.isfinite(state).all() and np.isfinite(command).all()):
+            raise RuntimeError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")
+        mujoco, model, scratch = self._mujoco, self.model, self._scratch
+        scratch.time = 0.0
+        scratch.qpos[:], scratch.qvel[:], scratch.qacc_warmstart[:] = self._parts(state)
+        scratch.ctrl[:] = command[self.command_places]
+        scratch.qfrc_applied[:] = 0.0
+        if forces:
+            self._apply(forces)
+        mujoco.mj_step(model, scratch)
+        failed = (
+            mujoco.mjtWarning.mjWARN_BADQPOS,
+            mujoco.mjtWarning.mjWARN_BADQVEL,
+            mujoco.mjtWarning.mjWARN_BADQACC,
+        )
+        if any(scratch.warning[int(kind)].number for kind in failed):
+            mujoco.mj_resetData(model, scratch)
+            raise RuntimeError(f"robot '{self.robot.name}': MuJoCo's simulation is unstable")
+        return np.concatenate([scratch.qpos, scratch.qvel, scratch.qacc_warmstart])
+
+    def _apply(self, forces: list[PointForce]) -> None:
+        mujoco, model, scratch = self._mujoco, self.model, self._scratch
+        mujoco.mj_kinematics(model, scratch)
+        mujoco.mj_comPos(model, scratch)
+        for force in forces:
+            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, force.body)
+            if index < 0:
+                raise ValueError(
+                    f"robot '{self.robot.name}': MuJoCo has no body '{force.body}' to push"
+                )
+            R_WB = scratch.xmat[index].reshape(3, 3)
+            point = scratch.xpos[index] + R_WB @ force.p_BoBq_B
+            mujoco.mj_applyFT(
+                model, scratch, force.force_W, force.torque_W, point, index, scratch.qfrc_applied
+            )

@@ -1,0 +1,294 @@
+"""A robot and what it touches as a MuJoCo model: mechanics from its URDF, contacts as in Drake."""
+
+from __future__ import annotations
+
+import itertools
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    HalfSpace,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+
+from drake_safety.control.robot import PAYLOAD_RADIUS_M, PlantVariation, model_file
+from drake_safety.control.robot_model import RobotModel, by_pattern
+
+if TYPE_CHECKING:
+    import mujoco
+
+_MECHANICS = {"link", "joint", "mujoco"}  # Of a URDF's elements, what MuJoCo is given.
+_SHAPES = {
+    Sphere: ("mjGEOM_SPHERE", lambda shape: [shape.radius(), 0.0, 0.0]),
+    Box: ("mjGEOM_BOX", lambda shape: 0.5 * shape.size()),
+    Capsule: ("mjGEOM_CAPSULE", lambda shape: [shape.radius(), 0.5 * shape.length(), 0.0]),
+    Cylinder: ("mjGEOM_CYLINDER", lambda shape: [shape.radius(), 0.5 * shape.length(), 0.0]),
+    Ellipsoid: ("mjGEOM_ELLIPSOID", lambda shape: [shape.a(), shape.b(), shape.c()]),
+    HalfSpace: ("mjGEOM_PLANE", lambda _: [0.0, 0.0, 1.0]),
+}
+"""Drake's shapes as MuJoCo's: type and sizes."""
+
+
+def import_mujoco() -> Any:
+    """The package ``mujoco``, which only this engine needs.
+
+    Raises:
+        ValueError: It is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ValueError(
+            "engine 'mujoco' needs the package mujoco: pip install 'drake_safety[mujoco]'"
+        ) from error
+    return mujoco
+
+
+def mechanics_of_urdf(text: str) -> str:
+    """A URDF reduced to links, inertias and joints; what is seen and touched is left out.
+
+    Args:
+        text: The URDF.
+    """
+    root = ElementTree.fromstring(text)
+    for element in list(root):
+        if element.tag not in _MECHANICS:
+            root.remove(element)
+    for link in root.findall("link"):
+        for element in link.findall("visual") + link.findall("collision"):
+            link.remove(element)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
+    """The robot's bodies and joints by MuJoCo's own reader, its base free."""
+    mujoco = import_mujoco()
+    path = model_file(robot.urdf, robot.source_dir)
+    if path.suffix != ".urdf":
+        raise ValueError(
+            f"robot '{robot.name}': engine 'mujoco' reads models from URDF files; got '{path}'"
+        )
+    spec = mujoco.MjSpec.from_string(mechanics_of_urdf(path.read_text(encoding="utf-8")))
+    # Links that nothing moves keep their names: feet and hands may be among them.
+    spec.compiler.fusestatic = False
+    base = spec.body(robot.base)
+    roots = [body.name for body in spec.worldbody.bodies]
+    if base is None or base.name not in roots:
+        raise ValueError(
+            f"robot '{robot.name}': engine 'mujoco' expects base '{robot.base}' to be the root of "
+            f"the model; roots are {roots}"
+        )
+    base.add_freejoint()
+    return spec
+
+
+def joint_order(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
+    """Names of the robot's joints in the order of its velocities, the base left out."""
+    instance = plant.GetModelInstanceByName(robot.name)
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    moving = [joint for joint in joints if joint.num_velocities() == 1]
+    return [j.name() for j in sorted(moving, key=lambda joint: joint.velocity_start())]
+
+
+def _add_actuators(
+    spec: mujoco.MjSpec,
+    plant: MultibodyPlant,
+    robot: RobotModel,
+    variation: PlantVariation,
+    servos: bool,
+) -> list[int]:
+    """Actuators, friction and damping of the actuated joints; returns `build_model`'s commands."""
+    mujoco = import_mujoco()
+    instance = plant.GetModelInstanceByName(robot.name)
+    # A joint's dry friction is, in Drake, a second actuator that comes after its own.
+    limits: dict[str, float] = {}
+    for index in plant.GetJointActuatorIndices(instance):
+        actuator = plant.get_joint_actuator(index)
+        limits.setdefault(actuator.joint().name(), actuator.effort_limit())
+    names = joint_order(plant, robot)
+    commands = []
+
+    def add(kind: str, name: str, gain: float, bias: list[float], command: int) -> None:
+        actuator = spec.add_actuator(
+            name=f"{name}_{kind}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        actuator.gainprm[0] = gain
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.biasprm[:3] = bias
+        commands.append(command)
+
+    for row, name in enumerate(names):
+        joint = spec.joint(name)
+        if joint is None:
+            raise ValueError(
+                f"robot '{robot.name}': MuJoCo finds no joint '{name}'; it finds "
+                f"{[joint.name for joint in spec.joints if joint.name]}"
+            )
+        if name not in limits:
+            continue
+        joint.damping[0] += variation.joint_damping
+        joint.frictionloss = variation.joint_friction_nm
+        # The limit is on the sum of what a joint's actuators do.
+        is_limited = np.isfinite(limits[name])
+        joint.actfrclimited = is_limited
+        joint.actfrcrange = [-limits[name], limits[name]] if is_limited else [0.0, 0.0]
+        gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
+        if not servos:
+            add("torque", name, 1.0, [0.0, 0.0, 0.0], row)
+        elif gains is not None:
+            add("position", name, gains.stiffness, [0.0, -gains.stiffness, 0.0], row)
+            add("velocity", name, gains.damping, [0.0, 0.0, -gains.damping], len(names) + row)
+    return commands
+
+
+def _touchable(plant: MultibodyPlant) -> Iterator[tuple[RigidBody, list[GeometryId]]]:
+    """Bodies with collision geometry."""
+    for index in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(index))
+        geometries = plant.GetCollisionGeometriesForBody(body)
+        if geometries:
+            yield body, geometries
+
+
+def _add_geometries(
+    spec: mujoco.MjSpec, plant: MultibodyPlant, scene_graph: SceneGraph, robot: RobotModel
+) -> None:
+    """Collision geometry, what stands around the robot, and which pairs ignore each other."""
+    mujoco = import_mujoco()
+    inspector = scene_graph.model_inspector()
+    context = plant.CreateDefaultContext()
+    instance = plant.GetModelInstanceByName(robot.name)
+    touchable = list(_touchable(plant))
+    names = {}
+    for body, geometries in touchable:
+        if body.model_instance() == instance:
+            mujoco_body = spec.body(body.name())
+        else:
+            name = f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}"
+            mujoco_body = spec.worldbody.add_body(name=name)
+            X_WB = plant.EvalBodyPoseInWorld(context, body)
+            mujoco_body.pos = X_WB.translation()
+            mujoco_body.quat = X_WB.rotation().ToQuaternion().wxyz()
+            if not plant.IsAnchored(body):
+                raise ValueError(
+                    f"engine 'mujoco' moves nothing but the robot; got '{name}', which moves too"
+                )
+        names[body.index()] = mujoco_body.name
+        for geometry in geometries:
+            shape = inspector.GetShape(geometry)
+            if type(shape) not in _SHAPES:
+                known = [kind.__name__ for kind in _SHAPES]
+                raise ValueError(
+                    f"body '{mujoco_body.name}': engine 'mujoco' has no collision shape "
+                    f"{type(shape).__name__}; it has {known}"
+                )
+            kind, size = _SHAPES[type(shape)]
+            X_BG = inspector.GetPoseInFrame(geometry)
+            properties = inspector.GetProximityProperties(geometry)
+            friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+            geom = mujoco_body.add_geom(
+                type=getattr(mujoco.mjtGeom, kind),
+                size=size(shape),
+                pos=X_BG.translation(),
+                quat=X_BG.rotation().ToQuaternion().wxyz(),
+            )
+            geom.friction[0] = friction
+    for (one, ours), (other, theirs) in itertools.combinations(touchable, 2):
+        filtered = [inspector.CollisionFiltered(a, b) for a in ours for b in theirs]
+        pair = names[one.index()], names[other.index()]
+        if all(filtered):
+            spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+        elif any(filtered):
+            raise ValueError(
+                f"engine 'mujoco' filters collisions by body; of '{pair[0]}' and '{pair[1]}' only "
+                "some geometries are filtered"
+            )
+
+
+def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariation) -> None:
+    """Welds the variation's payload to its body."""
+    payload = variation.payload
+    if payload is None:
+        return
+    name = payload.body or robot.base
+    carrier = spec.body(name)
+    if carrier is None:
+        raise ValueError(
+            f"robot '{robot.name}' has no body '{name}' for the payload; its bodies are "
+            f"{[body.name for body in spec.bodies]}"
+        )
+    # All masses are scaled after compiling; the payload's is what it is.
+    mass_kg = payload.mass_kg / variation.mass_scale
+    inertia = 0.4 * mass_kg * PAYLOAD_RADIUS_M**2
+    carrier.add_body(
+        name="payload",
+        pos=payload.position_m,
+        mass=mass_kg,
+        inertia=[inertia] * 3,
+        explicitinertial=True,
+    )
+
+
+def build_model(
+    robot: RobotModel,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    variation: PlantVariation,
+    *,
+    time_step_s: float,
+    servos: bool,
+) -> tuple[mujoco.MjModel, list[int]]:
+    """Compiles a robot and all that it touches.
+
+    Masses, inertias, joint frames, axes and stops are read from the URDF by MuJoCo. Actuators and
+    their limits are those that the Drake plant has, and so are collision shapes, coefficients of
+    friction and the pairs that ignore each other, so that both engines simulate one scene. What
+    is not said anywhere, such as how soft a contact is, is MuJoCo's default; its friction cone is
+    Coulomb's.
+
+    Args:
+        robot: The robot.
+        plant: A finalised Drake plant of the robot and its scene.
+        scene_graph: The plant's scene graph.
+        variation: What differs from the published robot.
+        time_step_s: Step [s].
+        servos: Whether joints have robot.yaml's position servos; they take torques otherwise.
+
+    Returns:
+        The model, and for each of its controls the place of its value in the command: joint
+        positions and velocities with servos, joint torques without, in :func:`joint_order`.
+
+    Raises:
+        ValueError: The robot's model is no URDF or MuJoCo cannot read it, its base is not the
+            root, a shape is unknown to MuJoCo, or something else in the scene moves.
+    """
+    mujoco = import_mujoco()
+    spec = _read_robot(robot)
+    spec.option.timestep = time_step_s
+    # Damping, of servos too, enters implicitly, as it does in Drake.
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # A simulation that fails shall say so instead of beginning anew.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    commands = _add_actuators(spec, plant, robot, variation, servos)
+    _add_geometries(spec, plant, scene_graph, robot)
+    _add_payload(spec, robot, variation)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"robot '{robot.name}': MuJoCo cannot compile it: {error}") from error
+    if variation.mass_scale != 1.0:
+        model.body_mass *= variation.mass_scale
+        model.body_inertia *= variation.mass_scale
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model, commands

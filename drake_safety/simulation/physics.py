@@ -1,0 +1,269 @@
+"""The plant of a diagram, whichever engine simulates it: what goes in, what comes out, its state.
+
+A task says what stands in its scene; the variation says whose physics moves the robot in it. With
+another engine than Drake's, a Drake plant still describes bodies, joints and shapes, for pictures
+and for the poses of geometry, but takes no step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    DiscreteContactApproximation,
+    MultibodyPlant,
+)
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from drake_safety.control.mujoco_dynamics import MujocoDynamics
+from drake_safety.control.obstacles import (
+    Obstacle,
+    add_obstacles,
+    collision_geometries,
+    filter_collisions,
+)
+from drake_safety.control.robot import (
+    PlantVariation,
+    actuation_matrix,
+    add_robot,
+    apply_masses,
+    servo_matrix,
+)
+from drake_safety.control.robot_model import RobotModel
+from drake_safety.simulation.balls import Ball, add_ball
+from drake_safety.simulation.ground import add_ground
+from drake_safety.systems.mujoco_plant import MujocoPlant
+
+
+@dataclass(kw_only=True)
+class Scene:
+    """What is around a robot besides the ground."""
+
+    obstacles: Sequence[Obstacle] | None = None
+    """With a list, even an empty one, arms touch obstacles alone and all else only the ground;
+    without, the model file says what touches what."""
+    decorations: Sequence[Obstacle] = ()
+    """Models without collision geometry, to be seen."""
+    has_ball: bool = False
+    """Whether there is a ball to throw."""
+
+
+class DrakePhysics:
+    """A MultibodyPlant that simulates; see :func:`add_physics`.
+
+    Attributes:
+        plant, scene_graph, instance: The plant, its scene graph, the robot in it.
+        ball: The ball, or None.
+        state: Port of the robot's ``[q; v]``.
+        ball_state: Port of the ball's, or None.
+        applied_spatial_force: Port of forces on bodies.
+    """
+
+    def __init__(
+        self,
+        builder: DiagramBuilder,
+        robot: RobotModel,
+        variation: PlantVariation,
+        scene: Scene,
+        *,
+        time_step_s: float,
+        servos: bool,
+    ):
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step_s)
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
+        self._robot, self._variation = robot, variation
+        self.plant: MultibodyPlant = plant
+        self.scene_graph: SceneGraph = scene_graph
+        self.instance = instance
+        self.ball = None if ball is None else Ball(plant, scene_graph, ball, robot.base)
+        self.state: OutputPort = plant.get_state_output_port(instance)
+        self.ball_state: OutputPort | None = (
+            None if ball is None else plant.get_state_output_port(ball)
+        )
+        self.applied_spatial_force: InputPort = plant.get_applied_spatial_force_input_port()
+
+    def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
+        """Maps joint torques (n_j,) onto what :meth:`connect_torques` takes."""
+        return actuation_matrix(self.plant, self._robot, joint_names)
+
+    def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
+        """Drives a robot without servos by torques that :meth:`actuation_matrix` has mapped."""
+        builder.Connect(torques, self.plant.get_actuation_input_port(self.instance))
+        if self._variation.joint_friction_nm:
+            # Without a desired state Drake disarms the servos that are the joints' friction.
+            port = self.plant.get_desired_state_input_port(self.instance)
+            rest = builder.AddNamedSystem("rest", ConstantVectorSource(np.zeros(port.size())))
+            builder.Connect(rest.get_output_port(), port)
+
+    def connect_servos(
+        self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
+    ) -> None:
+        """Drives a robot with servos by joint positions and velocities (2 n_j,), by name."""
+        D = servo_matrix(self.plant, self._robot, joint_names)
+        servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
+        builder.Connect(desired_joint_state, servos.get_input_port())
+        builder.Connect(
+            servos.get_output_port(), self.plant.get_desired_state_input_port(self.instance)
+        )
+
+    @contextmanager
+    def edited(self, context: Context) -> Iterator[Context]:
+        """The plant's Context, to be written; the variation's masses are in it.
+
+        Args:
+            context: The root Context of the diagram.
+        """
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        apply_masses(self.plant, plant_context, self._robot, self._variation)
+        yield plant_context
+
+
+class MujocoPhysics:
+    """MuJoCo in place of the plant; see :func:`add_physics`, and DrakePhysics for what it offers.
+
+    Raises:
+        ValueError: A ball is asked for, or MuJoCo cannot simulate the robot or its scene.
+    """
+
+    def __init__(
+        self,
+        builder: DiagramBuilder,
+        robot: RobotModel,
+        variation: PlantVariation,
+        scene: Scene,
+        *,
+        time_step_s: float,
+        servos: bool,
+    ):
+        if scene.has_ball:
+            raise ValueError(
+                "engine 'mujoco' has no ball to throw: pass ball=False, for both sides of a "
+                "comparison, or set the share of pushes to 0"
+            )
+        scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+        plant = MultibodyPlant(time_step_s)
+        plant.RegisterAsSourceForSceneGraph(scene_graph)
+        instance, _ = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
+        dynamics = MujocoDynamics(
+            robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
+        )
+        system = builder.AddNamedSystem("plant", MujocoPlant(dynamics, plant))
+        poses = builder.AddNamedSystem("geometry_pose", MultibodyPositionToGeometryPose(plant))
+        builder.Connect(system.GetOutputPort("positions"), poses.get_input_port())
+        builder.Connect(
+            poses.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
+        )
+        self._system = system
+        self.plant: MultibodyPlant = plant
+        self.scene_graph: SceneGraph = scene_graph
+        self.instance = instance
+        self.ball: Ball | None = None
+        self.state: OutputPort = system.GetOutputPort("state")
+        self.ball_state: OutputPort | None = None
+        self.applied_spatial_force: InputPort = system.GetInputPort("applied_spatial_force")
+
+    def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
+        """Maps joint torques (n_j,) onto what :meth:`connect_torques` takes: it is their order."""
+        return np.eye(len(joint_names))
+
+    def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
+        """Drives a robot without servos by joint torques."""
+        builder.Connect(torques, self._system.GetInputPort("command"))
+
+    def connect_servos(
+        self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
+    ) -> None:
+        """Drives a robot with servos by joint positions and velocities (2 n_j,)."""
+        del joint_names  # They are in the order of the velocities, as here.
+        builder.Connect(desired_joint_state, self._system.GetInputPort("command"))
+
+    @contextmanager
+    def edited(self, context: Context) -> Iterator[Context]:
+        """A Context of the Drake plant, to be written; what it then says becomes MuJoCo's state.
+
+        Args:
+            context: The root Context of the diagram.
+        """
+        system_context = self._system.GetMyMutableContextFromRoot(context)
+        plant_context = self.plant.CreateDefaultContext()
+        state = self.state.Eval(system_context)
+        self.plant.SetPositionsAndVelocities(plant_context, self.instance, state)
+        yield plant_context
+        state = self.plant.GetPositionsAndVelocities(plant_context, self.instance)
+        self._system.set_state(system_context, state)
+
+
+Physics = DrakePhysics | MujocoPhysics
+_ENGINES: dict[str, type[DrakePhysics] | type[MujocoPhysics]] = {
+    "drake": DrakePhysics,
+    "mujoco": MujocoPhysics,
+}
+
+
+def add_physics(
+    builder: DiagramBuilder,
+    robot: RobotModel,
+    variation: PlantVariation,
+    scene: Scene,
+    *,
+    time_step_s: float,
+    servos: bool,
+) -> Physics:
+    """Adds a robot on level ground to a diagram, simulated by the variation's engine.
+
+    Args:
+        builder: The diagram's builder.
+        robot: The robot.
+        variation: The engine, and what differs from the published robot.
+        scene: What else is there.
+        time_step_s: Step of the discrete plant [s].
+        servos: Whether the joints have robot.yaml's position servos; they take torques otherwise.
+
+    Returns:
+        The plant, its ports and its state.
+
+    Raises:
+        ValueError: A body, joint or file that does not exist, a decoration that can be touched, or
+            something that the engine cannot simulate.
+    """
+    physics = _ENGINES[variation.engine]
+    return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
+
+
+def _furnish(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    robot: RobotModel,
+    variation: PlantVariation,
+    scene: Scene,
+    *,
+    servos: bool,
+) -> tuple[ModelInstanceIndex, ModelInstanceIndex | None]:
+    """Fills and finalises a plant; returns the model instances of robot and ball."""
+    plant.set_name("plant")
+    instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
+    add_ground(plant, variation.foot_friction or robot.foot_friction)
+    ball = add_ball(plant) if scene.has_ball else None
+    obstacles = add_obstacles(plant, list(scene.obstacles or ()))
+    decorations = add_obstacles(plant, list(scene.decorations))
+    # What the ports say is of now, not of the last step: no copies are kept for it.
+    plant.SetUseSampledOutputPorts(False)
+    plant.Finalize()
+    for decoration, model in zip(scene.decorations, decorations, strict=True):
+        if collision_geometries(plant, [model]):
+            raise ValueError(
+                f"decoration '{decoration.model}' has collision geometry, which no margin would "
+                "tell of; list it under 'obstacles'"
+            )
+    if scene.obstacles is not None:
+        filter_collisions(plant, scene_graph, robot, obstacles)
+    return instance, ball
