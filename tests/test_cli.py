@@ -176,7 +176,9 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     for title in ("30 fresh targets judged at k = 0: all targets", "the other hand", "Learning"):
         assert title in printed
     report = json.loads((folder / "evaluation.json").read_text())
-    assert report["plans.causes.named_by"] in ("cause_probability", "predicted_margins")
+    assert (
+        report["plans.causes.right_cause"]["n"] == report["plans.causes.by_cause_probability"]["n"]
+    )
     for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
         for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
             figure = report[f"{prefix}.{name}.unsafe_recall"]

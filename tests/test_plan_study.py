@@ -164,20 +164,14 @@ def test_the_mirrored_loop_sees_the_same_plans_as_the_loop_itself():
         )
 
 
-def test_the_cause_is_named_by_whoever_was_right_more_often_on_the_calibration_plans(
-    study, assessment, calibration, plans
-):
-    named = named_causes(assessment, calibration)
-    assert list(named) == ["cause_probability", "predicted_margins"]
-    rows = calibration.is_unsafe & (
-        RULES[0].unsafe_score(calibration) > study.thresholds["sharpened"]
-    )
-    right = {
-        name: np.mean((causes == calibration.first.cause)[rows]) for name, causes in named.items()
-    }
-    assert right[study.cause_rule] == max(right.values())
-    figures = study.figures
-    assert figures["plans.causes.right_cause"] == figures[f"plans.causes.by_{study.cause_rule}"]
+def test_the_cause_is_the_constraint_whose_predicted_margin_is_smallest(study, assessment, plans):
+    named = named_causes(assessment, plans)
+    said = assessment.predict(plans.first.state, plans.first.desired_preview, plans.first.features)
+    np.testing.assert_array_equal(named["right_cause"], said.predicted_margins.argmin(axis=1))
+    rows = plans.is_unsafe & (RULES[0].unsafe_score(plans) > study.thresholds["sharpened"])
+    for name, causes in named.items():
+        right = np.mean((causes == plans.first.cause)[rows])
+        assert study.figures[f"plans.causes.{name}"].value == right
 
 
 def test_causes_are_judged_on_the_correctly_refused_alone(study, plans):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.cli.console import console, margin_words, new_table
+from drake_safety.cli.console import cause_words, console, new_table
 from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.goal_motion import GoalMotion
     from drake_safety.simulation.pushes import Push
@@ -75,7 +76,10 @@ def run_to_target(
         ports=_MOTION_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    recording.save(draw_motion(loop, motion, threshold), table_of_motion(loop, motion, threshold))
+    recording.save(
+        draw_motion(loop, motion, threshold),
+        table_of_motion(loop, settings.assessment, motion, threshold),
+    )
     return True
 
 
@@ -144,11 +148,14 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     )
 
 
-def table_of_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Table:
+def table_of_motion(
+    loop: ClosedLoop, assessment: SafetyAssessment, motion: GoalMotion, threshold: float
+) -> Table:
     """What happened when, and what Γ was then.
 
     Args:
         loop: The closed loop that was simulated.
+        assessment: Γ.
         motion: What came of it, with Γ and what it expects.
         threshold: From which Γ on a goal is accepted.
     """
@@ -161,11 +168,11 @@ def table_of_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> T
         )
     alarm = alarm_row(motion, threshold)
     if alarm is not None:
-        cause = int(np.argmax(motion.extra["cause_probability"][alarm]))
-        expected = margin_words(
-            loop.constraint_names[cause],
-            float(motion.extra["predicted_margins"][alarm, cause]),
-            loop.angular_constraints,
+        expected = cause_words(
+            loop,
+            assessment,
+            motion.extra["cause_probability"][alarm],
+            motion.extra["predicted_margins"][alarm],
         )
         events.append(
             (float(motion.time_s[alarm]), f"Γ below the threshold; expected violation: {expected}")

@@ -16,6 +16,7 @@ from drake_safety.evaluation.metrics import (
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import likely_causes
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -148,14 +149,11 @@ class PlanStudy:
         figures: By dotted key.
         thresholds: Per rule, the unsafe score above which it refuses.
         unsafe_score: Per set ("plans", "plans.other_hand") and rule, the score of each plan, (N,).
-        cause_rule: What names the most likely cause better on the calibration plans: the largest
-            "cause_probability" or the smallest of the "predicted_margins".
     """
 
     figures: dict[str, Figure]
     thresholds: dict[str, float]
     unsafe_score: dict[str, dict[str, np.ndarray]]
-    cause_rule: str
 
 
 def evaluate_plans(
@@ -189,14 +187,6 @@ def evaluate_plans(
         for rule in rules
     }
     own = next((rule for rule in rules if rule.name == "sharpened"), rules[0])
-    named = named_causes(assessment, calibration)
-    is_refused = _is_refused(own.unsafe_score(calibration), thresholds[own.name])
-    right = {
-        name: _right_causes(calibration, causes, is_refused)[0].value
-        for name, causes in named.items()
-    }
-    # The first, the belief's own word, unless another is better.
-    cause_rule = max(right, key=lambda name: np.nan_to_num(right[name], nan=-1.0))
 
     figures: dict[str, Figure] = {}
     scores: dict[str, dict[str, np.ndarray]] = {}
@@ -215,7 +205,6 @@ def evaluate_plans(
             found = _cause_figures(
                 chosen,
                 {name: of_all[rows] for name, of_all in causes.items()},
-                cause_rule,
                 _is_refused(scores[prefix][own.name][rows], thresholds[own.name]),
             )
             found |= outcome_figures(chosen)
@@ -223,9 +212,7 @@ def evaluate_plans(
         figures[f"{prefix}.share_fair"] = proportion(
             int(plans.is_outcome_fair.sum()), len(plans.outcomes)
         )
-    return PlanStudy(
-        figures=figures, thresholds=thresholds, unsafe_score=scores, cause_rule=cause_rule
-    )
+    return PlanStudy(figures=figures, thresholds=thresholds, unsafe_score=scores)
 
 
 def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) -> dict[str, Figure]:
@@ -262,8 +249,8 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
     """The cause that Γ would name for each plan, as a column of the constraints, (N,).
 
     Returns:
-        By what it is read from: "cause_probability", the largest one, and where there are any
-        "predicted_margins", the smallest one.
+        "right_cause", by the rule of :func:`~drake_safety.learning.causes.likely_causes`, and to
+        compare with "by_cause_probability", the constraint with most of the unsafe mass.
     """
     first = plans.first
     result = assessment.predict(
@@ -271,22 +258,23 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
         first.desired_preview,
         first.features if assessment.uses_features else None,
     )
-    named = {"cause_probability": result.cause_probability.argmax(axis=1)}
-    if len(plans) and np.isfinite(result.predicted_margins).any():
-        margins = np.where(np.isnan(result.predicted_margins), np.inf, result.predicted_margins)
-        named["predicted_margins"] = margins.argmin(axis=1)
-    return named
+    no_margins = np.full_like(result.predicted_margins, np.nan)
+    return {
+        "right_cause": likely_causes(
+            result.cause_probability, result.predicted_margins, assessment.parameters.margin_unit
+        ),
+        "by_cause_probability": likely_causes(result.cause_probability, no_margins),
+    }
 
 
 def _cause_figures(
-    plans: Plans, named: Mapping[str, np.ndarray], cause_rule: str, is_refused: np.ndarray
+    plans: Plans, named: Mapping[str, np.ndarray], is_refused: np.ndarray
 ) -> dict[str, Figure]:
-    """Shares of the right causes among correctly refused plans, by any rule and by cause."""
+    """Shares of the right causes among correctly refused plans, by either rule and by cause."""
     figures = {}
     for name, causes in named.items():
-        figures[f"causes.by_{name}"], by_cause = _right_causes(plans, causes, is_refused)
-        if name == cause_rule:
-            figures["causes.right_cause"] = figures[f"causes.by_{name}"]
+        figures[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
+        if name == "right_cause":
             figures |= {f"causes.{cause}": figure for cause, figure in by_cause.items()}
     return figures
 
