@@ -239,13 +239,20 @@ def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothin
     assert "standing, inside the safe set throughout" in told
 
 
-def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(call, folder):
-    assert goal_threshold(folder, "sharpened")[0] == DEFAULT_THRESHOLD
+def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
+    call, folder, trained
+):
+    gamma = trained[1]
+    assert goal_threshold(folder, "sharpened", gamma).threshold == DEFAULT_THRESHOLD
     told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
     assert "remark" in told and "is not calibrated" in told
     calibrate(folder, 0.25)
-    assert goal_threshold(folder, "sharpened") == (0.25, "")
-    assert goal_threshold(folder, "paper")[0] == DEFAULT_THRESHOLD
+    assert goal_threshold(folder, "sharpened", gamma) == (0.25, 0.25, "")
+    assert goal_threshold(folder, "paper", gamma).threshold == DEFAULT_THRESHOLD
+    # What was stored with the assessment itself comes first.
+    stored = SimpleNamespace(threshold=0.7, unsafe_below=0.2, promise="a promise")
+    calibrated = SimpleNamespace(calibrations_={"plan": stored})
+    assert goal_threshold(folder, "sharpened", calibrated) == (0.7, 0.2, "a promise")
 
 
 @pytest.mark.parametrize(

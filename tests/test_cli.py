@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -39,7 +40,7 @@ def call(monkeypatch, *arguments):
 
 def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
-    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate"]
+    assert list(commands) == ["scenarios", "train", "calibrate", "ask", "run", "evaluate"]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")
 
@@ -191,6 +192,53 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
         assert (folder / f"{name}.png").is_file()
     # What takes throws or runs is no part of it.
     assert not any(key.startswith(("throws.", "segments.")) for key in report)
+
+
+def calibrate_shuttle(monkeypatch, run, *arguments):
+    file, folder = run
+    options = ("--assessment", folder, "--episodes", 120, "--workers", 1, "--splits", 20)
+    return call(monkeypatch, "calibrate", file, *options, *arguments)
+
+
+@pytest.mark.slow
+def test_a_calibration_is_stored_and_used_by_who_asks_and_who_evaluates(
+    monkeypatch, capsys, shuttle_run, tmp_path
+):
+    file, trained = shuttle_run
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    run = (file, folder)
+    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
+    printed = capsys.readouterr().out
+    assert "at most 10 % of unsafe episodes called safe, on average" in printed
+    assert "takes 99 unsafe episodes" in printed
+    stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
+    for mode in MODES:
+        assert stored[mode].keys() == {"plan", "motion"}
+        assert stored[mode]["plan"].miss_rate == 0.1
+        assert stored[mode]["plan"].num_unsafe + stored[mode]["plan"].num_safe == 120
+    # The episodes are kept: another promise simulates nothing.
+    monkeypatch.setattr(rollouts, "run_episode", None)
+    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.01) == 2
+    assert "takes at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
+    assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
+    monkeypatch.undo()
+    options = ("--assessment", folder, "--target", 0.7, 0.5, 0.5, "--json")
+    call(monkeypatch, "ask", file, *options)
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["threshold"] == stored["sharpened"]["plan"].threshold
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, run, "--plane-step", 0) in (0, None)
+    report = json.loads((folder / "evaluation.json").read_text())
+    threshold = report["plans.sharpened.threshold"]["value"]
+    assert threshold == pytest.approx(answer["threshold"])
+    assert report["calibration.sharpened.plan.promised_miss_rate"]["value"] == 0.1
+    missed = report["calibration.sharpened.plan.miss_rate"]["value"]
+    assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
+    assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
+    assert "is the one that thresholds were calibrated with" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.evaluation.metrics import threshold_for_recall
 from drake_safety.evaluation.plan_study import (
     PROMISED_UNSAFE_RECALL,
     SAFE,
@@ -16,10 +15,12 @@ from drake_safety.evaluation.plan_study import (
     named_causes,
     outcome_figures,
     plans_of,
+    promised_miss_rate,
     reachability_rule,
     scorer_rule,
 )
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.segments import DIVERGED, Episodes
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING
@@ -127,13 +128,28 @@ def test_every_rule_has_every_figure_on_every_set(study):
 
 def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, plans, assessment):
     score = RULES[0].unsafe_score(calibration)
-    expected = threshold_for_recall(score, calibration.is_unsafe, PROMISED_UNSAFE_RECALL)
+    miss_rate = promised_miss_rate(calibration)
+    expected = score_threshold(score, calibration.is_unsafe, miss_rate)
     assert study.thresholds["sharpened"] == expected
     alone = evaluate_plans(RULES, assessment, calibration, {"plans": plans.fair()})
     assert alone.thresholds == study.thresholds
     # Told as the safety probability below which a plan is refused.
     assert study.figures["plans.sharpened.threshold"].value == 1.0 - expected
     assert study.figures["plans.sharpened.threshold"].n == len(calibration)
+
+
+def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
+    study, calibration, caplog
+):
+    num_unsafe = int(calibration.is_unsafe.sum())
+    assert promised_miss_rate(calibration) == 1.0 / (num_unsafe + 1)
+    assert f"{num_unsafe} unsafe calibration episodes promise an unsafe recall" in caplog.text
+    assert "0.992 takes 124" in caplog.text
+    promised = study.figures["plans.promised_unsafe_recall"]
+    assert (promised.value, promised.n) == (1.0 - 1.0 / (num_unsafe + 1), num_unsafe)
+    safe = replace(calibration, first=calibration.first.take(~calibration.is_unsafe))
+    with pytest.raises(ValueError, match=r"0 of .* calibration plans are unsafe; it takes 124"):
+        promised_miss_rate(safe)
 
 
 def test_no_unsafe_calibration_plan_is_missed_when_there_are_few(study, calibration):

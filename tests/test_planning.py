@@ -53,6 +53,15 @@ def test_a_goal_is_safe_from_the_threshold_on():
     assert not ask(constant(0.6), threshold=0.61).is_accepted
 
 
+def test_between_the_thresholds_of_a_calibration_a_goal_is_not_known():
+    for gamma, expected in [(0.8, SAFE), (0.79, UNKNOWN), (0.3, UNKNOWN), (0.29, UNSAFE)]:
+        verdict = assess_goal(
+            GoalTask(), FieldAssessment(constant(gamma)), INSIDE, threshold=0.8, unsafe_below=0.3
+        )
+        assert verdict.verdict == expected
+        assert ("between 0.300 and 0.800" in verdict.reason) == (expected == UNKNOWN)
+
+
 def test_a_goal_is_not_known_when_most_of_its_belief_rests_on_cells_that_know_nothing():
     # μ = 0.3 + 0.7 e, e the share of empty cells: 0.65 is half of them.
     assert ask(constant(1.0), unknown=0.64).verdict == SAFE

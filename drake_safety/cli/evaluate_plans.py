@@ -173,8 +173,12 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     from drake_safety.evaluation.scorers import assessment_scorer
 
     rules = [
-        scorer_rule(assessment_scorer("sharpened", judged.sharpened, is_normalized=True)),
-        scorer_rule(assessment_scorer("paper", judged.paper, is_normalized=True)),
+        scorer_rule(
+            assessment_scorer(mode, gamma, is_normalized=True), gamma.calibrations_.get("plan")
+        )
+        for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items()
+    ]
+    rules += [
         *(scorer_rule(scorer) for scorer in judged.classifiers),
     ]
     known = [hand for hand in hands if hand is not None]

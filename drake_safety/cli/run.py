@@ -104,8 +104,8 @@ def run(
         is_live=meshcat,
     )
     if target is not None:
-        threshold, remark = goal_threshold(assessment, mode)
-        if not run_to_target(settings, target, threshold, remark, is_forced=force):
+        rule = goal_threshold(assessment, mode, settings.assessment)
+        if not run_to_target(settings, target, rule, is_forced=force):
             raise typer.Exit(1)
         return
     if force:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+    from drake_safety.cli.training_folder import GoalThreshold
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.goal_motion import GoalMotion
@@ -31,15 +32,14 @@ _AFTER_EPISODE_S = 1.0  # What is shown beyond an episode: whether the robot sta
 
 
 def run_to_target(
-    settings: RunSettings, target: str, threshold: float, remark: str, *, is_forced: bool
+    settings: RunSettings, target: str, rule: GoalThreshold, *, is_forced: bool
 ) -> bool:
     """Tells the verdict on a target and, unless that is a refusal to be obeyed, goes there.
 
     Args:
         settings: Of the run.
         target: The target as it was typed.
-        threshold: From which Γ on it is accepted.
-        remark: Where the threshold comes from, if that is worth saying.
+        rule: What the verdict on it is read from.
         is_forced: Whether to go there in any case.
 
     Returns:
@@ -54,9 +54,12 @@ def run_to_target(
     loop = settings.make_loop()
     goal = parse_target(loop, target)
     push = named_push(loop, settings.pushes)
-    verdict = assess_goal(loop, settings.assessment, goal, threshold=threshold)
+    threshold = rule.threshold
+    verdict = assess_goal(
+        loop, settings.assessment, goal, threshold=threshold, unsafe_below=rule.unsafe_below
+    )
     nearest = None if verdict.is_accepted else nearest_accepted(loop, settings.assessment, verdict)
-    print_verdict(loop, verdict, nearest, remark)
+    print_verdict(loop, verdict, nearest, rule.remark)
     if not (verdict.is_accepted or is_forced):
         console.print("refused: nothing moved; --force goes there all the same", highlight=False)
         return False
@@ -76,6 +79,9 @@ def run_to_target(
         ports=_MOTION_PORTS,
         realtime_rate=settings.realtime_rate,
     )
+    watched = settings.assessment.calibrations_.get("motion")
+    # While it moves there are many rows to judge: the promise of a motion has its own threshold.
+    threshold = threshold if watched is None else watched.threshold
     recording.save(
         draw_motion(loop, motion, threshold),
         table_of_motion(loop, settings.assessment, motion, threshold),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
+from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
     INPUT_LIMIT,
@@ -210,6 +211,8 @@ class SafetyAssessment:
       prediction takes other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
       segments in the cells, (K, N, 2), (N,), (N,), which adaptation starts from.
+    - `calibrations_`: the `Calibration` by its kind, of these maps and `beliefs_`; empty until it
+      is set.
 
     Departure ("sharpened" only): x gains the safe set's own signed margins along the plan
     (`features`), the maps learn safety and future margins beside t-SNE's points from every start
@@ -309,6 +312,7 @@ class SafetyAssessment:
             input_scale=self._input_scale(x.shape[1], segments.features.shape[1]),
         )
         self.info_ = info
+        self.calibrations_: dict[str, Calibration] = {}
         self.embedding_ = self._train(data, stage("training"))
         self._fill_cells(x, segments)
         if progress is not None:
@@ -594,6 +598,7 @@ class SafetyAssessment:
             "parameters": json.dumps(asdict(self.parameters)),
             "info": json.dumps(asdict(self.info_)),
             "num_margins": str(self.embedding_.num_margins),
+            "calibrations": json.dumps([one.to_json() for one in self.calibrations_.values()]),
         }
         content = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
         path = Path(path)
@@ -630,6 +635,9 @@ class SafetyAssessment:
         try:
             assessment = cls(AssessmentParameters(**json.loads(metadata["parameters"])))
             assessment.info_ = EpisodesInfo(**json.loads(metadata["info"]))
+            # Files that were written before there were calibrations have none.
+            stored = [Calibration(**one) for one in json.loads(metadata.get("calibrations", "[]"))]
+            assessment.calibrations_ = {one.kind: one for one in stored}
             assessment._restore(tensors, int(metadata["num_margins"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error

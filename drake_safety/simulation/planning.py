@@ -10,11 +10,10 @@ import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY
+from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
 from drake_safety.simulation.closed_loop import ClosedLoop
 
-SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
-"""The verdicts."""
 RESERVE = 0.8
 """Share of the way from the threshold to certainty by which a suggested goal exceeds the threshold.
 
@@ -96,7 +95,12 @@ class GoalVerdict:
 
 
 def assess_goal(
-    loop: ClosedLoop, assessment: SafetyAssessment, goal: np.ndarray, *, threshold: float
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    *,
+    threshold: float,
+    unsafe_below: float | None = None,
 ) -> GoalVerdict:
     """What an assessment says of going from the standing posture to a goal.
 
@@ -108,6 +112,8 @@ def assess_goal(
         goal: In the world, (3,) [m]. One that is not finite, or outside the region that was
             sampled in training, is answered with "don't know" and the region.
         threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
+            default.
 
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
@@ -115,7 +121,9 @@ def assess_goal(
     goal = _checked(goal)
     box = target_box(loop)
     if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
-        (verdict,) = assess_goals(loop, assessment, goal[None], threshold=threshold)
+        (verdict,) = assess_goals(
+            loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
+        )
         return verdict
     what = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
     names = tuple(loop.constraint_names)
@@ -133,7 +141,12 @@ def assess_goal(
 
 
 def assess_goals(
-    loop: ClosedLoop, assessment: SafetyAssessment, goals: np.ndarray, *, threshold: float
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goals: np.ndarray,
+    *,
+    threshold: float,
+    unsafe_below: float | None = None,
 ) -> list[GoalVerdict]:
     """What an assessment says of goals inside the region that was sampled in training.
 
@@ -144,15 +157,24 @@ def assess_goals(
         assessment: What was learned from its episodes.
         goals: In the world, (N, 3) [m].
         threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
+            default.
     """
     if len(goals) == 0:
         return []
+    unsafe_below = threshold if unsafe_below is None else unsafe_below
     said = assessment.predict(*goal_inputs(loop, goals))
     most_unknown = 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
         reason = ""
         verdict = SAFE if said.normalized[i] >= threshold else UNSAFE
+        if unsafe_below <= said.normalized[i] < threshold:
+            verdict = UNKNOWN
+            reason = (
+                f"Γ {said.normalized[i]:.3f} lies between {unsafe_below:.3f} and "
+                f"{threshold:.3f}, where safe and unsafe targets cannot be told apart"
+            )
         if said.belief[i, UNCERTAINTY] > most_unknown:
             verdict = UNKNOWN
             reason = "training came too seldom near what this target looks like to the assessment"
