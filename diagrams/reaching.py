@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
@@ -134,6 +135,9 @@ class ReachingParameters:
     default."""
     plan_duration_s: float = 3.0
     """Duration of the planned motion [s]."""
+    via_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Half-widths of how far plans bend aside half-way, along x, y and z; other plans than straight
+    ones can be chosen from only where training has drawn such."""
     monitor_period_s: float = 0.02
     """Time between two looks at the margins [s]."""
     clearance_range_m: float = 0.1
@@ -163,6 +167,10 @@ class ReachingParameters:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
+        if len(self.via_m) != 3 or not all(0 <= width < np.inf for width in self.via_m):
+            raise ValueError(
+                f"reaching: via_m must be three finite widths, none negative; got {self.via_m}"
+            )
         if not self.start.clearance_m <= self.clearance_range_m:
             raise ValueError(
                 f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
@@ -204,6 +212,8 @@ class Reaching(ClosedLoop):
         "assessment_period_s",
         "view",
     )
+    added_parameters = ("via_m",)
+    plan_variety = "its parameter 'via_m' says how far plans may bend aside, in training too"
 
     def __init__(
         self,
@@ -425,6 +435,15 @@ class Reaching(ClosedLoop):
         progress = interpolate(np.zeros(1), np.ones(1), duration_s).value(seen_s).item()
         start = preview[0]
         ends = np.array([start, start + (preview[-1] - start) / progress])
+        if any(self.scenario.parameters.via_m) and len(preview) > 2:
+            # A bent plan: what it is made of is told from all samples, not from the last alone.
+            times = np.minimum(self.scenario.step_s * np.arange(len(preview)), duration_s)
+            unit, still = np.ones(1), np.zeros(1)
+            parts = [
+                interpolate(still, unit, duration_s).vector_values(times)[0],
+                interpolate(still, still, duration_s, via=unit).vector_values(times)[0],
+            ]
+            ends[1] = start + np.linalg.lstsq(np.column_stack(parts), preview - start)[0][0]
         if self.mirror is not None:
             ends = self.mirror.points(ends)
         # An episode begins on the feet of the standing posture.
@@ -456,9 +475,34 @@ class Reaching(ClosedLoop):
         drawn = rng.uniform(*self.scenario.parameters.target.box)
         if goal is None:
             goal = drawn if self.mirror is None else self.mirror.points(drawn)
-        self._set(context, q, goal)
+        self._set(context, q, goal, self._draw_via(rng))
         self._observers.reseed(context, rng)
         return 0
+
+    def _draw_via(self, rng: np.random.Generator) -> np.ndarray | None:
+        """A random bend (3,) [m]; None, and no draw, where plans are straight."""
+        widths = np.array(self.scenario.parameters.via_m)
+        if not widths.any():
+            return None
+        via = rng.uniform(-widths, widths)
+        return via if self.mirror is None else self.mirror.points(via)
+
+    def candidate_plans(
+        self, context: Context, rng: np.random.Generator, num_plans: int
+    ) -> list[PiecewisePolynomial]:
+        """The plan that there is, the straight one and bent ones as training has drawn them."""
+        planned = self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
+        if not any(self.scenario.parameters.via_m):
+            return [planned]
+        start, end = planned.start_time(), planned.end_time()
+        ends = [planned.value(time).ravel() for time in (start, end)]
+        bends = [np.zeros(3), *(self._draw_via(rng) for _ in range(num_plans - 2))]
+        plans = [interpolate(*ends, end - start, start, via=via) for via in bends]
+        return [planned, *plans][:num_plans]
+
+    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
+        """Sets a plan; see :meth:`ClosedLoop.set_plan`."""
+        self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
@@ -509,7 +553,9 @@ class Reaching(ClosedLoop):
             f"the safe set with a clearance of {sampling.clearance_m} m: narrow 'start'"
         )
 
-    def _set(self, context: Context, q: np.ndarray, goal: np.ndarray) -> None:
+    def _set(
+        self, context: Context, q: np.ndarray, goal: np.ndarray, via: np.ndarray | None = None
+    ) -> None:
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
             raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
@@ -534,6 +580,7 @@ class Reaching(ClosedLoop):
             X_SW @ model.reaching_position(q),
             X_SW @ goal,
             self.scenario.parameters.plan_duration_s,
+            via=None if via is None else X_SW.rotation() @ via,
         )
         self._planner.set_plan(
             self._planner.GetMyMutableContextFromRoot(context), plan, stance_pose

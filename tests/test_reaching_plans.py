@@ -37,6 +37,66 @@ def test_the_goal_of_an_episode_is_where_its_plan_ends(robot, hand):
         np.testing.assert_allclose(found, goal_of(loop, context), atol=PLACED_M)
 
 
+@pytest.fixture(scope="module")
+def bending(tmp_path_factory):
+    """The porter's loop, its plans bent aside."""
+    path = porting(tmp_path_factory.mktemp("bending"), parameters={"via_m": [0.0, 0.1, 0.2]})
+    return load_scenario(path).make_loop()
+
+
+def path_of(loop, context):
+    """Where the hand shall be at the start, half-way and at the end, in the world, (3, 3)."""
+    end_s, points = loop.scenario.parameters.plan_duration_s, []
+    for time_s in (0.0, 0.5 * end_s, end_s):
+        later = context.Clone()
+        later.SetTime(time_s)
+        points.append(evaluated(loop, later, "desired_output"))
+    return np.array(points)
+
+
+def test_bent_plans_pass_beside_the_straight_way_and_end_at_their_goal(bending):
+    bends = []
+    for seed in range(6):
+        context = started(bending, seed)
+        start, middle, end = path_of(bending, context)
+        bends.append(middle - 0.5 * (start + end))
+        found = bending.goal_of(first_row(bending, context))
+        np.testing.assert_allclose(found, end, atol=PLACED_M)
+    assert np.all(np.abs(bends) <= np.array([0.0, 0.1, 0.2]) + PLACED_M)
+    assert np.ptp(bends, axis=0)[1:].min() > 0.05
+
+
+def test_plans_to_choose_from_lead_to_the_same_goal_and_the_straight_one_is_among_them(bending):
+    context = started(bending, 1)
+    start, middle, end = path_of(bending, context)
+    plans = bending.candidate_plans(context, np.random.default_rng(0), 5)
+    middles = []
+    for plan in plans:
+        bending.set_plan(context, plan)
+        path = path_of(bending, context)
+        np.testing.assert_allclose(path[[0, 2]], [start, end], atol=1e-9)
+        middles.append(path[1])
+    np.testing.assert_allclose(middles[0], middle, atol=1e-9)
+    np.testing.assert_allclose(middles[1], 0.5 * (start + end), atol=1e-9)
+    assert len(np.unique(middles, axis=0)) == 5
+
+
+def test_where_training_draws_straight_plans_alone_there_is_none_to_choose():
+    loop = porter()
+    assert len(loop.candidate_plans(started(loop), np.random.default_rng(0), 5)) == 1
+
+
+def test_straight_plans_are_what_they_were_before_there_were_bent_ones(bending):
+    scenario = load_scenario("atlas_reaching")
+    before = scenario.simulation_hash()
+    scenario.parameters.via_m = [0.0, 0.0, 0.1]
+    assert scenario.simulation_hash() != before
+    scenario.parameters.via_m = [0.0, 0.0, 0.0]
+    assert scenario.simulation_hash() == before
+    with pytest.raises(ValueError, match=r"via_m must be three finite widths"):
+        type(scenario.parameters)(via_m=[0.1, -0.1, 0.0])
+
+
 def test_noise_on_what_is_seen_does_not_move_the_goal():
     for variation in ("noisy", "blurred"):
         loop = porter(variation)

@@ -12,7 +12,7 @@ import sys
 import typer
 from rich.logging import RichHandler
 
-from drake_safety.cli import ask, calibrate, evaluate, run, scenarios, train
+from drake_safety.cli import ask, calibrate, evaluate, plan_study, run, scenarios, train
 from drake_safety.cli.console import console
 from drake_safety.cli.targets import TargetCommand
 
@@ -24,6 +24,7 @@ _COMMANDS = (
     ask.ask,
     run.run,
     evaluate.evaluate,
+    plan_study.plan_study,
 )
 
 app = typer.Typer(

@@ -79,6 +79,13 @@ class ClosedLoop(Diagram):
     online_parameters: tuple[str, ...] = ()
     """Parameters that no recorded episode depends on; the scenario's hash leaves them out."""
 
+    added_parameters: tuple[str, ...] = ()
+    """Parameters whose default is how it was before there were any; at their default the
+    scenario's hash leaves them out, so that what was recorded before stays valid."""
+
+    plan_variety = "the task decides which plans there are"
+    """Where a scenario says how plans may differ."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]
@@ -225,6 +232,32 @@ class ClosedLoop(Diagram):
             rng: Source of the noise that follows; always the same by default.
         """
         raise ValueError(f"task '{type(self).__name__}' has plans without a goal")
+
+    def candidate_plans(
+        self, context: Context, rng: np.random.Generator, num_plans: int
+    ) -> list[Any]:
+        """Plans from the state of a Context that would do; tasks that offer some override this.
+
+        They stay inside what the scenario's training covers, or Γ could not judge them.
+
+        Args:
+            context: The diagram's Context, with a plan.
+            rng: Source of the others.
+            num_plans: How many at most.
+
+        Returns:
+            What :meth:`set_plan` takes; the first is the plan that the Context has.
+        """
+        raise ValueError(f"task '{type(self).__name__}' offers no plans to choose from")
+
+    def set_plan(self, context: Context, plan: Any) -> None:
+        """Sets a plan in place of the one that the Context has; the state stays as it is.
+
+        Args:
+            context: The diagram's Context.
+            plan: One of :meth:`candidate_plans`.
+        """
+        raise ValueError(f"task '{type(self).__name__}' offers no plans to choose from")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.

@@ -100,6 +100,7 @@ def run_episode(
     seed: int = 0,
     goal: np.ndarray | None = None,
     is_standing: bool = False,
+    plan: Any = None,
 ) -> Episode:
     """Simulates one episode: until it leaves the safe set, or its time is over.
 
@@ -111,6 +112,7 @@ def run_episode(
             ``reset`` takes one.
         is_standing: Whether it begins in the robot's own posture instead of a random one; takes a
             goal.
+        plan: Replaces the plan that it begins with: one of the loop's ``candidate_plans``.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
@@ -134,6 +136,8 @@ def run_episode(
         loop.reset_standing(context, goal, rng)
     else:
         first_step = loop.reset(context, rng, goal)
+    if plan is not None:
+        loop.set_plan(context, plan)
     safe = loop.GetOutputPort("safe")
     nothing = EventStatus.DidNothing()
 

@@ -144,6 +144,12 @@ class Scenario:
         text["parameters"] = yaml.safe_load(body) or {}
         for name in task.online_parameters:
             text["parameters"].pop(name, None)
+        if task.added_parameters:
+            schema = type(self.parameters)
+            default = yaml.safe_load(yaml_dump_typed(schema(), schema=schema)) or {}
+            for name in task.added_parameters:
+                if text["parameters"].get(name) == default.get(name):
+                    text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
             digest.update(Path(path).read_bytes())

@@ -12,15 +12,24 @@ from pydrake.trajectories import PiecewisePolynomial
 
 
 def interpolate(
-    start: np.ndarray, goal: np.ndarray, duration_s: float, start_time_s: float = 0.0
+    start: np.ndarray,
+    goal: np.ndarray,
+    duration_s: float,
+    start_time_s: float = 0.0,
+    *,
+    via: np.ndarray | None = None,
 ) -> PiecewisePolynomial:
     """The minimum-jerk quintic from rest at ``start`` to rest at ``goal``.
+
+    A via offset bends it: 64 τ³(1 - τ)³ of it is added, τ the share of the time that has passed,
+    which is all of it half-way and leaves both ends at rest.
 
     Args:
         start: (n_z,) [m].
         goal: (n_z,) [m].
         duration_s: Duration of the motion [s].
         start_time_s: When it starts [s].
+        via: By how much it passes beside the half-way point, (n_z,) [m]; not at all by default.
 
     Raises:
         ValueError: The duration is not positive.
@@ -28,9 +37,15 @@ def interpolate(
     if not duration_s > 0:
         raise ValueError(f"plan: duration_s must be positive; got {duration_s}")
     scale = np.array([10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
+    if via is None:
+        rows = [(b - a) * scale for a, b in zip(start, goal, strict=True)]
+    else:
+        scale = np.append(scale, 0.0)
+        bend = 64.0 * np.array([1.0, -3.0, 3.0, -1.0]) / duration_s ** np.arange(3, 7)
+        rows = [(b - a) * scale + c * bend for a, b, c in zip(start, goal, via, strict=True)]
     segment = [
-        [Polynomial(np.concatenate([[a, 0.0, 0.0], (b - a) * scale]))]
-        for a, b in zip(start, goal, strict=True)
+        [Polynomial(np.concatenate([[a, 0.0, 0.0], row]))]
+        for a, row in zip(start, rows, strict=True)
     ]
     return PiecewisePolynomial([np.array(segment)], [start_time_s, start_time_s + duration_s])
 
