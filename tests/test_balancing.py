@@ -416,7 +416,7 @@ def test_recovery_saves_a_robot_that_would_have_fallen():
 
 
 def test_plans_to_choose_from_end_over_the_same_point_as_high_and_as_late_as_training_draws():
-    loop = load_scenario(PACKAGED).make_loop(ball=False)
+    loop = load_scenario("laikago_balancing").make_loop(ball=False)
     context = loop.CreateDefaultContext()
     loop.reset(context, np.random.default_rng(4))
     sampling = loop.scenario.parameters.start
