@@ -246,6 +246,24 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
 
 
 @pytest.mark.slow
+def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
+    monkeypatch, capsys, shuttle_run, tmp_path
+):
+    file, folder = shuttle_run
+    options = ("--assessment", folder, "--episodes", 10, "--candidates", 3, "--workers", 1)
+    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path) in (0, None)
+    printed = capsys.readouterr().out
+    report = json.loads((tmp_path / "planning.json").read_text())
+    shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
+    assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
+    assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
+    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
+        assert name in printed
+    assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
+    assert "0 is the training episodes' own seed" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
     arguments = ("--plane-step", 0)
