@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
@@ -26,7 +27,7 @@ from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
 _NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
 _LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
@@ -335,6 +336,32 @@ class Balancing(ClosedLoop):
             step_planner.set_stance(
                 step_planner.GetMyMutableContextFromRoot(context), p_WC, stance_pose
             )
+
+    def candidate_plans(
+        self, context: Context, rng: np.random.Generator, num_plans: int
+    ) -> list[PiecewisePolynomial]:
+        """Plans that end over the same point, at other heights and after other durations.
+
+        Both as training draws them. A motion that is under way goes on as it was planned.
+        """
+        planned = self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
+        if planned.start_time() < context.get_time():
+            return [planned]
+        sampling = self.scenario.parameters.start
+        start, goal = (
+            planned.value(time).ravel() for time in (planned.start_time(), planned.end_time())
+        )
+        plans = [planned]
+        for _ in range(num_plans - 1):
+            height_m = rng.uniform(*sampling.target_height_m)
+            duration_s = rng.uniform(*sampling.plan_duration_s)
+            end = np.append(goal[:2], height_m)
+            plans.append(interpolate(start, end, duration_s, planned.start_time()))
+        return plans
+
+    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
+        """Sets a plan; see :meth:`ClosedLoop.set_plan`."""
+        self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
     @property
     def trigger_port(self) -> str:

@@ -10,6 +10,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
@@ -129,6 +130,7 @@ class Reaching(ClosedLoop):
         "assessment_period_s",
         "view",
     )
+    plan_variety = "its parameter 'detours' says how far plans may lead around, in training too"
 
     def __init__(
         self,
@@ -414,6 +416,28 @@ class Reaching(ClosedLoop):
             start_s=push.time_s,
             duration_s=push.duration_s,
         )
+
+    def candidate_plans(
+        self, context: Context, rng: np.random.Generator, num_plans: int
+    ) -> list[PiecewisePolynomial]:
+        """The plan that there is, and ones that make detours as training has drawn them."""
+        planned = self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
+        detours = self.scenario.parameters.detours
+        if not detours.share or planned.start_time() < context.get_time():
+            return [planned]
+        start, end = planned.start_time(), planned.end_time()
+        ends = [planned.value(time).ravel() for time in (start, end)]
+        plans = [planned]
+        for _ in range(num_plans - 1):
+            detour = rng.uniform(detours.lowest_m, detours.highest_m)
+            if self.mirror is not None:
+                detour = self.mirror.points(detour)
+            plans.append(interpolate(*ends, end - start, start, detour=detour))
+        return plans
+
+    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
+        """Sets a plan; see :meth:`ClosedLoop.set_plan`."""
+        self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None

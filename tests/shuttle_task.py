@@ -117,6 +117,20 @@ class Shuttling(ClosedLoop):
         shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
         shuttle_context.SetDiscreteState(np.append(start, velocity))
 
+    def candidate_plans(self, context, rng, num_plans):
+        """Velocities: the one that it has, and slower ones that lead less far."""
+        state = self._state_vector(context)
+        shares = rng.uniform(0.3, 1.0, num_plans - 1)
+        return [state[3:].copy(), *(share * state[3:] for share in shares)]
+
+    def set_plan(self, context, plan):
+        shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
+        shuttle_context.SetDiscreteState(np.append(self._state_vector(context)[:3], plan))
+
+    def _state_vector(self, context):
+        shuttle_context = self.shuttle.GetMyContextFromRoot(context)
+        return shuttle_context.get_discrete_state_vector().get_value()
+
     def goal_of(self, episode):
         position, velocity = np.split(episode.state[0], 2)
         goal = position + self.scenario.episode_duration_s * velocity

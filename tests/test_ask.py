@@ -122,6 +122,8 @@ def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call
     # What is told can be typed, and is accepted then.
     assert call("ask", SCENARIO, "--assessment", folder, "--target", *nearest.split())[0] == 0
     assert float(nearest.split()[0]) < FAR[0]
+    gamma = re.search(r"cm away, Γ (\S+)", told)[1]
+    assert float(gamma) >= 0.5 + 0.8 * 0.5
 
 
 @pytest.mark.parametrize("target", [NEAR, FAR])
@@ -151,7 +153,8 @@ def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(call, fol
     assert code == 1
     assert words in told
     assert "x 0.45…1, y -0.3…1.3, z 0.5…1.6 m" in told
-    assert "Γ" not in told
+    # The number that may follow is of another target, which may be suggested.
+    assert "Γ" not in told.partition("nearest accepted")[0]
     assert "belief" not in told
 
 
@@ -239,13 +242,20 @@ def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothin
     assert "standing, inside the safe set throughout" in told
 
 
-def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(call, folder):
-    assert goal_threshold(folder, "sharpened")[0] == DEFAULT_THRESHOLD
+def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
+    call, folder, trained
+):
+    gamma = trained[1]
+    assert goal_threshold(folder, "sharpened", gamma).threshold == DEFAULT_THRESHOLD
     told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
     assert "remark" in told and "is not calibrated" in told
     calibrate(folder, 0.25)
-    assert goal_threshold(folder, "sharpened") == (0.25, "")
-    assert goal_threshold(folder, "paper")[0] == DEFAULT_THRESHOLD
+    assert goal_threshold(folder, "sharpened", gamma) == (0.25, 0.25, "")
+    assert goal_threshold(folder, "paper", gamma).threshold == DEFAULT_THRESHOLD
+    # What was stored with the assessment itself comes first.
+    stored = SimpleNamespace(threshold=0.7, unsafe_below=0.2, promise="a promise")
+    calibrated = SimpleNamespace(calibrations_={"plan": stored})
+    assert goal_threshold(folder, "sharpened", calibrated) == (0.7, 0.2, "a promise")
 
 
 @pytest.mark.parametrize(

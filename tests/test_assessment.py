@@ -7,6 +7,7 @@ import pytest
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.calibration import calibrate
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
 
@@ -152,6 +153,27 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
         np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
     np.testing.assert_array_equal(loaded.training_points_, assessment.training_points_)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_calibration_is_kept_with_the_assessment_and_a_file_without_one_still_loads(
+    assessment, tmp_path
+):
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    score = np.linspace(0, 1, 100)
+    found = calibrate(score, score > 0.4, kind="plan", miss_rate=0.05, confidence=0.9)
+    path = tmp_path / "gamma.safetensors"
+    assert assessment.calibrations_ == {}
+    assessment.calibrations_ = {"plan": found}
+    assessment.save(path)
+    assessment.calibrations_ = {}
+    assert SafetyAssessment.load(path).calibrations_ == {"plan": found}
+    with safe_open(path, framework="numpy") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
+    del metadata["calibrations"]
+    save_file(tensors, path, metadata)
+    assert SafetyAssessment.load(path).calibrations_ == {}
 
 
 def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_path, monkeypatch):

@@ -413,3 +413,21 @@ def test_recovery_saves_a_robot_that_would_have_fallen():
         lowest[recovery] = min(margins)
     assert lowest[False] < 0
     assert lowest[True] > 0
+
+
+def test_plans_to_choose_from_end_over_the_same_point_as_high_and_as_late_as_training_draws():
+    loop = load_scenario("laikago_balancing").make_loop(ball=False)
+    context = loop.CreateDefaultContext()
+    loop.reset(context, np.random.default_rng(4))
+    sampling = loop.scenario.parameters.start
+    default, *others = loop.candidate_plans(context, np.random.default_rng(0), 20)
+    goal = default.value(default.end_time()).ravel()
+    ends = np.array([plan.value(plan.end_time()).ravel() for plan in others])
+    np.testing.assert_allclose(ends[:, :2], np.tile(goal[:2], (19, 1)), atol=1e-12)
+    for values, bounds in (
+        (ends[:, 2], sampling.target_height_m),
+        ([plan.end_time() for plan in others], sampling.plan_duration_s),
+    ):
+        assert bounds[0] <= np.min(values) < np.max(values) <= bounds[1]
+    for plan in others:
+        np.testing.assert_allclose(plan.value(0.0), default.value(0.0), atol=1e-12)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -39,7 +40,16 @@ def call(monkeypatch, *arguments):
 
 def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
-    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate", "adapt"]
+    assert list(commands) == [
+        "scenarios",
+        "train",
+        "calibrate",
+        "ask",
+        "run",
+        "evaluate",
+        "plan-study",
+        "adapt",
+    ]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")
 
@@ -177,7 +187,9 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     for title in ("30 fresh targets judged at k = 0: all targets", "the other hand", "Learning"):
         assert title in printed
     report = json.loads((folder / "evaluation.json").read_text())
-    assert report["plans.causes.named_by"] in ("cause_probability", "predicted_margins")
+    assert (
+        report["plans.causes.right_cause"]["n"] == report["plans.causes.by_cause_probability"]["n"]
+    )
     for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
         for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
             figure = report[f"{prefix}.{name}.unsafe_recall"]
@@ -190,6 +202,67 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
         assert (folder / f"{name}.png").is_file()
     # What takes throws or runs is no part of it.
     assert not any(key.startswith(("throws.", "segments.")) for key in report)
+
+
+def calibrate_shuttle(monkeypatch, run, *arguments):
+    file, folder = run
+    options = ("--assessment", folder, "--episodes", 120, "--workers", 1, "--splits", 20)
+    return call(monkeypatch, "calibrate", file, *options, *arguments)
+
+
+@pytest.mark.slow
+def test_a_calibration_is_stored_and_used_by_who_evaluates(
+    monkeypatch, capsys, shuttle_run, tmp_path
+):
+    file, trained = shuttle_run
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    run = (file, folder)
+    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
+    printed = capsys.readouterr().out
+    assert "at most 10 % of unsafe episodes called safe, on average" in printed
+    assert "takes 99 unsafe episodes" in printed
+    stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
+    for mode in MODES:
+        assert stored[mode].keys() == {"plan", "motion"}
+        assert stored[mode]["plan"].miss_rate == 0.1
+        assert stored[mode]["plan"].num_unsafe + stored[mode]["plan"].num_safe == 120
+    # The episodes are kept: another promise simulates nothing.
+    monkeypatch.setattr(rollouts, "run_episode", None)
+    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.01) == 2
+    assert "takes at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
+    assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
+    monkeypatch.undo()
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, run, "--plane-step", 0) in (0, None)
+    report = json.loads((folder / "evaluation.json").read_text())
+    threshold = report["plans.sharpened.threshold"]["value"]
+    assert threshold == pytest.approx(stored["sharpened"]["plan"].threshold)
+    assert report["calibration.sharpened.plan.promised_miss_rate"]["value"] == 0.1
+    missed = report["calibration.sharpened.plan.miss_rate"]["value"]
+    assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
+    assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
+    assert "is the one that thresholds were calibrated with" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
+@pytest.mark.slow
+def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
+    monkeypatch, capsys, shuttle_run, tmp_path
+):
+    file, folder = shuttle_run
+    options = ("--assessment", folder, "--episodes", 10, "--candidates", 3, "--workers", 1)
+    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path) in (0, None)
+    printed = capsys.readouterr().out
+    report = json.loads((tmp_path / "planning.json").read_text())
+    shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
+    assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
+    assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
+    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
+        assert name in printed
+    assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
+    assert "0 is the training episodes' own seed" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from drake_safety.evaluation.metrics import (
     proportion,
     segment_figures,
     threshold_at,
-    threshold_for_recall,
 )
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
@@ -261,56 +260,3 @@ def test_a_threshold_needs_both_classes_a_finite_score_and_a_known_criterion():
         threshold_at(score * np.nan, np.array([False, True]))
     with pytest.raises(ValueError, match="unknown criterion 'f1'; the criteria are"):
         threshold_at(score, np.array([False, True]), "f1")
-
-
-def test_a_threshold_for_a_recall_keeps_its_promise_on_samples_yet_to_come():
-    rng = np.random.default_rng(3)
-    recalls = []
-    for _ in range(400):
-        seen, coming = rng.normal(size=(2, 150))
-        label = np.ones(150, dtype=bool)
-        recalls.append(np.mean(coming > threshold_for_recall(seen, label, 0.95)))
-    assert np.mean(recalls) >= 0.95
-    # Not much more than promised, either: refusing everything is no skill.
-    assert np.mean(recalls) <= 0.965
-
-
-@pytest.mark.parametrize(("num_unsafe", "missed"), [(5, 0), (19, 0), (39, 1), (99, 4)])
-def test_as_many_unsafe_samples_are_missed_as_the_promise_allows(num_unsafe, missed):
-    score = np.linspace(0.1, 0.9, num_unsafe)
-    threshold = threshold_for_recall(score, np.ones(num_unsafe, dtype=bool), 0.95)
-    assert np.sum(score <= threshold) == missed
-
-
-def test_a_threshold_for_a_recall_lies_midway_below_the_sample_it_must_not_miss():
-    score = np.array([0.1, 0.4, 0.6, 0.9])
-    label = np.array([False, False, True, True])
-    assert threshold_for_recall(score, label, 0.9) == pytest.approx(0.5)
-    # A safe sample with the same score cannot be told apart, and is refused as well.
-    tied = threshold_for_recall(np.array([0.1, 0.6, 0.6, 0.9]), label, 0.9)
-    assert tied == pytest.approx(0.35)
-
-
-def test_where_an_unsafe_sample_has_the_lowest_score_nothing_is_accepted():
-    threshold = threshold_for_recall(np.zeros(3), np.array([True, False, False]), 0.9)
-    assert threshold < 0.0
-    # As a safety probability it refuses what is taken for certainly safe, rounding included.
-    assert 1.0 < 1.0 - threshold
-
-
-def test_unsafe_samples_that_nobody_knows_stay_above_every_threshold():
-    score, label = np.array([0.1, 0.3, np.nan]), np.array([False, False, True])
-    assert threshold_for_recall(score, label, 0.9) == 0.3
-
-
-@pytest.mark.parametrize(
-    ("score", "is_unsafe", "recall", "message"),
-    [
-        ([0.1, 0.2], [False, False], 0.9, "0 of 2 samples are unsafe"),
-        ([np.nan, np.nan], [True, False], 0.9, "0 scores are finite"),
-        ([0.1, 0.2], [True, False], 1.0, "unsafe_recall is 1.0"),
-    ],
-)
-def test_a_threshold_that_cannot_be_is_refused(score, is_unsafe, recall, message):
-    with pytest.raises(ValueError, match=message):
-        threshold_for_recall(np.array(score), np.array(is_unsafe), recall)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.evaluation.metrics import threshold_for_recall
 from drake_safety.evaluation.plan_study import (
     PROMISED_UNSAFE_RECALL,
     SAFE,
@@ -16,10 +15,12 @@ from drake_safety.evaluation.plan_study import (
     named_causes,
     outcome_figures,
     plans_of,
+    promised_miss_rate,
     reachability_rule,
     scorer_rule,
 )
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.segments import DIVERGED, Episodes
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING
@@ -127,13 +128,28 @@ def test_every_rule_has_every_figure_on_every_set(study):
 
 def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, plans, assessment):
     score = RULES[0].unsafe_score(calibration)
-    expected = threshold_for_recall(score, calibration.is_unsafe, PROMISED_UNSAFE_RECALL)
+    miss_rate = promised_miss_rate(calibration)
+    expected = score_threshold(score, calibration.is_unsafe, miss_rate)
     assert study.thresholds["sharpened"] == expected
     alone = evaluate_plans(RULES, assessment, calibration, {"plans": plans.fair()})
     assert alone.thresholds == study.thresholds
     # Told as the safety probability below which a plan is refused.
     assert study.figures["plans.sharpened.threshold"].value == 1.0 - expected
     assert study.figures["plans.sharpened.threshold"].n == len(calibration)
+
+
+def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
+    study, calibration, caplog
+):
+    num_unsafe = int(calibration.is_unsafe.sum())
+    assert promised_miss_rate(calibration) == 1.0 / (num_unsafe + 1)
+    assert f"{num_unsafe} unsafe calibration episodes promise an unsafe recall" in caplog.text
+    assert "0.992 takes 124" in caplog.text
+    promised = study.figures["plans.promised_unsafe_recall"]
+    assert (promised.value, promised.n) == (1.0 - 1.0 / (num_unsafe + 1), num_unsafe)
+    safe = replace(calibration, first=calibration.first.take(~calibration.is_unsafe))
+    with pytest.raises(ValueError, match=r"0 of .* calibration plans are unsafe; it takes 124"):
+        promised_miss_rate(safe)
 
 
 def test_no_unsafe_calibration_plan_is_missed_when_there_are_few(study, calibration):
@@ -164,20 +180,14 @@ def test_the_mirrored_loop_sees_the_same_plans_as_the_loop_itself():
         )
 
 
-def test_the_cause_is_named_by_whoever_was_right_more_often_on_the_calibration_plans(
-    study, assessment, calibration, plans
-):
-    named = named_causes(assessment, calibration)
-    assert list(named) == ["cause_probability", "predicted_margins"]
-    rows = calibration.is_unsafe & (
-        RULES[0].unsafe_score(calibration) > study.thresholds["sharpened"]
-    )
-    right = {
-        name: np.mean((causes == calibration.first.cause)[rows]) for name, causes in named.items()
-    }
-    assert right[study.cause_rule] == max(right.values())
-    figures = study.figures
-    assert figures["plans.causes.right_cause"] == figures[f"plans.causes.by_{study.cause_rule}"]
+def test_the_cause_is_the_constraint_whose_predicted_margin_is_smallest(study, assessment, plans):
+    named = named_causes(assessment, plans)
+    said = assessment.predict(plans.first.state, plans.first.desired_preview, plans.first.features)
+    np.testing.assert_array_equal(named["right_cause"], said.predicted_margins.argmin(axis=1))
+    rows = plans.is_unsafe & (RULES[0].unsafe_score(plans) > study.thresholds["sharpened"])
+    for name, causes in named.items():
+        right = np.mean((causes == plans.first.cause)[rows])
+        assert study.figures[f"plans.causes.{name}"].value == right
 
 
 def test_causes_are_judged_on_the_correctly_refused_alone(study, plans):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,6 +53,15 @@ def test_a_goal_is_safe_from_the_threshold_on():
     assert not ask(constant(0.6), threshold=0.61).is_accepted
 
 
+def test_between_the_thresholds_of_a_calibration_a_goal_is_not_known():
+    for gamma, expected in [(0.8, SAFE), (0.79, UNKNOWN), (0.3, UNKNOWN), (0.29, UNSAFE)]:
+        verdict = assess_goal(
+            GoalTask(), FieldAssessment(constant(gamma)), INSIDE, threshold=0.8, unsafe_below=0.3
+        )
+        assert verdict.verdict == expected
+        assert ("between 0.300 and 0.800" in verdict.reason) == (expected == UNKNOWN)
+
+
 def test_a_goal_is_not_known_when_most_of_its_belief_rests_on_cells_that_know_nothing():
     # μ = 0.3 + 0.7 e, e the share of empty cells: 0.65 is half of them.
     assert ask(constant(1.0), unknown=0.64).verdict == SAFE
@@ -81,7 +91,7 @@ def test_outside_what_was_trained_the_answer_is_the_region_and_no_number(goal, w
     assert task.num_resets == 0
     told = json.loads(json.dumps(verdict.to_json(), allow_nan=False))
     assert told["safety_probability"] is None
-    assert told["nearest_violation"] is None
+    assert told["cause_margin"] is None
     assert told["cause"] is None
 
 
@@ -90,19 +100,24 @@ def test_the_corners_of_the_region_belong_to_it():
         assert ask(constant(1.0), corner).is_accepted
 
 
-def test_a_refusal_names_the_likely_cause_and_the_margin_that_comes_nearest_to_violation():
+def test_a_refusal_names_the_constraint_whose_margin_comes_nearest_to_violation():
+    # Most of the unsafe mass is the floor's, but it is the wall that the margins tell of.
     verdict = ask(constant(0.25))
-    assert verdict.cause == "floor"
-    assert verdict.nearest_violation == ("wall", -0.25)
+    assert verdict.cause == "wall"
+    assert verdict.cause_margin == -0.25
     told = verdict.to_json()
-    assert told["cause"] == "floor"
-    assert told["nearest_violation"] == {"constraint": "wall", "margin": -0.25}
+    assert told["cause"] == "wall"
+    assert told["cause_margin"] == -0.25
     assert sum(told["belief"].values()) == pytest.approx(1.0)
     assert sum(told["cause_probability"].values()) == pytest.approx(told["belief"]["unsafe"])
 
 
-def test_where_nothing_speaks_for_a_cause_none_is_named():
-    assert ask(constant(1.0)).cause == ""
+def test_without_predicted_margins_the_cause_is_what_most_of_the_unsafe_mass_is_for():
+    unknown = np.full(2, np.nan)
+    verdict = replace(ask(constant(0.25)), predicted_margins=unknown)
+    assert verdict.cause == "floor"
+    assert math.isnan(verdict.cause_margin)
+    assert replace(verdict, cause_probability=np.zeros(2)).cause == ""
 
 
 def test_goals_are_judged_by_the_first_instant_on_the_way_to_each():
@@ -155,6 +170,23 @@ def test_an_accepted_goal_stays_one_when_it_is_typed_to_the_millimetre():
     typed = np.array([float(f"{value:.3f}") for value in found.goal])
     np.testing.assert_array_equal(typed, found.goal)
     assert ask(gamma, typed).is_accepted
+
+
+@pytest.mark.parametrize(("reserve", "x_m"), [(0.0, 0.5), (0.5, 0.25), (0.8, 0.1)])
+def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve(reserve, x_m):
+    # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, 0.5 + 0.5 reserve further down.
+    found = search(lambda goals: 1.0 - goals[:, 0], np.array([0.9, 0.0, 1.0]), reserve=reserve)
+    assert found.safety_probability >= 0.5 + 0.5 * reserve
+    assert x_m - 0.05 <= found.goal[0] <= x_m + 1e-9
+    assert found.threshold == 0.5
+    assert found.is_accepted
+
+
+def test_where_nothing_is_accepted_with_reserve_nothing_is_suggested():
+    assert search(constant(0.89), INSIDE, num_candidates=4) is None
+    assert search(constant(0.91), INSIDE, num_candidates=4) is not None
+    with pytest.raises(ValueError, match=r"reserve is 1\.5, expected a value in \[0, 1\]"):
+        search(constant(1.0), INSIDE, reserve=1.5)
 
 
 def test_the_same_generator_finds_the_same_goal():

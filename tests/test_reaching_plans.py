@@ -102,6 +102,40 @@ def test_a_push_is_over_when_what_is_learned_from_begins(tmp_path):
     assert all(e.time_s[e.first_step] >= 0.1 + 0.2 for e in pushed if e.is_safe)
 
 
+def path_of(loop, context):
+    """Where the hand shall be at the start, half-way and at the end, in the world, (3, 3)."""
+    end_s, points = loop.scenario.parameters.plan_duration_s, []
+    for time_s in (0.0, 0.5 * end_s, end_s):
+        later = context.Clone()
+        later.SetTime(time_s)
+        points.append(evaluated(loop, later, "desired_output"))
+    return np.array(points)
+
+
+def test_plans_to_choose_from_lead_to_the_same_goal_and_make_detours_as_drawn(tmp_path):
+    loop = exploring(tmp_path, exploring=False)
+    context = started(loop, 1)
+    start, middle, end = path_of(loop, context)
+    plans = loop.candidate_plans(context, np.random.default_rng(0), 5)
+    middles = []
+    for plan in plans:
+        loop.set_plan(context, plan)
+        path = path_of(loop, context)
+        np.testing.assert_allclose(path[[0, 2]], [start, end], atol=1e-9)
+        middles.append(path[1])
+    np.testing.assert_allclose(middles[0], middle, atol=1e-9)
+    detours = np.array(middles[1:]) - middle
+    assert len(np.unique(detours, axis=0)) == 4
+    assert np.all(
+        (detours >= np.array([-0.05, -0.1, 0.0]) - 1e-6) & (detours <= [0.0 + 1e-6, 0.1, 0.1])
+    )
+
+
+def test_where_training_makes_no_detours_there_is_no_plan_to_choose():
+    loop = porter()
+    assert len(loop.candidate_plans(started(loop), np.random.default_rng(0), 5)) == 1
+
+
 @pytest.mark.parametrize("robot", LOOPS)
 @pytest.mark.parametrize("hand", ["left", "right"])
 def test_fair_is_a_goal_in_the_box_whose_plan_is_clear_of_obstacles(robot, hand):

@@ -12,12 +12,21 @@ import sys
 import typer
 from rich.logging import RichHandler
 
-from drake_safety.cli import adapt, ask, evaluate, run, scenarios, train
+from drake_safety.cli import adapt, ask, calibrate, evaluate, plan_study, run, scenarios, train
 from drake_safety.cli.console import console
 from drake_safety.cli.targets import TargetCommand
 
 # In the order in which the help lists them.
-_COMMANDS = (scenarios.scenarios, train.train, ask.ask, run.run, evaluate.evaluate, adapt.adapt)
+_COMMANDS = (
+    scenarios.scenarios,
+    train.train,
+    calibrate.calibrate,
+    ask.ask,
+    run.run,
+    evaluate.evaluate,
+    plan_study.plan_study,
+    adapt.adapt,
+)
 
 app = typer.Typer(
     help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",

@@ -227,11 +227,12 @@ class _Judge:
                 num_orders=num_orders,
                 seed=self._seed,
                 rivals=rivals,
-                progress=lambda stage, done, total, mode=mode: self._stages(
-                    f"{mode}: {stage}", done, total
-                ),
+                progress=partial(self._report, mode),
             )
         return found
+
+    def _report(self, mode: str, stage: str, done: int, total: int) -> None:
+        self._stages(f"{mode}: {stage}", done, total)
 
 
 def _adaptation_table(

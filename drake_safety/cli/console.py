@@ -22,7 +22,11 @@ from rich.progress import (
 from rich.table import Column, Table
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from drake_safety.evaluation.metrics import Figure
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.closed_loop import ClosedLoop
 
 # Square brackets are units here, not markup. A log has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
@@ -52,6 +56,27 @@ def margin_words(name: str, margin: float, angular_constraints: Collection[str])
     if name in angular_constraints:
         return f"{name}, {math.degrees(margin):+.1f}°"
     return f"{name}, {100 * margin:+.1f} cm"
+
+
+def cause_words(
+    loop: ClosedLoop, assessment: SafetyAssessment, masses: np.ndarray, margins: np.ndarray
+) -> str:
+    """The constraint that is most likely to be violated, and its margin where one is predicted.
+
+    Args:
+        loop: Whose constraints they are.
+        assessment: What said so.
+        masses: b_unsafe split by constraint, (n_c,).
+        margins: Predicted margins, (n_c,) [m, rad].
+    """
+    from drake_safety.learning.causes import NO_CAUSE, likely_causes
+
+    (cause,) = likely_causes(masses[None], margins[None], assessment.parameters.margin_unit)
+    if cause == NO_CAUSE:
+        return "unknown"
+    if not math.isfinite(margins[cause]):
+        return loop.constraint_names[cause]
+    return margin_words(loop.constraint_names[cause], margins[cause], loop.angular_constraints)
 
 
 def print_path(what: str, path: Path) -> None:

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.evaluate_calibration import evaluate_calibration
 from drake_safety.cli.evaluate_plans import (
     PlanOptions,
     check_options,
@@ -118,6 +119,12 @@ def evaluate(
             f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and "
             f"{train_set.info.seed} is the training episodes' own; choose another"
         )
+    for one in (*sharpened.calibrations_.values(), *paper.calibrations_.values()):
+        if one.seed in used:
+            raise ValueError(
+                f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and {one.seed} is "
+                "the one that thresholds were calibrated with; choose another"
+            )
     with open_stages() as stages:
 
         def run_set(what: str, num_episodes: int, offset: int, **loop_options: Any) -> Episodes:
@@ -163,6 +170,7 @@ def evaluate(
             findings.add(evaluate_plans(judged, options, partial(run_set, offset=4)))
         else:
             findings.add(_evaluate_segments(judged))
+        findings.add(evaluate_calibration(judged))
         if throws:
             findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
     report = {

@@ -158,15 +158,12 @@ def evaluate_plans(
     }
     tables = [_verdict_table(figures, key, [rule.name for rule in rules]) for key in keys]
     tables.append(_outcome_table(figures, keys, test.constraint_names))
-    tables.append(_cause_table(figures, keys, test.constraint_names, study.cause_rule))
+    tables.append(_cause_table(figures, keys, test.constraint_names))
     if curve:
         tables.append(_curve_table(curve, sorted(set(options.learning_curve))))
     return Findings(
         figures=figures,
-        entries={
-            "calibration_episodes": len(judged.calibration_set),
-            "plans.causes.named_by": study.cause_rule,
-        },
+        entries={"calibration_episodes": len(judged.calibration_set)},
         pictures=pictures,
         tables=tables,
     )
@@ -178,8 +175,12 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     from drake_safety.evaluation.scorers import assessment_scorer
 
     rules = [
-        scorer_rule(assessment_scorer("sharpened", judged.sharpened, is_normalized=True)),
-        scorer_rule(assessment_scorer("paper", judged.paper, is_normalized=True)),
+        scorer_rule(
+            assessment_scorer(mode, gamma, is_normalized=True), gamma.calibrations_.get("plan")
+        )
+        for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items()
+    ]
+    rules += [
         *(scorer_rule(scorer) for scorer in judged.classifiers),
     ]
     known = [hand for hand in hands if hand is not None]
@@ -259,18 +260,17 @@ def _outcome_table(
 
 
 def _cause_table(
-    figures: dict[str, Figure],
-    keys: Mapping[str, str],
-    constraints: Sequence[str],
-    cause_rule: str,
+    figures: dict[str, Figure], keys: Mapping[str, str], constraints: Sequence[str]
 ) -> Table:
     """Of the correctly refused, all of them and by their cause."""
     seen = [name for name in constraints if any(f"{key}.causes.{name}" in figures for key in keys)]
     columns = [name.replace("_", " ") for name in seen]
-    title = f"Right cause of the correctly refused, by {cause_rule.replace('_', ' ')} [%]"
+    columns.append("all, by mass alone")
+    title = "Right cause of the correctly refused [%]"
     table = new_table("set", "refused", "all", *columns, title=title)
     for key, name in keys.items():
-        found = [figures.get(f"{key}.causes.{cause}") for cause in ("right_cause", *seen)]
+        wanted = ("right_cause", *seen, "by_cause_probability")
+        found = [figures.get(f"{key}.causes.{cause}") for cause in wanted]
         table.add_row(
             name,
             f"{figures[f'{key}.causes.right_cause'].n}",

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import margin_words, new_table
+from drake_safety.cli.console import cause_words, new_table
 from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.balls import Throw
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.scenario import Scenario
@@ -103,8 +104,8 @@ def run(
         is_live=meshcat,
     )
     if target is not None:
-        threshold, remark = goal_threshold(assessment, mode)
-        if not run_to_target(settings, target, threshold, remark, is_forced=force):
+        rule = goal_threshold(assessment, mode, settings.assessment)
+        if not run_to_target(settings, target, rule, is_forced=force):
             raise typer.Exit(1)
         return
     if force:
@@ -136,7 +137,9 @@ def _run_with_balls(settings: RunSettings) -> None:
         ports=_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    recording.save(_timeline(loop, log, throws), _table_of_events(loop, log, throws))
+    recording.save(
+        _timeline(loop, log, throws), _table_of_events(loop, settings.assessment, log, throws)
+    )
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
@@ -197,7 +200,9 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
     )
 
 
-def _table_of_events(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Table:
+def _table_of_events(
+    loop: ClosedLoop, assessment: SafetyAssessment, log: ThrowLog, throws: list[Throw]
+) -> Table:
     def row_at(time_s: float) -> int:
         return min(round(time_s / LOG_PERIOD_S), len(log.time_s) - 1)
 
@@ -211,15 +216,13 @@ def _table_of_events(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Ta
     ]
     for time_s, _ in log.recovery_intervals_s:
         row = row_at(time_s)
-        cause = int(np.argmax(log.extra["cause_probability"][row]))
-        margin = log.extra["predicted_margins"][row][cause]
-        events.append(
-            (
-                time_s,
-                "recovery triggered; expected violation: "
-                + margin_words(loop.constraint_names[cause], margin, loop.angular_constraints),
-            )
+        expected = cause_words(
+            loop,
+            assessment,
+            log.extra["cause_probability"][row],
+            log.extra["predicted_margins"][row],
         )
+        events.append((time_s, f"recovery triggered; expected violation: {expected}"))
     if log.has_fallen:
         events.append((log.fall_time_s, "the robot fell"))
     else:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.cli.console import console, margin_words, new_table
+from drake_safety.cli.console import cause_words, console, new_table
 from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+    from drake_safety.cli.training_folder import GoalThreshold
+    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.goal_motion import GoalMotion
     from drake_safety.simulation.pushes import Push
@@ -30,15 +32,14 @@ _AFTER_EPISODE_S = 1.0  # What is shown beyond an episode: whether the robot sta
 
 
 def run_to_target(
-    settings: RunSettings, target: str, threshold: float, remark: str, *, is_forced: bool
+    settings: RunSettings, target: str, rule: GoalThreshold, *, is_forced: bool
 ) -> bool:
     """Tells the verdict on a target and, unless that is a refusal to be obeyed, goes there.
 
     Args:
         settings: Of the run.
         target: The target as it was typed.
-        threshold: From which Γ on it is accepted.
-        remark: Where the threshold comes from, if that is worth saying.
+        rule: What the verdict on it is read from.
         is_forced: Whether to go there in any case.
 
     Returns:
@@ -53,9 +54,12 @@ def run_to_target(
     loop = settings.make_loop()
     goal = parse_target(loop, target)
     push = named_push(loop, settings.pushes)
-    verdict = assess_goal(loop, settings.assessment, goal, threshold=threshold)
+    threshold = rule.threshold
+    verdict = assess_goal(
+        loop, settings.assessment, goal, threshold=threshold, unsafe_below=rule.unsafe_below
+    )
     nearest = None if verdict.is_accepted else nearest_accepted(loop, settings.assessment, verdict)
-    print_verdict(loop, verdict, nearest, remark)
+    print_verdict(loop, verdict, nearest, rule.remark)
     if not (verdict.is_accepted or is_forced):
         console.print("refused: nothing moved; --force goes there all the same", highlight=False)
         return False
@@ -75,7 +79,13 @@ def run_to_target(
         ports=_MOTION_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    recording.save(draw_motion(loop, motion, threshold), table_of_motion(loop, motion, threshold))
+    watched = settings.assessment.calibrations_.get("motion")
+    # While it moves there are many rows to judge: the promise of a motion has its own threshold.
+    threshold = threshold if watched is None else watched.threshold
+    recording.save(
+        draw_motion(loop, motion, threshold),
+        table_of_motion(loop, settings.assessment, motion, threshold),
+    )
     return True
 
 
@@ -144,11 +154,14 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     )
 
 
-def table_of_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Table:
+def table_of_motion(
+    loop: ClosedLoop, assessment: SafetyAssessment, motion: GoalMotion, threshold: float
+) -> Table:
     """What happened when, and what Γ was then.
 
     Args:
         loop: The closed loop that was simulated.
+        assessment: Γ.
         motion: What came of it, with Γ and what it expects.
         threshold: From which Γ on a goal is accepted.
     """
@@ -161,11 +174,11 @@ def table_of_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> T
         )
     alarm = alarm_row(motion, threshold)
     if alarm is not None:
-        cause = int(np.argmax(motion.extra["cause_probability"][alarm]))
-        expected = margin_words(
-            loop.constraint_names[cause],
-            float(motion.extra["predicted_margins"][alarm, cause]),
-            loop.angular_constraints,
+        expected = cause_words(
+            loop,
+            assessment,
+            motion.extra["cause_probability"][alarm],
+            motion.extra["predicted_margins"][alarm],
         )
         events.append(
             (float(motion.time_s[alarm]), f"Γ below the threshold; expected violation: {expected}")

@@ -89,7 +89,7 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
 def nearest_accepted(
     loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
 ) -> GoalVerdict | None:
-    """What would be accepted instead of a target that was refused, if anything would be."""
+    """What would be accepted with reserve instead of a target that was refused, if anything."""
     from drake_safety.simulation.planning import nearest_accepted_goal
 
     return nearest_accepted_goal(
@@ -134,22 +134,23 @@ def print_verdict(
 
 def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None) -> dict[str, str]:
     lines = {}
-    name, margin = verdict.nearest_violation
-    violation = margin_words(name, margin, loop.angular_constraints) if name else ""
-    if verdict.cause and verdict.cause != name:
+    if np.isfinite(verdict.cause_margin):
+        lines["likely cause"] = margin_words(
+            verdict.cause, verdict.cause_margin, loop.angular_constraints
+        )
+    elif verdict.cause:
         share = verdict.cause_probability.max() / verdict.cause_probability.sum()
         lines["likely cause"] = f"{verdict.cause} ({100 * share:.0f} %)"
-        if violation:
-            lines["least margin"] = violation
-    elif violation and np.isfinite(verdict.safety_probability):
-        lines["likely cause"] = violation
     if not np.isfinite(verdict.goal).all():
         return lines
     if nearest is None:
-        lines["nearest accepted"] = "none was found"
+        lines["nearest accepted"] = "none was found that is accepted with reserve"
     else:
         distance_m = float(np.linalg.norm(nearest.goal - verdict.goal))
-        lines["nearest accepted"] = f"{_point(nearest.goal)}, {100 * distance_m:.1f} cm away"
+        lines["nearest accepted"] = (
+            f"{_point(nearest.goal)}, {100 * distance_m:.1f} cm away, "
+            f"Γ {nearest.safety_probability:.3f}"
+        )
     return lines
 
 

@@ -4,10 +4,25 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+
+
+class GoalThreshold(NamedTuple):
+    """What a verdict on a goal is read from.
+
+    Attributes:
+        threshold: From which Γ = b_safe / (1 - μ) on it is accepted.
+        unsafe_below: Below which it is unsafe; between the two the answer is "don't know".
+        remark: Where they come from, if that is worth saying.
+    """
+
+    threshold: float
+    unsafe_below: float
+    remark: str = ""
+
 
 MODES = ("sharpened", "paper")
 """Modes that are trained and compared, the default first."""
@@ -79,23 +94,29 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     return SafetyAssessment.load(path)
 
 
-def goal_threshold(folder: Path, mode: str) -> tuple[float, str]:
-    """From which Γ = b_safe / (1 - μ) on a goal is accepted.
+def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> GoalThreshold:
+    """What a verdict on a goal is read from.
 
     Args:
         folder: The folder of a training.
         mode: Of the assessment that is asked.
+        assessment: The assessment itself.
 
     Returns:
-        The threshold that ``evaluate`` chose on its calibration episodes, and ""; without one the
-        default, and a remark that says so.
+        What ``calibrate`` stored with the assessment; else the threshold that ``evaluate`` chose on
+        its calibration episodes; else the default, and a remark that says so.
     """
+    calibration = assessment.calibrations_.get("plan")
+    if calibration is not None:
+        return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.promise)
     file = folder / "evaluation.json"
     figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     figure = figures.get(f"plans.{mode}.threshold")
     if figure is not None:
-        return float(figure["value"]), ""
-    return DEFAULT_THRESHOLD, (
-        f"the threshold {DEFAULT_THRESHOLD:g} is not calibrated: `drake-safety evaluate` writes "
-        f"one into {file}"
+        return GoalThreshold(float(figure["value"]), float(figure["value"]))
+    return GoalThreshold(
+        DEFAULT_THRESHOLD,
+        DEFAULT_THRESHOLD,
+        f"the threshold {DEFAULT_THRESHOLD:g} is not calibrated: `drake-safety calibrate` chooses "
+        f"one with a promised miss rate and keeps it in {folder}",
     )

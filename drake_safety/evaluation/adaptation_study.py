@@ -75,7 +75,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
     found = {}
     for name, published in PUBLISHED.items():
         unsafe = 1.0 - published(result)
-        rows = {"": slice(None), "k0.": segments.is_first}
+        rows = {"": np.ones(len(unsafe), dtype=bool), "k0.": segments.is_first}
         found[name] = {
             f"{prefix}{metric}": value
             for prefix, chosen in rows.items()

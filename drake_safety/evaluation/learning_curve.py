@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 
-from drake_safety.evaluation.metrics import Figure, threshold_for_recall
+from drake_safety.evaluation.metrics import Figure
 from drake_safety.evaluation.plan_study import (
-    PROMISED_UNSAFE_RECALL,
     Plans,
+    promised_miss_rate,
     scorer_rule,
     verdict_figures,
 )
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.calibration import score_threshold
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import parallel_map
 
@@ -79,10 +80,11 @@ def learning_curve(
         if progress is not None:
             progress("learning curve", done, len(wanted))
     figures: dict[str, Figure] = {}
+    miss_rate = promised_miss_rate(calibration)
     for size in wanted:
         rule = scorer_rule(assessment_scorer("sharpened", learned[size], is_normalized=True))
-        threshold = threshold_for_recall(
-            rule.unsafe_score(calibration), calibration.is_unsafe, PROMISED_UNSAFE_RECALL
+        threshold = score_threshold(
+            rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate
         )
         score = rule.unsafe_score(test)
         for key, plans, chosen in (

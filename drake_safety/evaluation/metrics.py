@@ -87,7 +87,6 @@ class Bootstrap:
         return Figure(value, float(low), float(high), num_episodes)
 
 
-_BELOW_ALL = 1e-6  # By how much a threshold stays below the lowest score, wherever it is rounded.
 _BOOTSTRAP = Bootstrap()
 _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
@@ -320,49 +319,6 @@ def threshold_at(
         merit = -np.abs(unsafe_recall - safe_recall) + 1e-6 * balanced
     best = np.flatnonzero(merit >= merit.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
-
-
-def threshold_for_recall(
-    unsafe_score: np.ndarray, is_unsafe: np.ndarray, unsafe_recall: float
-) -> float:
-    """Chooses the highest threshold that promises a recall for unsafe samples yet to come.
-
-    Of n unsafe samples and one more that is drawn as they were, each is as likely as any other to
-    have the k-th lowest score. Below the k-th lowest of the n, k = ⌊(1 - recall)(n + 1)⌋, a
-    threshold misses the further one with a probability of at most 1 - recall (split conformal
-    prediction): k - 1 of the n are missed, fewer than (1 - recall) n. With too few of them for the
-    promise, none is missed.
-
-    Args:
-        unsafe_score: Unsafe scores, (N,).
-        is_unsafe: Labels, (N,).
-        unsafe_recall: The recall promised, in (0, 1).
-
-    Returns:
-        A threshold midway between the score it must stay below and the next lower one, safe or
-        unsafe; just below it when there is none.
-
-    Raises:
-        ValueError: No sample is unsafe, no score is finite, or the recall is not in (0, 1).
-    """
-    score, label = _checked("threshold_for_recall", unsafe_score, is_unsafe)
-    if not 0.0 < unsafe_recall < 1.0:
-        raise ValueError(
-            f"threshold_for_recall: unsafe_recall is {unsafe_recall}, expected a value in (0, 1)"
-        )
-    finite = score[np.isfinite(score)]
-    unsafe = np.sort(score[label])
-    if unsafe.size == 0 or finite.size == 0:
-        raise ValueError(
-            f"threshold_for_recall: {unsafe.size} of {len(score)} samples are unsafe, and "
-            f"{finite.size} scores are finite; it takes some of both"
-        )
-    rank = max(math.floor((1.0 - unsafe_recall) * (unsafe.size + 1) + 1e-9), 1)
-    bound = unsafe[rank - 1]
-    lower = finite[finite < bound]
-    if math.isinf(bound):
-        return float(lower.max())
-    return float(0.5 * (bound + lower.max()) if lower.size else bound - _BELOW_ALL)
 
 
 def _checked(

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import (
-    Figure,
-    proportion,
-    segment_figures,
-    threshold_for_recall,
-)
+from drake_safety.evaluation.metrics import Figure, proportion, segment_figures
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import (
+    Calibration,
+    episodes_needed,
+    least_miss_rate,
+    score_threshold,
+)
+from drake_safety.learning.causes import likely_causes
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -27,6 +30,9 @@ PROMISED_UNSAFE_RECALL = 0.992
 """What thresholds are chosen for: half a point above the paper's, as a finite test set scatters."""
 SAFE = "safe"
 """Outcome of an episode that stayed in the safe set; else it is the episode's cause."""
+
+
+_LOGGER = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +124,18 @@ class PlanRule:
     threshold: float | None = None
 
 
-def scorer_rule(scorer: Scorer) -> PlanRule:
-    """A scorer of x, its threshold left open."""
-    return PlanRule(name=scorer.name, unsafe_score=lambda plans: scorer.unsafe_score(plans.first))
+def scorer_rule(scorer: Scorer, calibration: Calibration | None = None) -> PlanRule:
+    """A scorer of x.
+
+    Args:
+        scorer: The scorer.
+        calibration: Its own; without one its threshold is left open.
+    """
+    return PlanRule(
+        name=scorer.name,
+        unsafe_score=lambda plans: scorer.unsafe_score(plans.first),
+        threshold=None if calibration is None else 1.0 - calibration.threshold,
+    )
 
 
 def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
@@ -148,14 +163,11 @@ class PlanStudy:
         figures: By dotted key.
         thresholds: Per rule, the unsafe score above which it refuses.
         unsafe_score: Per set ("plans", "plans.other_hand") and rule, the score of each plan, (N,).
-        cause_rule: What names the most likely cause better on the calibration plans: the largest
-            "cause_probability" or the smallest of the "predicted_margins".
     """
 
     figures: dict[str, Figure]
     thresholds: dict[str, float]
     unsafe_score: dict[str, dict[str, np.ndarray]]
-    cause_rule: str
 
 
 def evaluate_plans(
@@ -168,8 +180,10 @@ def evaluate_plans(
 
     Thresholds left open are chosen on the calibration plans, all of the target box, so that an
     unsafe plan yet to come is refused with the probability `PROMISED_UNSAFE_RECALL`, see
-    :func:`~drake_safety.evaluation.metrics.threshold_for_recall`; of those the one that accepts
-    most. The figures give them as Γ_thre, the safety probability below which a plan is refused.
+    :mod:`drake_safety.learning.calibration`; of those the one that accepts most. With too few
+    unsafe calibration plans for that promise it is the highest that can be kept, with a warning;
+    `promised_unsafe_recall` says which it was. The figures give them as Γ_thre, the safety
+    probability below which a plan is refused.
 
     Args:
         rules: Who is judged; the assessment's own rule is the one of this name: "sharpened".
@@ -180,25 +194,18 @@ def evaluate_plans(
     Raises:
         ValueError: There is no threshold to choose: no calibration plan is unsafe.
     """
+    miss_rate = promised_miss_rate(calibration)
     thresholds = {
-        rule.name: threshold_for_recall(
-            rule.unsafe_score(calibration), calibration.is_unsafe, PROMISED_UNSAFE_RECALL
-        )
+        rule.name: score_threshold(rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate)
         if rule.threshold is None
         else rule.threshold
         for rule in rules
     }
     own = next((rule for rule in rules if rule.name == "sharpened"), rules[0])
-    named = named_causes(assessment, calibration)
-    is_refused = _is_refused(own.unsafe_score(calibration), thresholds[own.name])
-    right = {
-        name: _right_causes(calibration, causes, is_refused)[0].value
-        for name, causes in named.items()
-    }
-    # The first, the belief's own word, unless another is better.
-    cause_rule = max(right, key=lambda name: np.nan_to_num(right[name], nan=-1.0))
 
-    figures: dict[str, Figure] = {}
+    promise = 1.0 - miss_rate
+    num_unsafe = int(calibration.is_unsafe.sum())
+    figures = {"plans.promised_unsafe_recall": Figure(promise, promise, promise, num_unsafe)}
     scores: dict[str, dict[str, np.ndarray]] = {}
     for prefix, plans in sets.items():
         scores[prefix] = {rule.name: rule.unsafe_score(plans) for rule in rules}
@@ -215,7 +222,6 @@ def evaluate_plans(
             found = _cause_figures(
                 chosen,
                 {name: of_all[rows] for name, of_all in causes.items()},
-                cause_rule,
                 _is_refused(scores[prefix][own.name][rows], thresholds[own.name]),
             )
             found |= outcome_figures(chosen)
@@ -223,9 +229,34 @@ def evaluate_plans(
         figures[f"{prefix}.share_fair"] = proportion(
             int(plans.is_outcome_fair.sum()), len(plans.outcomes)
         )
-    return PlanStudy(
-        figures=figures, thresholds=thresholds, unsafe_score=scores, cause_rule=cause_rule
-    )
+    return PlanStudy(figures=figures, thresholds=thresholds, unsafe_score=scores)
+
+
+def promised_miss_rate(calibration: Plans) -> float:
+    """What share of unsafe plans thresholds may accept: as promised, or more if few were seen.
+
+    Args:
+        calibration: The plans that thresholds are chosen on.
+
+    Raises:
+        ValueError: None of them is unsafe.
+    """
+    num_unsafe, wanted = int(calibration.is_unsafe.sum()), 1.0 - PROMISED_UNSAFE_RECALL
+    if num_unsafe == 0:
+        raise ValueError(
+            f"thresholds: 0 of {len(calibration)} calibration plans are unsafe; it takes "
+            f"{episodes_needed(wanted)} to promise an unsafe recall of {PROMISED_UNSAFE_RECALL:g}"
+        )
+    least = least_miss_rate(num_unsafe)
+    if least > wanted:
+        _LOGGER.warning(
+            "%d unsafe calibration episodes promise an unsafe recall of %.3f; %.3f takes %d",
+            num_unsafe,
+            1.0 - least,
+            PROMISED_UNSAFE_RECALL,
+            episodes_needed(wanted),
+        )
+    return max(least, wanted)
 
 
 def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) -> dict[str, Figure]:
@@ -262,8 +293,8 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
     """The cause that Γ would name for each plan, as a column of the constraints, (N,).
 
     Returns:
-        By what it is read from: "cause_probability", the largest one, and where there are any
-        "predicted_margins", the smallest one.
+        "right_cause", by the rule of :func:`~drake_safety.learning.causes.likely_causes`, and to
+        compare with "by_cause_probability", the constraint with most of the unsafe mass.
     """
     first = plans.first
     result = assessment.predict(
@@ -271,22 +302,23 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
         first.desired_preview,
         first.features if assessment.uses_features else None,
     )
-    named = {"cause_probability": result.cause_probability.argmax(axis=1)}
-    if len(plans) and np.isfinite(result.predicted_margins).any():
-        margins = np.where(np.isnan(result.predicted_margins), np.inf, result.predicted_margins)
-        named["predicted_margins"] = margins.argmin(axis=1)
-    return named
+    no_margins = np.full_like(result.predicted_margins, np.nan)
+    return {
+        "right_cause": likely_causes(
+            result.cause_probability, result.predicted_margins, assessment.parameters.margin_unit
+        ),
+        "by_cause_probability": likely_causes(result.cause_probability, no_margins),
+    }
 
 
 def _cause_figures(
-    plans: Plans, named: Mapping[str, np.ndarray], cause_rule: str, is_refused: np.ndarray
+    plans: Plans, named: Mapping[str, np.ndarray], is_refused: np.ndarray
 ) -> dict[str, Figure]:
-    """Shares of the right causes among correctly refused plans, by any rule and by cause."""
+    """Shares of the right causes among correctly refused plans, by either rule and by cause."""
     figures = {}
     for name, causes in named.items():
-        figures[f"causes.by_{name}"], by_cause = _right_causes(plans, causes, is_refused)
-        if name == cause_rule:
-            figures["causes.right_cause"] = figures[f"causes.by_{name}"]
+        figures[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
+        if name == "right_cause":
             figures |= {f"causes.{cause}": figure for cause, figure in by_cause.items()}
     return figures
 

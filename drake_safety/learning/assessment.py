@@ -18,6 +18,7 @@ from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
     AssessmentParameters,
 )
+from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.embedding import INPUT_LIMIT, Embedding
 from drake_safety.learning.feedback import (
     FeedbackSegments,
@@ -59,6 +60,8 @@ class SafetyAssessment:
     - `base_logit_`: L, which scales the maps' heads to one logit; None without heads.
     - `shift_`: what feedback adds to L in every map's cells, (K, R*R); zero before any.
     - `adaptation_`: the `Adaptation` to feedback; None before any.
+    - `calibrations_`: the `Calibration` by its kind, of these maps and `beliefs_`; empty until it
+      is set.
 
     Departure ("sharpened" only): x gains the safe set's own signed margins along the plan
     (`features`), the maps learn safety and future margins beside t-SNE's points from every start
@@ -129,6 +132,7 @@ class SafetyAssessment:
                 else np.zeros(len(segments), dtype=np.int64)
             )
         self.adaptation_: Adaptation | None = None
+        self.calibrations_: dict[str, Calibration] = {}
         self.shift_ = np.zeros((self.embedding_.num_members, self.grid_.num_cells))
         self.beliefs_ = adaptation.prior_beliefs(
             self._training, self.grid_, parameters, self.num_causes
@@ -192,6 +196,8 @@ class SafetyAssessment:
         )
         points = output.embedding
         adapted = copy.copy(self)
+        # What was promised was promised of other beliefs.
+        adapted.calibrations_ = {}
         arguments = (self.grid_, self.parameters, self.num_causes)
         b = 0.0
         adapted.shift_ = np.zeros_like(self.shift_)
@@ -371,7 +377,9 @@ class SafetyAssessment:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one safetensors file, first under a temporary name: it is whole or absent."""
         self._check_fitted()
-        tensors = {f"embedding.{name}": w for name, w in self.embedding_.weights.items()}
+        tensors: dict[str, np.ndarray] = {
+            f"embedding.{name}": w for name, w in self.embedding_.weights.items()
+        }
         tensors |= {
             "beliefs": self.beliefs_,
             "shift": self.shift_,
@@ -390,6 +398,7 @@ class SafetyAssessment:
             numbers={
                 "num_margins": self.embedding_.num_margins,
                 "base_logit": None if self.base_logit_ is None else asdict(self.base_logit_),
+                "calibrations": [one.to_json() for one in self.calibrations_.values()],
             },
             tensors=tensors,
         )
@@ -417,6 +426,7 @@ class SafetyAssessment:
         *,
         num_margins: int,
         base_logit: dict[str, Any] | None,
+        calibrations: list[dict[str, Any]],
     ) -> None:
         parameters, info = self.parameters, self.info_
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
@@ -440,6 +450,8 @@ class SafetyAssessment:
         if base_logit is not None:
             low, high = base_logit["margin_range"]
             self.base_logit_ = BaseLogit(**base_logit | {"margin_range": (low, high)})
+        stored = [Calibration(**one) for one in calibrations]
+        self.calibrations_ = {one.kind: one for one in stored}
         self.beliefs_ = tensors["beliefs"]
         self.shift_ = tensors["shift"]
         expected = (

@@ -82,6 +82,9 @@ class ClosedLoop(Diagram):
     judging_options: Mapping[str, Any] = {}
     """Options of the diagram that verdicts are judged with, where they are not the training's."""
 
+    plan_variety = "the task decides which plans there are"
+    """Where a scenario says how plans may differ."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]
@@ -265,6 +268,32 @@ class ClosedLoop(Diagram):
             push: Where, how hard, when.
         """
         raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
+
+    def candidate_plans(
+        self, context: Context, rng: np.random.Generator, num_plans: int
+    ) -> list[Any]:
+        """Plans from the state of a Context that would do; tasks that offer some override this.
+
+        They stay inside what the scenario's training covers, or Γ could not judge them.
+
+        Args:
+            context: The diagram's Context, with a plan.
+            rng: Source of the others.
+            num_plans: How many at most.
+
+        Returns:
+            What :meth:`set_plan` takes; the first is the plan that the Context has.
+        """
+        raise ValueError(f"task '{type(self).__name__}' offers no plans to choose from")
+
+    def set_plan(self, context: Context, plan: Any) -> None:
+        """Sets a plan in place of the one that the Context has; the state stays as it is.
+
+        Args:
+            context: The diagram's Context.
+            plan: One of :meth:`candidate_plans`.
+        """
+        raise ValueError(f"task '{type(self).__name__}' offers no plans to choose from")
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples a calm motion, during which a ball is thrown; tasks with a ball override this.

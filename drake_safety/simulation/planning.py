@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY
+from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
+from drake_safety.learning.causes import NO_CAUSE, likely_causes
 from drake_safety.simulation.closed_loop import ClosedLoop
 
-SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
-"""The verdicts."""
+RESERVE = 0.8
+"""Share of the way from the threshold to certainty by which a suggested goal exceeds the threshold.
+
+At the threshold itself as many goals are safe as not: a suggestion must be better than that."""
 
 _FIRST_RADIUS_M = 0.05
 _GROWTH = 1.6  # From one ball of candidates to the next.
@@ -39,6 +43,7 @@ class GoalVerdict:
         cause_probability: b_unsafe split by the constraint that will be violated, (n_c,).
         predicted_margins: Smallest margin of each constraint that is expected, (n_c,); NaN where
             none is predicted.
+        margin_unit: Margin that counts as one when margins are compared [m, rad].
         reason: Why the answer is "don't know"; "" otherwise.
     """
 
@@ -50,6 +55,7 @@ class GoalVerdict:
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
     predicted_margins: np.ndarray
+    margin_unit: float = 1.0
     reason: str = ""
 
     @property
@@ -60,24 +66,20 @@ class GoalVerdict:
     @property
     def cause(self) -> str:
         """The constraint that is most likely to be violated; "" where nothing speaks for any."""
-        if not self.cause_probability.max(initial=0.0) > 0:
-            return ""
-        return self.constraint_names[int(np.argmax(self.cause_probability))]
+        (column,) = likely_causes(
+            self.cause_probability[None], self.predicted_margins[None], self.margin_unit
+        )
+        return "" if column == NO_CAUSE else self.constraint_names[column]
 
     @property
-    def nearest_violation(self) -> tuple[str, float]:
-        """The smallest predicted margin: whose it is, and its value [m, rad].
-
-        "" and NaN where none is predicted.
-        """
-        if not np.isfinite(self.predicted_margins).any():
-            return "", math.nan
-        lowest = int(np.nanargmin(self.predicted_margins))
-        return self.constraint_names[lowest], float(self.predicted_margins[lowest])
+    def cause_margin(self) -> float:
+        """The margin that is predicted for the cause [m, rad]; NaN where none is."""
+        if not self.cause:
+            return math.nan
+        return float(self.predicted_margins[self.constraint_names.index(self.cause)])
 
     def to_json(self) -> dict[str, Any]:
         """As plain values; what is unknown is None."""
-        name, margin = self.nearest_violation
         by_name = zip(self.constraint_names, self.cause_probability.tolist(), strict=True)
         return {
             "goal": [_finite(value) for value in self.goal.tolist()],
@@ -88,12 +90,17 @@ class GoalVerdict:
             "threshold": self.threshold,
             "cause": self.cause or None,
             "cause_probability": dict(by_name),
-            "nearest_violation": {"constraint": name, "margin": margin} if name else None,
+            "cause_margin": _finite(self.cause_margin),
         }
 
 
 def assess_goal(
-    loop: ClosedLoop, assessment: SafetyAssessment, goal: np.ndarray, *, threshold: float
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    *,
+    threshold: float,
+    unsafe_below: float | None = None,
 ) -> GoalVerdict:
     """What an assessment says of going from the standing posture to a goal.
 
@@ -105,6 +112,8 @@ def assess_goal(
         goal: In the world, (3,) [m]. One that is not finite, or outside the region that was
             sampled in training, is answered with "don't know" and the region.
         threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
+            default.
 
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
@@ -112,7 +121,9 @@ def assess_goal(
     goal = _checked(goal)
     box = target_box(loop)
     if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
-        (verdict,) = assess_goals(loop, assessment, goal[None], threshold=threshold)
+        (verdict,) = assess_goals(
+            loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
+        )
         return verdict
     what = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
     names = tuple(loop.constraint_names)
@@ -130,7 +141,12 @@ def assess_goal(
 
 
 def assess_goals(
-    loop: ClosedLoop, assessment: SafetyAssessment, goals: np.ndarray, *, threshold: float
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goals: np.ndarray,
+    *,
+    threshold: float,
+    unsafe_below: float | None = None,
 ) -> list[GoalVerdict]:
     """What an assessment says of goals inside the region that was sampled in training.
 
@@ -141,15 +157,24 @@ def assess_goals(
         assessment: What was learned from its episodes.
         goals: In the world, (N, 3) [m].
         threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
+            default.
     """
     if len(goals) == 0:
         return []
+    unsafe_below = threshold if unsafe_below is None else unsafe_below
     said = assessment.predict(*goal_inputs(loop, goals))
     most_unknown = 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
         reason = ""
         verdict = SAFE if said.normalized[i] >= threshold else UNSAFE
+        if unsafe_below <= said.normalized[i] < threshold:
+            verdict = UNKNOWN
+            reason = (
+                f"Γ {said.normalized[i]:.3f} lies between {unsafe_below:.3f} and "
+                f"{threshold:.3f}, where safe and unsafe targets cannot be told apart"
+            )
         if said.belief[i, UNCERTAINTY] > most_unknown:
             verdict = UNKNOWN
             reason = "training came too seldom near what this target looks like to the assessment"
@@ -163,6 +188,7 @@ def assess_goals(
                 constraint_names=tuple(loop.constraint_names),
                 cause_probability=said.cause_probability[i],
                 predicted_margins=said.predicted_margins[i],
+                margin_unit=assessment.parameters.margin_unit,
                 reason=reason,
             )
         )
@@ -195,10 +221,14 @@ def nearest_accepted_goal(
     *,
     threshold: float,
     rng: np.random.Generator,
+    reserve: float = RESERVE,
     num_candidates: int = 64,
     resolution_m: float = 1e-3,
 ) -> GoalVerdict | None:
-    """The accepted goal nearest to a given one, as far as a random search finds it.
+    """The goal nearest to a given one that is accepted with reserve, as far as a search finds it.
+
+    With reserve: Γ ≥ threshold + reserve (1 - threshold). The nearest goal lies at the limit that
+    was searched with, and of those at the threshold itself many are unsafe.
 
     Candidates fill growing balls about the goal, in the end the whole region, until one of them is
     accepted. From there on the search goes down: a bisection towards the goal, then candidates
@@ -211,24 +241,33 @@ def nearest_accepted_goal(
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
         threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
         rng: Source of the candidates.
+        reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
+            is accepted.
         num_candidates: That are judged at a time.
         resolution_m: Spacing of the grid of candidates [m].
 
     Returns:
-        The verdict on it; None when the goal is not finite, or nothing in the region is accepted.
+        The verdict on it, by the threshold itself; None when the goal is not finite, or nothing in
+        the region is accepted with reserve.
+
+    Raises:
+        ValueError: The reserve is not in [0, 1], or the goal is not three numbers.
     """
+    if not 0.0 <= reserve <= 1.0:
+        raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
     goal = _checked(goal)
     if not np.isfinite(goal).all():
         return None
     box = target_box(loop)
     centre = np.clip(goal, *box)
+    stricter = threshold + reserve * max(1.0 - threshold, 0.0)
 
     def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
         on_grid = np.unique(np.round(candidates / resolution_m), axis=0) * resolution_m
         # A multiple of the spacing is not yet the number that is read back from its digits.
         on_grid = np.round(on_grid, 9)
         inside = on_grid[np.all((on_grid >= box[0]) & (on_grid <= box[1]), axis=1)]
-        verdicts = assess_goals(loop, assessment, inside, threshold=threshold)
+        verdicts = assess_goals(loop, assessment, inside, threshold=stricter)
         accepted = [verdict for verdict in verdicts if verdict.is_accepted]
         return min(accepted, key=lambda one: _distance(one.goal, goal), default=None)
 
@@ -254,7 +293,7 @@ def nearest_accepted_goal(
         found = nearest_of(candidates[is_nearer])
         if found is not None and _distance(found.goal, goal) < distance:
             best = found
-    return best
+    return replace(best, threshold=threshold)
 
 
 def _bisected(

@@ -105,6 +105,7 @@ def run_episode(
     goal: np.ndarray | None = None,
     is_standing: bool = False,
     start: EpisodeStart | None = None,
+    plan: Any = None,
 ) -> Episode:
     """Simulates one episode: until it leaves the safe set, or its time is over.
 
@@ -118,6 +119,7 @@ def run_episode(
             goal.
         start: What it begins with, in place of a random state and plan: the twin of an episode
             that began so. The noise is that of the set and the index.
+        plan: Replaces the plan that it begins with: one of the loop's ``candidate_plans``.
 
     Returns:
         The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
@@ -145,6 +147,8 @@ def run_episode(
         loop.reset_standing(context, goal, rng)
     else:
         first_step = loop.reset(context, rng, goal)
+    if plan is not None:
+        loop.set_plan(context, plan)
     safe = loop.GetOutputPort("safe")
     nothing = EventStatus.DidNothing()
 

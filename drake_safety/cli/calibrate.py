@@ -1,0 +1,169 @@
+"""``drake-safety calibrate``: thresholds of Γ with a promised miss rate, kept beside Γ."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.training_folder import (
+    MODES,
+    assessment_file,
+    fresh_episodes_folder,
+    load_assessment,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from drake_safety.evaluation.calibration_study import PromiseKept
+    from drake_safety.learning.calibration import Calibration
+
+SEED = 2_000_000
+"""Of the episodes that Γ is calibrated with: not those that `evaluate` judges by."""
+
+
+def calibrate(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    miss_rate: Annotated[
+        float, typer.Option(help="Promised share of unsafe episodes that are called safe.")
+    ] = 0.01,
+    false_alarm_rate: Annotated[
+        float,
+        typer.Option(help="Promised share of safe episodes called unsafe, not 'don't know'."),
+    ] = 0.05,
+    confidence: Annotated[
+        float | None,
+        typer.Option(help="With which the promise holds, such as 0.95; on average by default."),
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=2)] = 1000,
+    splits: Annotated[
+        int, typer.Option(help="How often to split them, to see promises kept; 0: not.", min=0)
+    ] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = SEED,
+    workers: WorkersOption = None,
+) -> None:
+    """Choose thresholds that keep a promised miss rate, on fresh episodes.
+
+    `ask`, `run` and `evaluate` use what is stored. The episodes are kept in ASSESSMENT: a
+    calibration that was stopped goes on, and another promise costs nothing more.
+    """
+    from drake_safety.evaluation.calibration_study import repeated_splits
+    from drake_safety.evaluation.scorers import assessment_scorer
+    from drake_safety.learning.calibration import KINDS, episode_scores
+    from drake_safety.learning.calibration import calibrate as choose
+    from drake_safety.learning.segments import split
+    from drake_safety.simulation.rollouts import run_episodes
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    learned = {
+        mode: load_assessment(assessment, mode)
+        for mode in MODES
+        if mode == MODES[0] or assessment_file(assessment, mode).is_file()
+    }
+    scenario_hash = loaded.simulation_hash()
+    for gamma in learned.values():
+        if gamma.info_.scenario_hash != scenario_hash:
+            raise ValueError(
+                f"calibrate: the assessment was learned from scenario '{gamma.info_.scenario}' "
+                f"with hash {gamma.info_.scenario_hash[:12]}, but '{loaded.name}' now has hash "
+                f"{scenario_hash[:12]}: train again"
+            )
+        if gamma.info_.seed == seed:
+            raise ValueError(
+                f"calibrate: {seed} is the training episodes' own seed; choose another"
+            )
+    judging = dict(loaded.task_class().judging_options)
+    with open_stages() as stages:
+        fresh = run_episodes(
+            loaded,
+            episodes,
+            seed=seed,
+            num_workers=workers,
+            path=fresh_episodes_folder(assessment, scenario_hash, seed, judging),
+            progress=partial(stages, "calibration episodes"),
+            **judging,
+        )
+    segments = split(fresh, stride=1, discount=1.0, shortest=1)
+    found: dict[str, list[Calibration]] = {}
+    kept: dict[str, list[PromiseKept]] = {}
+    for mode, gamma in learned.items():
+        score = assessment_scorer(mode, gamma, is_normalized=True).unsafe_score(segments)
+        for kind in KINDS:
+            of_episodes, is_unsafe = episode_scores(segments, score, kind)
+            one = choose(
+                of_episodes,
+                is_unsafe,
+                kind=kind,
+                miss_rate=miss_rate,
+                false_alarm_rate=false_alarm_rate,
+                confidence=confidence,
+                seed=seed,
+                scenario_hash=scenario_hash,
+            )
+            found.setdefault(mode, []).append(one)
+            if splits and mode == MODES[0]:
+                kept[kind] = repeated_splits(
+                    of_episodes, is_unsafe, confidence=confidence, num_splits=splits, seed=seed
+                )
+    for mode, gamma in learned.items():
+        gamma.calibrations_ = {one.kind: one for one in found[mode]}
+        gamma.save(assessment_file(assessment, mode))
+    console.print(_table(found))
+    for kind, promises in kept.items():
+        console.print(_splits_table(kind, promises, splits))
+    for mode in learned:
+        print_path("calibrated", assessment_file(assessment, mode))
+
+
+def _table(found: dict[str, list[Calibration]]) -> Table:
+    one = next(iter(found.values()))[0]
+    table = new_table(
+        "mode",
+        "judged by",
+        "safe from Γ",
+        "unsafe below",
+        "unsafe called safe",
+        "safe called safe",
+        title=f"Promised: {one.promise}",
+    )
+    for mode, calibrations in found.items():
+        for calibration in calibrations:
+            table.add_row(
+                mode,
+                {"plan": "first row", "motion": "worst row"}[calibration.kind],
+                f"{calibration.threshold:.4f}",
+                f"{calibration.unsafe_below:.4f}",
+                f"{calibration.num_missed} of {calibration.num_unsafe}",
+                f"{calibration.num_accepted} of {calibration.num_safe}",
+            )
+    return table
+
+
+def _splits_table(kind: str, promises: list[PromiseKept], num_splits: int) -> Table:
+    table = new_table(
+        "promised [%]",
+        "observed [%]",
+        "splits above it [%]",
+        "safe called safe [%]",
+        title=f"{MODES[0]}, {kind}: calibrated on one half and judged on the other, "
+        f"{num_splits} splits",
+    )
+    for one in promises:
+        promised = f"{100 * one.miss_rate:g}"
+        if one.observed.n == 0:
+            missing = f"takes {one.num_needed} unsafe episodes a half; there are "
+            table.add_row(promised, f"{missing}{one.num_calibration}", "-", "-")
+            continue
+        table.add_row(
+            promised,
+            interval(one.observed, 100, 2),
+            f"{100 * one.share_broken:.0f}",
+            interval(one.safe_recall, 100, 1),
+        )
+    return table

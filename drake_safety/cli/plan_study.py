@@ -1,0 +1,98 @@
+"""``drake-safety plan-study``: what choosing plans by Γ is worth."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.training_folder import goal_threshold, load_assessment
+
+_ROWS = {
+    "default": "default plan",
+    "any_candidate": "any candidate",
+    "chosen": "chosen by Γ",
+    "chosen_if_accepted": "chosen by Γ, if Γ accepts it",
+    "best_in_hindsight": "best in hindsight",
+}
+
+
+def plan_study(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    episodes: Annotated[int, typer.Option(help="Fresh starts to plan from.", min=1)] = 200,
+    candidates: Annotated[
+        int, typer.Option(help="Plans of each start, all of them simulated.", min=2)
+    ] = 9,
+    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 3_000_000,
+    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the figures; ASSESSMENT's by default.")
+    ] = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Compare the default plan, the one with the highest Γ, and the best in hindsight.
+
+    Simulates every candidate plan of every start: EPISODES times CANDIDATES motions.
+    """
+    from drake_safety.evaluation.planning_study import planning_study, run_trials
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    gamma = load_assessment(assessment, mode)
+    if gamma.info_.scenario_hash != loaded.simulation_hash():
+        raise ValueError(
+            f"plan-study: the assessment was learned from scenario '{gamma.info_.scenario}' with "
+            f"hash {gamma.info_.scenario_hash[:12]}, but '{loaded.name}' now has hash "
+            f"{loaded.simulation_hash()[:12]}: train again"
+        )
+    if seed == gamma.info_.seed:
+        raise ValueError(f"plan-study: {seed} is the training episodes' own seed; choose another")
+    rule = goal_threshold(assessment, mode, gamma)
+    with open_stages() as stages:
+        trials = run_trials(
+            loaded,
+            episodes,
+            num_plans=candidates,
+            seed=seed,
+            num_workers=workers,
+            progress=partial(stages, "starts"),
+        )
+    study = planning_study(gamma, trials, threshold=rule.threshold)
+    table = new_table(
+        "plan",
+        "executed",
+        "safe [%]",
+        title=f"{episodes} fresh starts, {candidates} plans each; Γ accepts a plan of "
+        f"{interval(study.figures['accepted'], 100, 1)} %",
+    )
+    for key, name in _ROWS.items():
+        figure = study.figures[key]
+        table.add_row(name, f"{figure.n}", interval(figure, 100, 1))
+    report = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "scenario_hash": loaded.simulation_hash(),
+        "mode": mode,
+        "seed": seed,
+        "candidates": candidates,
+        "threshold": rule.threshold,
+        "versions": versions(),
+        **{f"planning.{key}": figure.to_json() for key, figure in study.figures.items()},
+    }
+    folder = out or assessment
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "planning.json"
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    console.print(table)
+    gain = study.figures["gain"]
+    console.print(f"from default to hindsight: {interval(gain, 100, 0)} % of the way by Γ")
+    if rule.remark:
+        console.print(rule.remark, highlight=False, soft_wrap=True)
+    print_path("figures", file)

@@ -1,0 +1,101 @@
+"""The gradient leads to the nearest accepted goal, with far fewer goals judged than by search."""
+
+import numpy as np
+import pytest
+
+from drake_safety.learning.embedding import Embedding
+from drake_safety.learning.gradients import logit_gradient
+from drake_safety.simulation.goal_descent import descend_to_accepted
+from drake_safety.simulation.planning import nearest_accepted_goal
+from goal_field import BOX, FieldAssessment, GoalTask
+
+GOAL = np.array([0.9, 0.5, 1.5])
+NORMAL = np.array([0.48, 0.6, 0.64])
+STEEPNESS, OFFSET = 30.0, 0.9
+
+
+def random_maps(rng, sizes=(6, 8, 8), members=2):
+    widths = [*sizes, 2]
+    names = [f"trunk.{i}" for i in range(len(sizes) - 1)] + ["output"]
+    weights = {}
+    for name, n, m in zip(names, widths, widths[1:], strict=False):
+        weights[f"{name}.weight"] = rng.normal(size=(members, n, m))
+        weights[f"{name}.bias"] = rng.normal(size=(members, m))
+    for name, n, m in (("safety.0", 2, 5), ("safety.1", 5, 1)):
+        weights[f"{name}.weight"] = rng.normal(size=(members, n, m))
+        weights[f"{name}.bias"] = rng.normal(size=(members, m))
+    return Embedding(weights, num_margins=0)
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    rng = np.random.default_rng(0)
+    embedding = random_maps(rng)
+    x = rng.normal(size=(4, 6))
+    logit, gradient = logit_gradient(embedding, x)
+    np.testing.assert_allclose(
+        logit, embedding.evaluate(x).unsafe_logit.mean(axis=0), rtol=1e-4, atol=1e-4
+    )
+    for i in range(6):
+        step = 1e-6 * np.eye(6)[i]
+        change = logit_gradient(embedding, x + step)[0] - logit_gradient(embedding, x - step)[0]
+        np.testing.assert_allclose(gradient[:, i], change / 2e-6, rtol=1e-5, atol=1e-6)
+
+
+def test_maps_without_a_safety_head_have_no_gradient():
+    embedding = random_maps(np.random.default_rng(0))
+    weights = {k: v for k, v in embedding.weights.items() if not k.startswith("safety")}
+    with pytest.raises(ValueError, match="maps without a safety head"):
+        logit_gradient(Embedding(weights, num_margins=0), np.zeros((1, 6)))
+
+
+class PlaneAssessment(FieldAssessment):
+    """Unsafe beyond a plane; its maps say so, with a logit that is straight across it."""
+
+    def __init__(self):
+        super().__init__(lambda goals: 1.0 / (1.0 + np.exp(STEEPNESS * (goals @ NORMAL - OFFSET))))
+        # x is the goal three times: only the first counts. Offsets keep every unit active.
+        first = np.zeros((1, 9, 1))
+        first[0, :3, 0] = NORMAL
+        one = np.ones((1, 1, 1))
+        output = np.array([[[1.0, 0.0]]])
+        self.embedding_ = Embedding(
+            {
+                "trunk.0.weight": first,
+                "trunk.0.bias": np.full((1, 1), 10.0),
+                "output.weight": output,
+                "output.bias": np.zeros((1, 2)),
+                "safety.0.weight": np.array([[[1.0], [0.0]]]),
+                "safety.0.bias": np.full((1, 1), 10.0),
+                "safety.1.weight": STEEPNESS * one,
+                "safety.1.bias": np.full((1, 1), -STEEPNESS * (20.0 + OFFSET)),
+            },
+            num_margins=0,
+        )
+
+    def _inputs(self, *parts):
+        return np.concatenate(parts, axis=1)
+
+
+def test_the_nearest_accepted_goal_of_a_plane_is_found_with_few_judged():
+    found = descend_to_accepted(GoalTask(), PlaneAssessment(), GOAL, threshold=0.5)
+    # Γ ≥ 0.9 is ln 9 below the middle of the slope.
+    distance = GOAL @ NORMAL - (OFFSET - np.log(9.0) / STEEPNESS)
+    assert found.verdict.safety_probability >= 0.9
+    assert found.verdict.threshold == 0.5
+    assert np.linalg.norm(found.verdict.goal - GOAL) == pytest.approx(distance, abs=0.02)
+    task = GoalTask()
+    sampled = nearest_accepted_goal(
+        task, PlaneAssessment(), GOAL, threshold=0.5, rng=np.random.default_rng(0)
+    )
+    assert found.num_judged < 0.3 * task.num_resets
+    assert np.linalg.norm(found.verdict.goal - GOAL) <= np.linalg.norm(sampled.goal - GOAL) + 0.005
+
+
+def test_what_is_found_lies_in_the_region_and_a_flat_field_leads_nowhere():
+    outside = np.array([0.9, 3.0, 1.5])
+    found = descend_to_accepted(GoalTask(), PlaneAssessment(), outside, threshold=0.5)
+    assert np.all((found.verdict.goal >= BOX[0]) & (found.verdict.goal <= BOX[1]))
+    flat = PlaneAssessment()
+    weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
+    flat.embedding_ = Embedding(weights, num_margins=0)
+    assert descend_to_accepted(GoalTask(), flat, GOAL, threshold=0.5).verdict is None

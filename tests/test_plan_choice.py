@@ -1,0 +1,105 @@
+"""Of the plans that would do, the one with the highest Γ is set, and only the plan changes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.plan_choice import choose_plan, plan_inputs
+from drake_safety.simulation.rollouts import run_episode
+from goal_field import FieldAssessment
+from shuttle_task import shuttling
+
+THRESHOLD = 0.5
+
+
+class SlowIsSafe(FieldAssessment):
+    """Γ falls with the speed along x."""
+
+    uses_features = True
+
+    def __init__(self):
+        super().__init__(lambda state: np.exp(-state[:, 3]))
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return shuttling().make_loop()
+
+
+@pytest.fixture
+def context(loop):
+    context = loop.CreateDefaultContext()
+    loop.reset(context, np.random.default_rng(1))
+    return context
+
+
+def state(loop, context):
+    return loop.GetOutputPort("state").Eval(context).copy()
+
+
+def test_the_plan_with_the_highest_gamma_is_set_and_the_state_stays(loop, context):
+    before = state(loop, context)
+    plans = loop.candidate_plans(context, np.random.default_rng(0), 8)
+    choice = choose_plan(
+        loop, SlowIsSafe(), context, threshold=THRESHOLD, rng=np.random.default_rng(0), num_plans=8
+    )
+    slowest = min(range(8), key=lambda i: plans[i][0])
+    assert choice.index == slowest != 0
+    np.testing.assert_allclose(choice.safety_probability, np.exp([-plan[0] for plan in plans]))
+    after = state(loop, context)
+    np.testing.assert_array_equal(after[:3], before[:3])
+    np.testing.assert_array_equal(after[3:], plans[slowest])
+
+
+def test_where_no_plan_passes_the_choice_asks_for_another_target(loop, context):
+    rng = np.random.default_rng(0)
+    easy, hard = (
+        choose_plan(loop, SlowIsSafe(), context, threshold=threshold, rng=rng)
+        for threshold in (0.01, 0.999)
+    )
+    assert easy.is_accepted
+    assert not hard.is_accepted
+
+
+def test_of_equally_good_plans_the_first_stays(loop, context):
+    before = state(loop, context)
+    indifferent = FieldAssessment(lambda goals: np.full(len(goals), 0.7))
+    indifferent.uses_features = True
+    choice = choose_plan(
+        loop, indifferent, context, threshold=THRESHOLD, rng=np.random.default_rng(0)
+    )
+    assert choice.index == 0
+    np.testing.assert_array_equal(state(loop, context), before)
+
+
+def test_judging_plans_changes_nothing(loop, context):
+    before = state(loop, context)
+    plans = loop.candidate_plans(context, np.random.default_rng(0), 5)
+    seen, preview, features = plan_inputs(loop, context, plans)
+    np.testing.assert_array_equal(state(loop, context), before)
+    np.testing.assert_array_equal(seen[:, 3:], plans)
+    assert len(np.unique(preview, axis=0)) == len(np.unique(features, axis=0)) == 5
+
+
+def test_an_episode_can_begin_with_a_plan_that_was_chosen(loop):
+    context = loop.CreateDefaultContext()
+    default = run_episode(loop, 3, seed=1)
+    loop.reset(context, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(3,))))
+    plans = loop.candidate_plans(context, np.random.default_rng(0), 2)
+    same, other = (run_episode(loop, 3, seed=1, plan=plan) for plan in plans)
+    np.testing.assert_array_equal(same.state, default.state)
+    np.testing.assert_array_equal(other.state[0, :3], default.state[0, :3])
+    np.testing.assert_array_equal(other.state[0, 3:], plans[1])
+
+
+def test_a_task_that_offers_no_plans_says_so():
+    class Wandering(ClosedLoop):
+        pass
+
+    loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
+    with pytest.raises(ValueError, match="'Wandering' offers no plans to choose from"):
+        loop.candidate_plans(None, None, 2)
+    with pytest.raises(ValueError, match="'Wandering' offers no plans to choose from"):
+        loop.set_plan(None, None)

@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.planning_study import planning_study, run_trials
+from drake_safety.simulation.scenario import parse_scenario
+from gliding_task import SCENARIO as GLIDING
+from goal_field import FieldAssessment
+from shuttle_task import shuttling
+
+
+class Knowing(FieldAssessment):
+    """Γ by the speeds along x and y, in a task in which slower is safer."""
+
+    uses_features = True
+
+    def __init__(self, sign=1.0):
+        super().__init__(lambda state: 0.5 - sign * 0.1 * np.clip(state[:, 3:5].sum(axis=1), -4, 4))
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return run_trials(shuttling(), 40, num_plans=5, seed=9, num_workers=1)
+
+
+def test_every_candidate_of_every_start_is_executed(trials):
+    assert [trial.index for trial in trials] == list(range(40))
+    for trial in trials:
+        assert trial.is_safe.shape == (5,)
+        # All of them from one place, and with the noise of none.
+        assert len(np.unique(trial.state[:, :3], axis=0)) == 1
+        # A slower one along the same line is safe where a faster one is.
+        order = np.argsort(np.abs(trial.state[:, 3]))
+        assert not np.any(np.diff(trial.is_safe[order].astype(int)) > 0)
+
+
+def test_who_knows_comes_all_the_way_to_hindsight_and_who_errs_does_not(trials):
+    figures = planning_study(Knowing(), trials, threshold=0.0).figures
+    default = np.mean([trial.is_safe[0] for trial in trials])
+    best = np.mean([trial.is_safe.any() for trial in trials])
+    assert figures["default"].value == default < best
+    assert figures["chosen"].value == figures["best_in_hindsight"].value == best
+    assert figures["gain"].value == 1.0
+    # The default is the fastest: taking the least safe is taking it.
+    wrong = planning_study(Knowing(sign=-1.0), trials, threshold=0.0).figures
+    assert wrong["gain"].value == 0.0
+    assert default < figures["any_candidate"].value < best
+
+
+def test_starts_that_no_plan_is_accepted_for_are_told_apart(trials):
+    study = planning_study(Knowing(), trials, threshold=0.5)
+    accepted = [values.max() >= 0.5 for values in study.safety_probability]
+    assert study.figures["accepted"].value == np.mean(accepted)
+    assert study.figures["chosen_if_accepted"].n == sum(accepted)
+
+
+def test_without_starts_or_plans_there_is_nothing_to_study():
+    with pytest.raises(ValueError, match="there is no start"):
+        planning_study(Knowing(), [], threshold=0.5)
+    gliding = parse_scenario(GLIDING, name="gliding", folder=Path())
+    with pytest.raises(ValueError, match="'Gliding' offers no plans"):
+        run_trials(gliding, 1, num_plans=2, seed=0, num_workers=1)
