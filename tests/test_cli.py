@@ -39,7 +39,7 @@ def call(monkeypatch, *arguments):
 
 def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
-    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate"]
+    assert list(commands) == ["scenarios", "train", "ask", "run", "evaluate", "report"]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")
 

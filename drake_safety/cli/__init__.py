@@ -12,12 +12,12 @@ import sys
 import typer
 from rich.logging import RichHandler
 
-from drake_safety.cli import ask, evaluate, run, scenarios, train
+from drake_safety.cli import ask, evaluate, report, run, scenarios, train
 from drake_safety.cli.console import console
 from drake_safety.cli.targets import TargetCommand
 
 # In the order in which the help lists them.
-_COMMANDS = (scenarios.scenarios, train.train, ask.ask, run.run, evaluate.evaluate)
+_COMMANDS = (scenarios.scenarios, train.train, ask.ask, run.run, evaluate.evaluate, report.report)
 
 app = typer.Typer(
     help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
