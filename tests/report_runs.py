@@ -1,4 +1,4 @@
-"""A small run as `train` and `evaluate` leave it: pendulums, both modes, an evaluation, a motion."""
+"""A small run as `train` and `evaluate` leave it: pendulums in both modes, a motion of theirs."""
 
 import json
 
