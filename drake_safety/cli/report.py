@@ -69,13 +69,16 @@ def _report(folder: Path, store: Path | None) -> None:
 
 def _angular_constraints(run: Run) -> tuple[str, ...]:
     """Constraints whose margins are angles; none where the task cannot be asked any more."""
+    import yaml
+
     from drake_safety.simulation.scenario import parse_scenario
 
-    text = run.extra.get("scenario_yaml")
-    if not isinstance(text, str):
+    if not run.scenario:
         return ()
     try:
-        scenario = parse_scenario(text, name=run.scenario_name, folder=run.folder)
+        scenario = parse_scenario(
+            yaml.safe_dump(run.scenario), name=run.scenario_name, folder=run.folder
+        )
         return tuple(scenario.make_loop().angular_constraints)
     except (ValueError, OSError, RuntimeError):
         return ()

@@ -220,8 +220,11 @@ def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
     """Copies every picture, and gives what the page shows of each, by name."""
     known = _words("words.yaml")["pictures"]
     shown = {}
-    for name, paths in run.pictures.items():
-        stem = Path(name).name
+    # Those with words of their own in the order of the words, all others after them.
+    order = {stem: i for i, stem in enumerate(known)}
+    names = sorted(run.pictures, key=lambda name: (order.get(Path(name).name, len(order)), name))
+    for name in names:
+        paths, stem = run.pictures[name], Path(name).name
         flat = name.replace("/", "_")
         for suffix, path in paths.items():
             shutil.copyfile(path, folder / "figures" / f"{flat}{suffix}")

@@ -88,7 +88,6 @@ _TRIGGER_COLUMNS = (
         title="before the fall",
         meaning="Median time from the trigger to the fall that would have come.",
         unit="s",
-        better=1,
         digits=2,
     ),
 )
