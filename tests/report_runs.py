@@ -53,7 +53,14 @@ def write_run(folder):
     assessments = {}
     for mode in MODES:
         parameters = AssessmentParameters(
-            mode=mode, epochs=2, ensemble_size=1, hidden_sizes=[16], perplexity=10, min_count=3
+            mode=mode,
+            epochs=2,
+            ensemble_size=1,
+            hidden_sizes=[16],
+            perplexity=10,
+            min_count=3,
+            resolution=6,
+            cell_length=20.0,
         )
         assessments[mode] = SafetyAssessment(parameters).fit(episodes)
         assessments[mode].save(folder / f"{mode}.safetensors")

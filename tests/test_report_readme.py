@@ -18,7 +18,7 @@ ENTRIES = {
     "training_seed": 7,
     "training_episodes": 64,
 }
-BLOCK = "<!-- results: lip -->\nold\n<!-- end -->\n"
+BLOCK = "<!-- results: lip -->\nstale words\n<!-- end -->\n"
 
 
 def write_readme(folder, figures, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
@@ -61,7 +61,7 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     text = readme.read_text()
     assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety train lip")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
-    assert "old" not in text
+    assert "stale words" not in text
     assert "Learned from 64 episodes of seed 7. Judged on 60 fresh ones of seed 1000" in text
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
