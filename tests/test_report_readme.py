@@ -97,7 +97,7 @@ def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):
     [
         ("nothing", "has no block of results"),
         ("<!-- results: lip -->\n", "has no block of results"),
-        (BLOCK + "<!-- results: lip -->\n", r"only \['lip'\] end"),
+        (BLOCK + "<!-- results: lip -->\n", r"comes only after \['lip'\]"),
         (BLOCK.replace("lip", "other"), r"no results 'other' in .*there are \['lip'\]"),
     ],
 )

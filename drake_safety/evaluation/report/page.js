@@ -67,7 +67,7 @@
     }
     detail.replaceChildren(
       make("h4", {}, `Cell ${cell.column + 1}, ${cell.row + 1}`),
-      make("p", {}, `${verdict} Learned from ${cell.count} segment${cell.count === 1 ? "" : "s"}.`),
+      make("p", {}, `${verdict} ${isEmpty ? "Seen here:" : "Learned from"} ${cell.count} segment${cell.count === 1 ? "" : "s"}.`),
     );
     const parts = [["safe", safe, "var(--safe)"], ["don't know", unknown, "var(--unknown)"], ["unsafe", unsafe, "var(--unsafe)"]];
     const stack = make("div", { class: "stack" });

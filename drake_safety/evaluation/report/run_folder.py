@@ -137,7 +137,7 @@ def read_run(folder: Path, *, episodes: Path, assessments: Mapping[str, Path]) -
 
 
 def _read_episodes(run: Run, path: Path) -> None:
-    name, again = run.folder.name, "drake-safety train SCENARIO --resume --out"
+    name, again = str(run.folder), "drake-safety train SCENARIO --resume --out"
     try:
         run.info, run.extra = read_info(path)
         again = f"drake-safety train {run.info.scenario} --resume --out {name}"
@@ -168,7 +168,7 @@ def _read_assessment(run: Run, mode: str, path: Path) -> None:
             Missing(
                 what=f"The learned assessment, mode “{mode}”, and its map",
                 why=_sentence(error),
-                command=f"drake-safety train {scenario} --resume --out {run.folder.name}",
+                command=f"drake-safety train {scenario} --resume --out {run.folder}",
             )
         )
         return
@@ -186,7 +186,7 @@ def _read_assessment(run: Run, mode: str, path: Path) -> None:
 
 def _read_results(run: Run, path: Path) -> None:
     scenario = "SCENARIO" if run.info is None else run.info.scenario
-    command = f"drake-safety evaluate {scenario} --assessment {run.folder.name}"
+    command = f"drake-safety evaluate {scenario} --assessment {run.folder}"
     if not path.is_file():
         run.missing.append(
             Missing(
@@ -247,7 +247,7 @@ def _find_motions(run: Run) -> None:
             Missing(
                 what="A recorded motion: its timeline, and the robot to look at in 3-D",
                 why="No folder here holds a recording.html.",
-                command=f"drake-safety run {scenario} --assessment {run.folder.name}",
+                command=f"drake-safety run {scenario} --assessment {run.folder}",
             )
         )
 
