@@ -49,6 +49,7 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "evaluate",
         "plan-study",
         "adapt",
+        "report",
     ]
     for command in commands.values():
         assert command.help.splitlines()[0].endswith(".")

@@ -12,7 +12,17 @@ import sys
 import typer
 from rich.logging import RichHandler
 
-from drake_safety.cli import adapt, ask, calibrate, evaluate, plan_study, run, scenarios, train
+from drake_safety.cli import (
+    adapt,
+    ask,
+    calibrate,
+    evaluate,
+    plan_study,
+    report,
+    run,
+    scenarios,
+    train,
+)
 from drake_safety.cli.console import console
 from drake_safety.cli.targets import TargetCommand
 
@@ -26,6 +36,7 @@ _COMMANDS = (
     evaluate.evaluate,
     plan_study.plan_study,
     adapt.adapt,
+    report.report,
 )
 
 app = typer.Typer(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drake_safety.cli.console import console, print_path
+from drake_safety.cli.provenance import command_line, versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,7 +106,19 @@ class Recording:
         recording = folder / "recording.html"
         recording.write_text(self.viewer.StaticHtml(), encoding="utf-8")
         pictures = save(timeline, folder / "timeline")
+        (folder / "run.json").write_text(_events_json(events), encoding="utf-8")
         console.print(events)
         print_path("recording", recording)
         for path in pictures:
             print_path("picture  ", path)
+
+
+def _events_json(events: Table) -> str:
+    """What happened when, for the report: where it comes from, and the table's columns and rows."""
+    content = {
+        "command": command_line(),
+        "versions": versions(),
+        "columns": [str(column.header) for column in events.columns],
+        "rows": [list(row) for row in zip(*(c.cells for c in events.columns), strict=True)],
+    }
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

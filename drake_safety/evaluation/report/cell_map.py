@@ -1,0 +1,252 @@
+"""The map of an assessment, cell by cell: belief, count, causes, and an episode typical of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    SAFE_COLOUR,
+    SERIES_COLOURS,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+    spoken,
+)
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.grid import OUTSIDE
+from drake_safety.learning.segments import Episodes, Segments, split
+
+if TYPE_CHECKING:
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80")
+"""From unsafe over a pale middle to safe."""
+_UNKNOWN_STOPS = ("#f3f1f6", "#b3a5c9", "#3f2a63")
+_COUNT_STOPS = ("#eaf3ef", "#7fbfa7", "#0f5c45")
+_FIRST_CAUSE = 3  # Column of a cell's masses at which those of the causes begin.
+
+
+def cause_colours(num_causes: int) -> list[str]:
+    """A colour a cause; from the second of the series on: the first is the colour of safe."""
+    return [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(num_causes)]
+
+
+def map_cells(
+    assessment: SafetyAssessment,
+    episodes: Episodes | None = None,
+    *,
+    angular_constraints: Collection[str] = (),
+) -> list[dict[str, Any]]:
+    """What there is to say about each cell of an assessment's first map, as JSON types.
+
+    Args:
+        assessment: A fitted assessment.
+        episodes: Those it has learned from; without them no cell has a typical episode.
+        angular_constraints: Constraints whose margins are angles.
+
+    Returns:
+        One a cell, in the grid's order: ``column`` and ``row`` from the lower left, ``belief``
+        (safe, unsafe, don't know), ``count``, ``causes`` (mass of each constraint) and
+        ``typical``: an episode, the time at which its segment starts, how it ended, and its
+        margins [cm, degrees]; or None.
+    """
+    grid, beliefs = assessment.grid_, assessment.beliefs_[0]
+    inside = grid.locate(assessment.training_points_[0])
+    count = np.bincount(inside[inside != OUTSIDE], minlength=grid.num_cells)
+    typical: dict[int, dict[str, Any]] = {}
+    if episodes is not None:
+        typical = _typical_episodes(assessment, episodes, set(angular_constraints))
+    return [
+        {
+            "column": cell // grid.resolution,
+            "row": cell % grid.resolution,
+            "belief": [round(float(mass), 4) for mass in masses[:3]],
+            "count": int(count[cell]),
+            "causes": [round(float(mass), 4) for mass in masses[_FIRST_CAUSE:]],
+            "typical": typical.get(cell),
+        }
+        for cell, masses in enumerate(beliefs)
+    ]
+
+
+def _typical_episodes(
+    assessment: SafetyAssessment, episodes: Episodes, angular: set[str]
+) -> dict[int, dict[str, Any]]:
+    parameters = assessment.parameters
+    is_sharpened = parameters.is_sharpened
+    segments = split(
+        episodes,
+        stride=1 if is_sharpened else parameters.horizon,
+        discount=parameters.discount,
+        shortest=(parameters.shortest_segment or None) if is_sharpened else None,
+    )
+    points = assessment.predict(
+        segments.state if is_sharpened else segments.true_state,
+        segments.desired_preview,
+        segments.features,
+    ).embedding
+    cells = assessment.grid_.locate(points)
+    scale = [
+        np.degrees(1.0) if name in angular else 100.0 for name in episodes.info.constraint_names
+    ]
+    found = {}
+    for cell in np.unique(cells[cells != OUTSIDE]):
+        row = most_typical(segments, points, np.flatnonzero(cells == cell))
+        episode = episodes[int(segments.episode[row])]
+        found[int(cell)] = {
+            "episode": episode.index,
+            "start_s": round(float(episode.time_s[segments.start_row[row]]), 3),
+            "cause": episode.cause,
+            "time_s": np.round(episode.time_s, 3).tolist(),
+            "margins": np.round(episode.margins * scale, 2).T.tolist(),
+        }
+    return found
+
+
+def most_typical(segments: Segments, points: np.ndarray, rows: np.ndarray) -> int:
+    """The segment that stands for those of a cell.
+
+    It ends as most of them do, for the cause that most of these have, and lies nearest to the
+    mean place of those.
+
+    Args:
+        segments: All segments.
+        points: Their places in the embedding, (N, 2).
+        rows: Those in the cell, at least one.
+    """
+    is_unsafe = segments.is_unsafe[rows]
+    rows = rows[is_unsafe == (is_unsafe.mean() >= 0.5)]
+    causes = segments.cause[rows]
+    names, counts = np.unique(causes, return_counts=True)
+    rows = rows[causes == names[counts.argmax()]]
+    distance = np.linalg.norm(points[rows] - points[rows].mean(axis=0), axis=1)
+    return int(rows[distance.argmin()])
+
+
+def map_views(
+    assessment: SafetyAssessment, cells: list[dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """The ways to colour the map: a fill a cell, and what the colours mean.
+
+    Args:
+        assessment: The assessment.
+        cells: Of `map_cells`.
+
+    Returns:
+        By name: ``title``, ``meaning``, ``fills`` (None where a cell is empty), and either
+        ``stops`` with ``ends`` (words for the first and the last) or ``swatches``.
+    """
+    from matplotlib.colors import to_hex, to_rgb
+
+    names = assessment.info_.constraint_names
+    palette = cause_colours(len(names))
+    most = max((cell["count"] for cell in cells), default=1)
+
+    def fills(values: list[float], stops: tuple[str, ...], *, keeps_empty: bool) -> list[Any]:
+        shades = _ramp(stops)
+        return [
+            to_hex(shades(value)) if keeps_empty or not _is_empty(cell) else None
+            for value, cell in zip(values, cells, strict=True)
+        ]
+
+    def cause_fill(cell: dict[str, Any]) -> str | None:
+        if _is_empty(cell):
+            return None
+        colour = np.array(to_rgb(palette[int(np.argmax(cell["causes"]))]))
+        # White where nothing is unsafe, the cause's own colour where all that is known is.
+        return to_hex(0.97 * (1.0 - (1.0 - safe_share(cell)) * (1.0 - colour)))
+
+    return {
+        "safe": {
+            "title": "safe share",
+            "meaning": "Of what is known about a cell, the share that says safe: "
+            "b_safe / (1 − μ). Hatched cells are empty: the answer there is “don't know”.",
+            "fills": fills([safe_share(c) for c in cells], SAFETY_STOPS, keeps_empty=False),
+            "stops": SAFETY_STOPS,
+            "ends": ["0: all unsafe", "1: all safe"],
+        },
+        "unknown": {
+            "title": "don't know",
+            "meaning": "The share of each cell's belief that commits to nothing: μ.",
+            "fills": fills([c["belief"][2] for c in cells], _UNKNOWN_STOPS, keeps_empty=False),
+            "stops": _UNKNOWN_STOPS,
+            "ends": ["0: certain", "1: nothing known"],
+        },
+        "cause": {
+            "title": "likely cause",
+            "meaning": "The constraint that is most likely to be violated; pale: hardly likely.",
+            "fills": [cause_fill(cell) for cell in cells],
+            "swatches": [[spoken(n), c] for n, c in zip(names, palette, strict=True)],
+        },
+        "count": {
+            "title": "number of segments",
+            "meaning": "From how many pieces of simulated motion each cell has learned.",
+            "fills": fills(
+                [float(np.log1p(c["count"]) / np.log1p(max(most, 1))) for c in cells],
+                _COUNT_STOPS,
+                keeps_empty=False,
+            ),
+            "stops": _COUNT_STOPS,
+            "ends": ["few", f"{most}"],
+        },
+    }
+
+
+def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Figure:
+    """The map as a picture to print: the safe share of each cell, and its count.
+
+    Args:
+        assessment: The assessment.
+        cells: Of `map_cells`.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    size = assessment.grid_.resolution
+    shares = np.full((size, size), np.nan)
+    for cell in cells:
+        if not _is_empty(cell):
+            shares[cell["row"], cell["column"]] = safe_share(cell)
+    with drawing_style():
+        fig = new_figure(7.0, 6.0)
+        axes = fig.subplots()
+        axes.set_facecolor("#f1f2f4")
+        shade = ScalarMappable(Normalize(0.0, 1.0), _ramp(SAFETY_STOPS))
+        axes.pcolormesh(shares, cmap=shade.cmap, norm=shade.norm, edgecolors="white", linewidth=0.8)
+        for cell in cells:
+            if cell["count"]:
+                is_pale = _is_empty(cell) or 0.25 < safe_share(cell) < 0.75
+                axes.text(
+                    cell["column"] + 0.5,
+                    cell["row"] + 0.5,
+                    str(cell["count"]),
+                    ha="center",
+                    va="center",
+                    fontsize=6.5,
+                    color="#22262b" if is_pale else "white",
+                )
+        axes.set(xticks=[], yticks=[], aspect="equal", xlabel="numbers: segments learned from")
+        axes.set_title(f"Safe share of each cell, mode {assessment.parameters.mode}")
+        fig.colorbar(shade, ax=axes, shrink=0.8, label="b_safe / (1 − μ)")
+    return fig
+
+
+def safe_share(cell: dict[str, Any]) -> float:
+    """Of what is known about a cell, the share that says safe; 0 where nothing is."""
+    safe, unsafe = cell["belief"][SAFE], cell["belief"][UNSAFE]
+    return float(safe / (safe + unsafe)) if safe + unsafe else 0.0
+
+
+def _is_empty(cell: dict[str, Any]) -> bool:
+    return bool(cell["belief"][UNCERTAINTY] >= 1.0)
+
+
+def _ramp(stops: tuple[str, ...]) -> Colormap:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("ramp", list(stops))

@@ -1,0 +1,198 @@
+"""The README's tables of results, generated from stored evaluations, so that they cannot drift.
+
+What stands between ``<!-- results: NAME -->`` and ``<!-- end -->`` is made from
+``docs/results/NAME.json`` beside the README, and from nothing else.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.report.results import Results, read_results
+from drake_safety.evaluation.report.tables import Column, Row, Table
+from drake_safety.evaluation.report.verdicts import one_judge_on_sets, set_title, verdict_tables
+
+RESULTS_FOLDER = Path("docs/results")
+_BLOCK = re.compile(
+    r"(?P<start><!-- results: (?P<name>[\w-]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
+)
+_OPEN = re.compile(r"<!-- results: ([\w-]+) -->")
+_PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
+_SHARE = Column(key="", title="", meaning="")
+_PRINTED = {"safe_recall": 0.952, "unsafe_recall": 0.987}
+"""Of 1000 random targets, in the paper."""
+
+
+def rewrite_readme(path: Path) -> list[str]:
+    """Rewrites every block of results in a README.
+
+    Args:
+        path: The README.
+
+    Returns:
+        The names of the results it shows.
+
+    Raises:
+        ValueError: It has no such block, one of them does not end, or its results are not there.
+    """
+    text = path.read_text(encoding="utf-8")
+    names = [match["name"] for match in _BLOCK.finditer(text)]
+    if not names:
+        raise ValueError(
+            f"{path} has no block of results: put <!-- results: NAME --> and <!-- end --> where "
+            f"those of {RESULTS_FOLDER}/NAME.json belong"
+        )
+    generated = generate(text, path.parent / RESULTS_FOLDER)
+    if generated != text:
+        path.write_text(generated, encoding="utf-8")
+    return names
+
+
+def generate(text: str, folder: Path) -> str:
+    """A README's text with every block of results as the stored ones make it.
+
+    Args:
+        text: The README.
+        folder: Where the stored results are.
+
+    Raises:
+        ValueError: A block does not end, or its results are not there.
+    """
+    blocks = [match["name"] for match in _BLOCK.finditer(text)]
+    if blocks != (opened := _OPEN.findall(text)):
+        raise ValueError(
+            f"README: results begin for {opened}, but <!-- end --> comes only after {blocks}"
+        )
+
+    def block(match: re.Match[str]) -> str:
+        file = folder / f"{match['name']}.json"
+        if not file.is_file():
+            there = sorted(path.stem for path in folder.glob("*.json"))
+            raise ValueError(
+                f"README: there are no results '{match['name']}' in {folder}; there are {there}: "
+                "`drake-safety report RUN --store` writes them"
+            )
+        return f"{match['start']}{results_text(read_results(file))}\n{match['end']}"
+
+    return _BLOCK.sub(block, text)
+
+
+def results_text(results: Results) -> str:
+    """Commands, counts and tables of an evaluation, as Markdown."""
+    parts = [_commands(results), _counts(results)]
+    if results.has("plans."):
+        parts += _targets(results)
+    else:
+        parts += _moments(results)
+    if results.has("throws."):
+        parts += _throws(results)
+    return "\n\n".join(part for part in parts if part)
+
+
+def _commands(results: Results) -> str:
+    lines = [results.entries.get(key) for key in ("train_command", "command")]
+    return "\n".join(["```sh", *(line for line in lines if line), "```"])
+
+
+def _counts(results: Results) -> str:
+    entries, figures = results.entries, results.figures
+    judged = figures.get("plans.outcomes.safe") or figures.get("episodes.share_unsafe")
+    words = [
+        f"Learned from {entries.get('training_episodes')} episodes of seed "
+        f"{entries.get('training_seed')}."
+    ]
+    if judged is not None:
+        kind = "safe" if "plans.outcomes.safe" in figures else "unsafe"
+        words.append(
+            f"Judged on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
+            f"{_written(judged, _PERCENT)} are {kind}."
+        )
+    calibration = entries.get("calibration_episodes")
+    if calibration is not None:
+        words.append(f"Thresholds come from {calibration} other episodes.")
+    words.append("Intervals are 95 %.")
+    return " ".join(words)
+
+
+def _moments(results: Results) -> list[str]:
+    titles = {"segments": "every segment", "episodes": "first step, k = 0"}
+    parts = [
+        _retitled(table, titles[table.key]).to_markdown()
+        for table in verdict_tables(results)
+        if table.key in titles
+    ]
+    ahead = [
+        f"{_written(results.figures[key], _SHARE)} {place}"
+        for kind, place in (("segments", "per segment"), ("episodes", "at k = 0"))
+        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.figures
+    ]
+    if ahead:
+        parts.append(f"`sharpened` minus the better classifier, AUC: {', '.join(ahead)}.")
+    return parts
+
+
+def _throws(results: Results) -> list[str]:
+    (table,) = (table for table in verdict_tables(results) if table.key == "throws")
+    alone = results.figures["throws.falls_without_recovery"]
+    remark = (
+        f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
+        f"falls in {_written(alone, _PERCENT)}."
+    )
+    ahead = _ahead(table)
+    return [remark, _retitled(table, "trigger").to_markdown(), ahead]
+
+
+def _targets(results: Results) -> list[str]:
+    parts = []
+    columns = 3  # Recalls and AUC; the page shows the others, too.
+    for table in verdict_tables(results):
+        if table.key != "plans":
+            continue
+        rows = [
+            Row(key=row.key, label=row.label, figures=row.figures[:columns]) for row in table.rows
+        ]
+        text = _retitled(table, set_title("plans"), table.columns[:columns], rows).to_markdown()
+        printed = " | ".join(
+            f"*{_PRINTED[column.key]:.3f}*" if column.key in _PRINTED else ""
+            for column in table.columns[:columns]
+        )
+        parts.append(f"{text}\n| *the paper's own* | {printed} |".replace("|  |", "| |"))
+        parts.append(_ahead(_retitled(table, "", table.columns[:columns], rows)))
+    sets = one_judge_on_sets(results)
+    if len(sets.rows) > 1:
+        parts.append(sets.to_markdown())
+    right = results.figures.get("plans.causes.right_cause")
+    if right is not None and right.n:
+        parts.append(
+            f"The right cause is named for {_written(right, _PERCENT)} of the {right.n} rightly "
+            "refused targets."
+        )
+    return parts
+
+
+def _ahead(table: Table) -> str:
+    ahead = table.rivals_ahead()
+    return f"Ahead of `sharpened`: {'; '.join(ahead)}." if ahead else ""
+
+
+def _retitled(
+    table: Table,
+    corner: str,
+    columns: Sequence[Column] | None = None,
+    rows: Sequence[Row] | None = None,
+) -> Table:
+    return Table(
+        key=table.key,
+        title=table.title,
+        meaning=table.meaning,
+        corner=corner,
+        columns=table.columns if columns is None else columns,
+        rows=table.rows if rows is None else rows,
+    )
+
+
+def _written(figure: Figure, column: Column) -> str:
+    return f"{column.value_text(figure)} {column.interval_text(figure)}".strip()

@@ -1,0 +1,197 @@
+"""Tables of figures: what page, README, CSV and JSON all show, each in its own way."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from drake_safety.evaluation.metrics import Figure
+
+OURS = "sharpened"
+"""Key of the row that the others are compared with."""
+_MODES = re.compile(r"^(sharpened|paper)\b")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """What one column of a table shows.
+
+    Attributes:
+        key: The last part of a figure's key.
+        title: Its heading.
+        meaning: A sentence for somebody who has not read the paper.
+        unit: "", "%", "ms", "s", "of" for counts out of n, or "=" for what has no interval.
+        better: 1 where more is better, -1 where less is, 0 where neither.
+        digits: After the decimal point.
+    """
+
+    key: str
+    title: str
+    meaning: str
+    unit: str = ""
+    better: int = 0
+    digits: int = 3
+
+    @property
+    def is_share(self) -> bool:
+        """Whether it is a number between 0 and 1, which can be drawn as a bar."""
+        return self.unit in ("", "%")
+
+    def value_text(self, figure: Figure | None) -> str:
+        """The figure itself; a dash where there was nothing to see."""
+        if figure is None or (math.isnan(figure.value) and self.unit != "of"):
+            return "–"
+        if self.unit == "of":
+            count = round(figure.value * figure.n) if figure.n else 0
+            return f"{count} of {figure.n}"
+        if math.isinf(figure.value):
+            return "never"
+        space = "" if self.unit in ("", "=") else f" {self.unit}"
+        return f"{self._scale * figure.value:.{self.digits}f}{space}"
+
+    def interval_text(self, figure: Figure | None) -> str:
+        """Its interval in brackets, or nothing."""
+        if figure is None or self.unit not in ("", "%") or not math.isfinite(figure.value):
+            return ""
+        if not (math.isfinite(figure.low) and math.isfinite(figure.high)):
+            return ""
+        low, high = (f"{self._scale * end:.{self.digits}f}" for end in (figure.low, figure.high))
+        return f"({low}–{high})"
+
+    @property
+    def _scale(self) -> float:
+        return {"%": 100.0, "ms": 1000.0}.get(self.unit, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Who or what is judged.
+
+    Attributes:
+        key: Its part of the figures' keys.
+        label: How it is called.
+        figures: One a column; None where there is none.
+        is_quoted: Whether somebody else printed them: they take no part in comparisons.
+    """
+
+    key: str
+    label: str
+    figures: Sequence[Figure | None]
+    is_quoted: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Figures of a few judges, side by side.
+
+    Attributes:
+        key: Its name among files.
+        title: Its heading.
+        meaning: What it is about, for somebody who has not read the paper.
+        corner: What the rows are.
+        columns: The columns.
+        rows: The rows.
+    """
+
+    key: str
+    title: str
+    meaning: str
+    corner: str
+    columns: Sequence[Column]
+    rows: Sequence[Row] = field(default_factory=list)
+
+    def best(self, column: int) -> set[int]:
+        """Rows whose figure is the best of a column; none where there is nothing to compare."""
+        sign = self.columns[column].better
+        values = {
+            i: sign * row.figures[column].value  # type: ignore[union-attr]
+            for i, row in enumerate(self.rows)
+            if not row.is_quoted and _is_known(row.figures[column])
+        }
+        if not sign or len(values) < 2 or len(set(values.values())) == 1:
+            return set()
+        return {i for i, value in values.items() if value == max(values.values())}
+
+    def rivals_ahead(self) -> list[str]:
+        """In words, each figure in which another row is ahead of ours."""
+        ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
+        found: list[str] = []
+        if ours is None:
+            return found
+        for number, column in enumerate(self.columns):
+            best = self.best(number)
+            mine = self.rows[ours].figures[number]
+            if not best or ours in best or mine is None:
+                continue
+            first = self.rows[min(best)]
+            other = first.figures[number]
+            if other is None:
+                continue
+            is_clear = (other.low > mine.high) if column.better > 0 else (other.high < mine.low)
+            certainty = "beyond both intervals" if is_clear else "the intervals overlap"
+            found.append(
+                f"{column.title}: {first.label}, {column.value_text(other)} against "
+                f"{column.value_text(mine)} ({certainty})"
+            )
+        return found
+
+    def to_csv(self) -> str:
+        """The table as CSV: value, ends of the interval and n of every figure."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        names = ("", ".low", ".high", ".n")
+        writer.writerow([self.corner, *(f"{c.key}{end}" for c in self.columns for end in names)])
+        for row in self.rows:
+            cells: list[Any] = [row.key]
+            for figure in row.figures:
+                fields = {} if figure is None else figure.to_json()
+                cells += [fields.get(name) for name in ("value", "low", "high", "n")]
+            writer.writerow(["" if cell is None else cell for cell in cells])
+        return out.getvalue()
+
+    def to_json(self) -> dict[str, Any]:
+        """The table as JSON types."""
+        return {
+            "title": self.title,
+            "meaning": self.meaning,
+            "columns": [
+                {"key": c.key, "title": c.title, "meaning": c.meaning} for c in self.columns
+            ],
+            "rows": [
+                {
+                    "key": row.key,
+                    "label": row.label,
+                    "figures": {
+                        column.key: None if figure is None else figure.to_json()
+                        for column, figure in zip(self.columns, row.figures, strict=True)
+                    },
+                }
+                for row in self.rows
+            ],
+        }
+
+    def to_markdown(self) -> str:
+        """The table as Markdown, figures with their intervals."""
+        lines = [
+            "| " + " | ".join([self.corner, *(c.title for c in self.columns)]) + " |",
+            "|" + "---|" * (1 + len(self.columns)),
+        ]
+        for row in self.rows:
+            cells = [row.label if row.is_quoted else _MODES.sub(r"`\1`", row.label)]
+            for column, figure in zip(self.columns, row.figures, strict=True):
+                text = "" if figure is None else column.value_text(figure)
+                interval = column.interval_text(figure)
+                cells.append(f"{text} {interval}".strip())
+            if row.is_quoted:
+                cells = [f"*{cell}*" if cell else "" for cell in cells]
+            lines.append("| " + " | ".join(cells).replace("|  |", "| |") + " |")
+        return "\n".join(lines).replace("|  |", "| |")
+
+
+def _is_known(figure: Figure | None) -> bool:
+    return figure is not None and math.isfinite(figure.value)

@@ -1,0 +1,115 @@
+"""The README's results are those of the stored evaluations, to the letter."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.report.readme import generate, rewrite_readme
+from drake_safety.evaluation.report.results import Results, read_results, store_results
+from report_runs import make_figures
+
+ROOT = Path(__file__).resolve().parents[1]
+STORED = sorted((ROOT / "docs/results").glob("*.json"))
+ENTRIES = {
+    "command": "drake-safety evaluate lip --assessment /somebodys/own/lip --episodes 60",
+    "seed": 1000,
+    "training_seed": 7,
+    "training_episodes": 64,
+}
+BLOCK = "<!-- results: lip -->\nstale words\n<!-- end -->\n"
+
+
+def write_readme(folder, figures, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
+    store_results(
+        Results(figures=figures, entries=ENTRIES),
+        folder / "docs/results/lip.json",
+        train_command="drake-safety train lip --out=/somebodys/own/lip",
+    )
+    readme = folder / "README.md"
+    readme.write_text(text)
+    return readme
+
+
+def test_the_committed_readme_is_what_the_stored_evaluations_generate():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert generate(text, ROOT / "docs/results") == text
+    shown = set(re.findall(r"<!-- results: ([\w-]+) -->", text))
+    # A stored evaluation that the README does not show is as stale as one that it shows wrongly.
+    assert shown == {path.stem for path in STORED}
+
+
+def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
+    write_readme(tmp_path, make_figures())
+    results = read_results(tmp_path / "docs/results/lip.json")
+    assert list(results.figures) == list(make_figures())
+    for key, figure in make_figures().items():
+        stored = results.figures[key]
+        assert (stored.value, stored.low) == pytest.approx((figure.value, figure.low), rel=1e-5)
+        assert stored.n == figure.n
+    assert results.entries["command"] == (
+        "drake-safety evaluate lip --assessment runs/lip --episodes 60"
+    )
+    assert results.entries["train_command"] == "drake-safety train lip --out=runs/lip"
+    assert "/somebodys" not in (tmp_path / "docs/results/lip.json").read_text()
+
+
+def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
+    readme = write_readme(tmp_path, make_figures())
+    assert rewrite_readme(readme) == ["lip"]
+    text = readme.read_text()
+    assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety train lip")
+    assert text.endswith("<!-- end -->\n\nThe end.\n")
+    assert "stale words" not in text
+    assert "Learned from 64 episodes of seed 7. Judged on 60 fresh ones of seed 1000" in text
+    assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
+    assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
+    again = text
+    rewrite_readme(readme)
+    assert readme.read_text() == again
+
+
+def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
+    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    for name, count in (("sharpened", 19), ("paper", 10)):
+        for column in ("safe_recall", "unsafe_recall", "auc"):
+            figures[f"plans.{name}.{column}"] = proportion(count, 20)
+    figures["plans.causes.right_cause"] = proportion(9, 10)
+    readme = write_readme(tmp_path, figures)
+    rewrite_readme(readme)
+    text = readme.read_text()
+    assert "| all targets | safe recall | unsafe recall | AUC |" in text
+    assert "| *the paper's own* | *0.952* | *0.987* | |" in text
+    assert "of which 40.0 % (26.4–54.8) are safe" in text
+    assert "named for 90.0 % (55.5–99.7) of the 10 rightly refused" in text
+
+
+def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):
+    readme = write_readme(tmp_path, make_figures())
+    rewrite_readme(readme)
+    forged = readme.read_text().replace("0.900 (0.795–0.962)", "0.990 (0.795–0.962)", 1)
+    assert generate(forged, tmp_path / "docs/results") != forged
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("nothing", "has no block of results"),
+        ("<!-- results: lip -->\n", "has no block of results"),
+        (BLOCK + "<!-- results: lip -->\n", r"comes only after \['lip'\]"),
+        (BLOCK.replace("lip", "other"), r"no results 'other' in .*there are \['lip'\]"),
+    ],
+)
+def test_a_readme_that_cannot_be_filled_in_is_refused_and_left_alone(tmp_path, text, message):
+    readme = write_readme(tmp_path, make_figures(), text)
+    with pytest.raises(ValueError, match=message):
+        rewrite_readme(readme)
+    assert readme.read_text() == text
+
+
+def test_a_file_that_holds_no_results_is_refused(tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text('{"schema": "another"}')
+    with pytest.raises(ValueError, match="holds no results: its schema is 'another'"):
+        read_results(file)
