@@ -52,9 +52,7 @@ def adapt(
     orders: Annotated[int, typer.Option(help="Judging: orders of the feedback.", min=1)] = 5,
     oracle: Annotated[
         int,
-        typer.Option(
-            help="Judging: other actual episodes to train a rival from scratch on.", min=0
-        ),
+        typer.Option(help="Judging: other actual episodes to train a rival on.", min=0),
     ] = 0,
     scratch: Annotated[
         bool,
@@ -191,7 +189,7 @@ class _Judge:
             progress=partial(self._stages, what),
             extra={"command": command_line()},
         )
-        return episodes[:num_episodes]
+        return episodes
 
     def studies(
         self,

@@ -101,8 +101,9 @@ class AdaptationStudy:
     """What was found of one gap.
 
     Attributes:
-        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N", "scratch.N"
-            or "oracle"; of several orders it is the mean, and the interval their least and largest.
+        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N" or a
+            rival's name; of several orders it is the mean, and the interval their least and
+            largest.
         sizes: The N.
         num_orders: In how many orders the feedback came.
     """
