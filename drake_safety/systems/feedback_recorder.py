@@ -209,7 +209,7 @@ class FeedbackRecorder(LeafSystem):
 
     def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
         columns = [np.array(column) for column in zip(*recording.rows, strict=True)]
-        arrays = dict(zip(_ROW_PORTS, columns, strict=True))
+        arrays: dict[str, Any] = dict(zip(_ROW_PORTS, columns, strict=True))
         worst = int(np.argmin(arrays["margins"][-1]))
         times_s = np.array(recording.times_s)
         episode = Episode(
