@@ -19,12 +19,16 @@ ALLOWED = {
     "models": {"control"},
     "systems": {"learning", "control"},
     "simulation": {"systems", "learning", "control", "models"},
+    "logs": {"simulation", "systems", "learning", "control"},
     "evaluation": {"simulation", "systems", "learning", "control", "models"},
     "diagrams": {"simulation", "systems", "control", "learning", "models"},
-    "cli": {"evaluation", "simulation", "systems", "learning", "control", "models"},
+    "cli": {"logs", "evaluation", "simulation", "systems", "learning", "control", "models"},
 }
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags"}
+# What only an extra brings, and the room that may import it.
+EXTRAS = {"logs": "drake_safety/logs/"}
 ONLY_IN = {
     "torch": "drake_safety/learning/embedding.py",
     "tslearn": "drake_safety/learning/distance.py",
@@ -222,18 +226,27 @@ def test_nothing_pickles_or_imports_all_of_drake_or_the_folders_as_packages():
 def test_every_package_the_library_imports_is_a_declared_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     declared = {re.match(r"[\w-]+", line)[0].lower() for line in project["dependencies"]}
+    optional = {
+        re.match(r"[\w-]+", line)[0].lower(): room
+        for extra, room in EXTRAS.items()
+        for line in project["optional-dependencies"][extra]
+    }
     providers = packages_distributions()
     imported = {
-        dotted.split(".")[0]
+        (dotted.split(".")[0], relative(path))
         for path in LIBRARY
         for dotted, _, _ in imports_of(path.read_text(encoding="utf-8"), relative(path))
     }
-    third_party = imported - {"drake_safety", "__future__"} - sys.stdlib_module_names
-    assert {"numpy", "pydrake"} <= third_party
+    own = {"drake_safety", "__future__"} | sys.stdlib_module_names
+    third_party = {(name, path) for name, path in imported if name not in own}
+    assert {"numpy", "pydrake", "rosbags"} <= {name for name, _ in third_party}
     assert [
-        name
-        for name in sorted(third_party)
-        if not {provider.lower() for provider in providers.get(name, [name])} & declared
+        (name, path)
+        for name, path in sorted(third_party)
+        if not any(
+            provider in declared or path.startswith(optional.get(provider, " "))
+            for provider in (provider.lower() for provider in providers.get(name, [name]))
+        )
     ] == []
 
 

@@ -1,0 +1,1 @@
+"""Logs of a real robot, read into episodes: CSV, Parquet, MCAP and ROS bags."""

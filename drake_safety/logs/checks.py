@@ -1,0 +1,286 @@
+"""What is wrong with a log, said with its file, row and column, before anything is made of it."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.observation import quaternion_of
+from drake_safety.logs.channel import Channel
+from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
+
+_MIN_ROWS = 3  # Derivatives need them.
+_INTERVALS_S = (1e-4, 0.5)  # What the usual time between two rows of a log is between.
+_NORM_TOLERANCE = 0.01
+_MAX_TILT_RAD = math.radians(60.0)
+_FOOT_SHARE = 0.2  # Of the standing height: how far the lowest foot may seem off the ground.
+_FAR_RAD = 0.3  # Beyond a joint's stop no servo, and no offset of an encoder, gets it.
+_REACH_SHARE = 3.0  # Of the standing height: how far from the base z* can be.
+_RATE_FACTOR = 20.0  # Degrees for radians make 57, millimetres for metres 1000.
+_SLIP_M = 0.004  # Feet that stand are seen to slide by less, encoders and all.
+_SLIP_FACTOR = 3.0
+_MOVING = 1.0  # Velocities below this are not compared with derivatives.
+
+
+def check_time(channel: Channel, max_gap_s: float) -> None:
+    """Refuses a time that is not finite, does not advance, is in other units, or has gaps.
+
+    Args:
+        channel: A table or topic.
+        max_gap_s: Longest time between two rows that is bridged [s].
+
+    Raises:
+        ValueError: Names the row.
+    """
+    time = channel.time
+    if len(time) < _MIN_ROWS:
+        of = f" of topic '{channel.topic}'" if channel.topic else ""
+        raise ValueError(
+            f"log '{channel.path}'{of} has {len(time)} rows; it takes {_MIN_ROWS} at least"
+        )
+    if not np.isfinite(time).all():
+        row = int(np.argmin(np.isfinite(time)))
+        raise ValueError(f"{channel.where(row, channel.time_name)}: the time is {time[row]}")
+    step = np.diff(time)
+    if not (step > 0).all():
+        row = int(np.argmax(step <= 0)) + 1
+        how = "runs backwards" if step[row - 1] < 0 else "stands still"
+        raise ValueError(
+            f"{channel.where(row, channel.time_name)}: time {how}, from {time[row - 1]} to "
+            f"{time[row]} {channel.time_unit}"
+        )
+    usual = float(np.median(step))
+    low, high = _INTERVALS_S
+    if not low <= usual / TIME_UNITS[channel.time_unit] <= high:
+        likely = [unit for unit, n in TIME_UNITS.items() if low <= usual / n <= high]
+        raise ValueError(
+            f"{channel.where(0, channel.time_name)}: rows are {usual:g} apart, which as "
+            f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
+        )
+    step_s = step / TIME_UNITS[channel.time_unit]
+    # A little more than the limit is rounding: a log of 10 Hz has no gaps of 0.1 s.
+    if step_s.max() > max_gap_s * (1 + 1e-6):
+        row = int(np.argmax(step_s > max_gap_s * (1 + 1e-6))) + 1
+        raise ValueError(
+            f"{channel.where(row, channel.time_name)}: a gap of {step_s[row - 1]:g} s before it; "
+            f"no more than {max_gap_s:g} s are bridged ('max_gap_s' of the map)"
+        )
+
+
+def check_finite(channel: Channel) -> None:
+    """Refuses values that are missing or not finite.
+
+    Raises:
+        ValueError: Names the first row, and the column.
+    """
+    bad = {name: ~np.isfinite(values) for name, values in channel.columns.items()}
+    rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
+    if rows:
+        name = min(rows, key=lambda key: rows[key])
+        row = rows[name]
+        raise ValueError(
+            f"{channel.where(row, name)}: the value is {channel.columns[name][row]}, expected a "
+            f"finite number"
+        )
+
+
+def check_norms(channel: Channel, names: list[str]) -> None:
+    """Refuses quaternions whose norm is not 1.
+
+    Args:
+        channel: Where the quaternion is.
+        names: Its four columns.
+
+    Raises:
+        ValueError: Names the first row.
+    """
+    norms = np.linalg.norm(channel.table(names), axis=1)
+    is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
+    if is_bad.any():
+        row = int(np.argmax(is_bad))
+        raise ValueError(
+            f"{channel.where(row)}, columns {names}: the quaternion has a norm of "
+            f"{norms[row]:g}, expected 1"
+        )
+
+
+def check_first_row(
+    kinematics: RobotKinematics,
+    log_map: LogMap,
+    positions: Callable[[LogMap], np.ndarray],
+    where: str,
+) -> None:
+    """Refuses a log whose robot does not stand on the ground in the first row.
+
+    A wrong order of the quaternion lays it down or turns it over; wrong units lift its feet off
+    the ground or take its joints beyond their stops. What would make it stand is named.
+
+    Args:
+        kinematics: The robot.
+        log_map: The map as it is.
+        positions: The first row's positions (n_q,), if read by a map.
+        where: The first row in words.
+
+    Raises:
+        ValueError: Says what is implausible, and which other map is not.
+    """
+    wrong = _implausible(kinematics, positions(log_map))
+    if not wrong:
+        return
+    likely = []
+    for part, name, values in (
+        ("base_orientation", "order", ORDERS),
+        ("joint_positions", "unit", ANGLE_UNITS),
+        ("base_position", "unit", LENGTH_UNITS),
+    ):
+        for value in values:
+            other = copy.deepcopy(log_map)
+            setattr(getattr(other, part), name, value)
+            if other != log_map and not _implausible(kinematics, positions(other)):
+                likely.append(f"'{part}.{name}' is {value}")
+    hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
+    raise ValueError(
+        f"{where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the "
+        f"start: {wrong}{hint}"
+    )
+
+
+def check_stillness(
+    kinematics: RobotKinematics,
+    log_map: LogMap,
+    positions: Callable[[LogMap], np.ndarray],
+    where: str,
+) -> None:
+    """Refuses a quaternion in whose other order the feet would stand far more still.
+
+    x y z w read as w x y z turns an upright robot by half a turn about the vertical: it stands,
+    but as its base moves to one side its feet seem to slide to it twice as far.
+
+    Args:
+        kinematics: The robot.
+        log_map: The map as it is.
+        positions: Positions (N, n_q) at some rows, if read by a map.
+        where: The rows in words.
+
+    Raises:
+        ValueError: Says how far the feet slide in either order.
+    """
+    other = copy.deepcopy(log_map)
+    (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
+    slips = []
+    for read_by in (log_map, other):
+        feet = np.array([kinematics.contact_positions(q) for q in positions(read_by)])
+        slips.append(float(np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))))
+    if slips[0] > _SLIP_M and slips[0] > _SLIP_FACTOR * slips[1]:
+        raise ValueError(
+            f"{where}: the feet of robot '{kinematics.robot.name}' slide by {slips[0]:.3g} m, and "
+            f"by {slips[1]:.3g} m only if 'base_orientation.order' is "
+            f"{other.base_orientation.order}: it probably is"
+        )
+
+
+def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
+    excess = _beyond_limits(kinematics, q[None, 7:])[0]
+    joint = int(np.argmax(excess))
+    if excess[joint] > _FAR_RAD:
+        low, high = kinematics.position_limits[joint]
+        return (
+            f"joint '{kinematics.joint_names[joint]}' is at {q[7 + joint]:.3g} rad, its stops are "
+            f"{low:.3g} and {high:.3g}"
+        )
+    up = quaternion_of(q).rotation()[2, 2]
+    tilt = math.acos(min(max(up, -1.0), 1.0))
+    if tilt > _MAX_TILT_RAD:
+        return f"its base is tilted by {math.degrees(tilt):.0f}° from upright"
+    height = float((kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii).min())
+    if abs(height) > _FOOT_SHARE * kinematics.standing_height:
+        side = "above" if height > 0 else "below"
+        return f"its lowest foot is {abs(height):.3g} m {side} the ground"
+    return ""
+
+
+def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarray:
+    """How far joints (N, n_j) are beyond their stops [rad], negative inside."""
+    low, high = kinematics.position_limits.T
+    return np.maximum(low - joints, joints - high)
+
+
+def check_limits(
+    kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
+) -> None:
+    """Refuses joints that are far beyond their stops.
+
+    Args:
+        kinematics: The robot.
+        joints: At the channel's rows, (N, n_j) [rad].
+        channel: Where they are.
+        names: The joints' columns.
+
+    Raises:
+        ValueError: Names the first row, and the column.
+    """
+    excess = _beyond_limits(kinematics, joints)
+    is_far = excess > _FAR_RAD
+    if is_far.any():
+        row = int(np.argmax(is_far.any(axis=1)))
+        joint = int(np.argmax(excess[row]))
+        low, high = kinematics.position_limits[joint]
+        raise ValueError(
+            f"{channel.where(row, names[joint])}: joint '{kinematics.joint_names[joint]}' is at "
+            f"{joints[row, joint]:.3g} rad, far beyond its stops {low:.3g} and {high:.3g}"
+        )
+
+
+def check_rates(
+    logged: np.ndarray, derived: np.ndarray, channel: Channel, names: list[str], unit: str
+) -> None:
+    """Refuses velocities that are far larger than the derivatives of what they belong to.
+
+    Args:
+        logged: Velocities in SI units, (N, n).
+        derived: Derivatives of the logged positions, (M, n).
+        channel: Where the velocities are.
+        names: Their columns.
+        unit: What the map says their unit is.
+
+    Raises:
+        ValueError: Names the column.
+    """
+    size = np.sqrt(np.mean(logged**2, axis=0))
+    expected = np.sqrt(np.mean(derived**2, axis=0))
+    is_far = (size > _MOVING) & (size > _RATE_FACTOR * expected)
+    if is_far.any():
+        column = int(np.argmax(is_far))
+        row = int(np.argmax(np.abs(logged[:, column])))
+        raise ValueError(
+            f"{channel.where(row, names[column])}: velocities are {size[column]:.3g} on average, "
+            f"but what they belong to changes by {expected[column]:.3g} per second: is the unit "
+            f"really {unit} per second, and that of time right?"
+        )
+
+
+def check_desired_output(
+    kinematics: RobotKinematics, desired: np.ndarray, base: np.ndarray, where: str, unit: str
+) -> None:
+    """Refuses desired outputs that no part of the robot could be at.
+
+    Args:
+        kinematics: The robot.
+        desired: z* of the first row, (3,) [m].
+        base: Position of the base there, (3,) [m].
+        where: The row in words.
+        unit: What the map says the unit of z* is.
+
+    Raises:
+        ValueError: Says how far away it is.
+    """
+    distance = float(np.linalg.norm(desired - base))
+    if distance > _REACH_SHARE * kinematics.standing_height:
+        raise ValueError(
+            f"{where}: the desired output is {distance:.3g} m from the base of robot "
+            f"'{kinematics.robot.name}': is it in the same world, and its unit {unit}?"
+        )

@@ -1,0 +1,111 @@
+"""From a log's columns to positions and velocities in Drake's order, in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from drake_safety.logs.channel import Channel
+from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, LogMap, Position, Velocity
+
+
+def base_positions(log_map: LogMap, channels: Mapping[str, Channel]) -> np.ndarray:
+    """Positions of the base in the world at its topic's times, (N, 3) [m]."""
+    return points(log_map.base_position, channels)
+
+
+def points(position: Position, channels: Mapping[str, Channel]) -> np.ndarray:
+    """Points in the world at their topic's times, (N, 3 n) [m]."""
+    table = channels[position.topic].table(position.columns)
+    return LENGTH_UNITS[position.unit] * table
+
+
+def quaternions(log_map: LogMap, channels: Mapping[str, Channel]) -> np.ndarray:
+    """Orientations of the base at their topic's times, (N, 4): w, x, y, z."""
+    orientation = log_map.base_orientation
+    table = channels[orientation.topic].table(orientation.columns)
+    return table if orientation.order == "wxyz" else table[:, [3, 0, 1, 2]]
+
+
+def joint_table(
+    log_map: LogMap, channels: Mapping[str, Channel], joints: list[str], name: str
+) -> np.ndarray:
+    """``joint_positions`` or ``joint_velocities`` in the robot's order, (N, n_j) [rad, rad/s]."""
+    mapped = getattr(log_map, name)
+    table = channels[mapped.topic].table([mapped.column(joint) for joint in joints])
+    return ANGLE_UNITS[mapped.unit] * table
+
+
+def base_velocities(
+    velocity: Velocity, channels: Mapping[str, Channel], rotations: Rotation
+) -> np.ndarray:
+    """A velocity of the base along the world's axes, (N, 3) [m/s or rad/s].
+
+    Args:
+        velocity: Where it is.
+        channels: The log.
+        rotations: Orientation of the base at that topic's times.
+    """
+    units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
+    table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
+    return table if velocity.frame == "world" else rotations.apply(table)
+
+
+def rotations_of(wxyz: np.ndarray) -> Rotation:
+    """Rotations of quaternions (N, 4) in the order w, x, y, z."""
+    return Rotation.from_quat(wxyz, scalar_first=True)
+
+
+def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:
+    """Rotations at other times, along the great arc between two neighbours (slerp).
+
+    Args:
+        time_s: Times of the rotations, increasing, (N,) [s].
+        rotations: The rotations.
+        at_s: Wanted times, (M,) [s]; outside the first or last one holds.
+    """
+    if len(time_s) == 1:
+        return rotations[np.zeros(len(at_s), dtype=int)]
+    return Slerp(time_s, rotations)(np.clip(at_s, time_s[0], time_s[-1]))
+
+
+def values_at(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """Columns at other times, linear between two neighbours, (M, n).
+
+    Args:
+        time_s: Times of the rows, increasing, (N,) [s].
+        values: (N, n).
+        at_s: Wanted times, (M,) [s]; outside the first or last row holds.
+    """
+    return np.stack([np.interp(at_s, time_s, column) for column in values.T], axis=1)
+
+
+def rates(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Derivatives of columns, exact for parabolas, (N, n) [1/s].
+
+    Args:
+        time_s: Times of the rows, increasing, (N,), three at least [s].
+        values: (N, n).
+    """
+    return np.gradient(values, time_s, axis=0, edge_order=2)
+
+
+def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
+    """Angular velocity of rotations along the world's axes, (N, 3) [rad/s].
+
+    Each is the mean of those that lead to a row and away from it, weighted so that it is exact
+    where the angular velocity changes linearly.
+
+    Args:
+        time_s: Times of the rotations, increasing, (N,), three at least [s].
+        rotations: The rotations.
+    """
+    step_s = np.diff(time_s)[:, None]
+    between = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / step_s
+    slope = np.diff(between, axis=0) / (step_s[:-1] + step_s[1:])
+    inner = between[:-1] + slope * step_s[:-1]
+    first = between[0] - slope[0] * step_s[0]
+    last = between[-1] + slope[-1] * step_s[-1]
+    return np.vstack([first, inner, last])

@@ -1,0 +1,198 @@
+"""Episodes from a log: what a loop's ports say of the states that a robot went through."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydrake.systems.framework import Context
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.kinematics import planar_pose
+from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.logs.conversion import values_at
+from drake_safety.logs.robot_log import RobotLog
+from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.rollouts import Recorder, episodes_info
+from drake_safety.simulation.scenario import Scenario
+
+_ROUNDING_S = 1e-9
+
+
+def episodes_from_log(
+    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+) -> Episodes:
+    """Turns a log into episodes of the actual robot; see :func:`cut_log`.
+
+    Args:
+        log: The log.
+        loop: The loop whose ports say what each state means, without Γ; of a scenario its
+            ``actual`` one.
+        desired_output: z* in the world that was kept all the time, (n_z,) [m], for a log that
+            has none.
+
+    Raises:
+        ValueError: As :func:`cut_log`.
+    """
+    return cut_log(log, loop, desired_output=desired_output)[0]
+
+
+def cut_log(
+    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+) -> tuple[Episodes, list[EpisodeStart]]:
+    """Turns a log into episodes, and says what each begins with, for its nominal twin.
+
+    An episode lasts as long as the scenario's, and the next begins where it ends. The last one
+    ends where the robot leaves the safe set, as the loop's monitor sees it at its ticks; what the
+    log holds after that is not looked at, for it may be anything. A safe rest that is too short
+    for a segment is left out. What the assessor sees is what was logged: measurement noise is in
+    it already, and none is added. The preview is the logged z*, which after the last row stays
+    as it is; z* counts from the stance frame of the episode's first row.
+
+    Args:
+        log: The log.
+        loop: The loop whose ports say what each state means, without Γ; of a scenario its
+            ``actual`` one.
+        desired_output: z* in the world that was kept all the time, (n_z,) [m], for a log that
+            has none.
+
+    Returns:
+        The episodes, and what each begins with: ``run_episode(nominal_loop, start=starts[i])``
+        is the twin of ``episodes[i]``.
+
+    Raises:
+        ValueError: The log is of another robot, has no z*, begins outside the safe set, or is
+            too short for one segment.
+    """
+    if isinstance(loop, Scenario):
+        loop = loop.make_loop("actual")
+    desired = _desired_output(log, loop, desired_output)
+    scenario = loop.scenario
+    shortest = scenario.assessment.shortest_segment or scenario.assessment.horizon
+    context = loop.CreateDefaultContext()
+    episodes: list[Episode] = []
+    starts: list[EpisodeStart] = []
+    begin_s = 0.0
+    while log.duration_s - begin_s > scenario.step_s:
+        start = _start(log, loop, desired, begin_s)
+        loop.reset_to(context, None, start)
+        episode = _episode(log, loop, context, begin_s, len(episodes))
+        if not episode.is_safe and episode.num_steps == 0 and not episodes:
+            raise ValueError(
+                f"log '{log.path}' begins outside the safe set of scenario '{scenario.name}': "
+                f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
+            )
+        if not episode.is_safe or episode.num_steps >= shortest:
+            episodes.append(episode)
+            starts.append(start)
+        if not episode.is_safe:
+            break
+        begin_s += float(episode.time_s[-1])
+    if not episodes:
+        raise ValueError(
+            f"log '{log.path}' lasts {log.duration_s:g} s: too short for a segment of {shortest} "
+            f"steps of {scenario.step_s} s of scenario '{scenario.name}'"
+        )
+    return Episodes(episodes_info(loop, seed=0), episodes), starts
+
+
+def _desired_output(
+    log: RobotLog, loop: ClosedLoop, desired_output: np.ndarray | None
+) -> np.ndarray:
+    who = f"log '{log.path}'"
+    if log.robot != loop.robot.name:
+        raise ValueError(
+            f"{who} is of robot '{log.robot}', scenario '{loop.scenario.name}' of "
+            f"'{loop.robot.name}'"
+        )
+    size = len(loop.output_names)
+    if log.desired_output is not None:
+        if desired_output is not None:
+            raise ValueError(f"{who} has a desired output of its own; leave the other one out")
+        return log.desired_output
+    if desired_output is None:
+        raise ValueError(
+            f"{who} has no desired output, so nobody knows what was to come: map "
+            "'desired_output', or say which one was kept"
+        )
+    value = np.asarray(desired_output, dtype=float)
+    if value.shape != (size,) or not np.isfinite(value).all():
+        raise ValueError(f"{who}: desired_output must be {size} finite numbers; got {value}")
+    return np.tile(value, (len(log.time_s), 1))
+
+
+def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
+    """The logged state at a time, and the logged z* from then on as a plan."""
+    kinematics = loop.kinematics
+    begin = np.array([begin_s])
+    q, v = np.split(log.states_at(begin)[0], [kinematics.num_positions])
+    feet = None
+    if log.foot_positions is not None:
+        feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
+    scenario = loop.scenario
+    # No preview and no outlook of the longest episode reaches further.
+    reach_s = 2 * scenario.episode_duration_s + scenario.assessment.horizon * scenario.step_s
+    later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
+    hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
+    start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)
+    X_SW = planar_pose(start.stance_pose(kinematics)).inverse()
+    knots = np.concatenate([begin, later])
+    points = values_at(log.time_s, desired, knots).reshape(-1, 3)
+    z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
+    # Without overshoot at steps of z*, and with a rate that has none.
+    start.plan = (
+        PiecewisePolynomial.CubicShapePreserving(knots - begin_s, z.T)
+        if len(knots) > 2
+        else PiecewisePolynomial.FirstOrderHold(knots - begin_s, z.T)
+    )
+    return start
+
+
+def _episode(
+    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, index: int
+) -> Episode:
+    scenario = loop.scenario
+    length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
+    period_s = loop.monitor_period_s
+    ticks = period_s * np.arange(max(math.ceil(length_s / period_s - 1e-6), 1))
+    margins = _margins(log, loop, context, begin_s, ticks)
+    is_out = (margins < 0).any(axis=1)
+    times = scenario.step_s * np.arange(int(length_s / scenario.step_s + 1e-6) + 1)
+    if is_out.any():
+        tick = int(np.argmax(is_out))
+        # The loop ends once its plant has made the step after the tick that saw it.
+        end_s = min(ticks[tick] + scenario.time_step_s, length_s) if tick else 0.0
+        times = np.append(times[times < end_s - _ROUNDING_S], end_s)
+    # A row shows the monitor's last look: the one before, not at, its own instant.
+    seen = np.maximum(np.ceil(times / period_s - 1e-6).astype(int) - 1, 0)
+    recorder = Recorder(loop, [name for name in RECORDED_PORTS if name != "margins"])
+    for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
+        _set_state(loop, context, time_s, state)
+        recorder.record(context)
+    arrays = recorder.arrays() | {"margins": margins[seen]}
+    cause = ""
+    if is_out.any():
+        cause = loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
+    return Episode(index=index, **arrays, is_safe=cause == "", cause=cause)
+
+
+def _margins(
+    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, ticks: np.ndarray
+) -> np.ndarray:
+    """Margins at the monitor's ticks up to the first violation, (n, n_c) [m or rad]."""
+    port = loop.GetOutputPort("margins")
+    rows = []
+    for time_s, state in zip(ticks, log.states_at(begin_s + ticks), strict=True):
+        _set_state(loop, context, time_s, state)
+        loop.ExecuteInitializationEvents(context)
+        rows.append(port.Eval(context).copy())
+        if (rows[-1] < 0).any():
+            break
+    return np.array(rows)
+
+
+def _set_state(loop: ClosedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
+    context.SetTime(float(time_s))
+    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)

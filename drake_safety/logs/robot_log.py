@@ -1,0 +1,275 @@
+"""RobotLog: what a robot did, in Drake's order and SI units, read from a log of any format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.robot_model import RobotModel
+from drake_safety.logs import checks
+from drake_safety.logs.channel import Channel
+from drake_safety.logs.conversion import (
+    angular_velocities,
+    base_positions,
+    base_velocities,
+    joint_table,
+    points,
+    quaternions,
+    rates,
+    rotations_at,
+    rotations_of,
+    values_at,
+)
+from drake_safety.logs.log_map import LogMap, load_log_map
+from drake_safety.logs.messages import read_bag, read_mcap
+from drake_safety.logs.tables import read_csv, read_parquet
+
+FORMATS = (".csv", ".parquet", ".mcap", ".bag")
+"""Suffixes of the files that can be read; a folder is a ROS 2 bag."""
+
+_NUM_LOOKS = 50  # Rows, all over a log, at which its feet are looked at.
+
+
+@dataclass(kw_only=True, eq=False)
+class RobotLog:
+    """What a robot did.
+
+    Attributes:
+        path: Where it was read from.
+        robot: Name of the robot.
+        time_s: Time since the first row, increasing, (N,) [s].
+        q: Positions: base quaternion (w, x, y, z), base position, joints, (N, n_q).
+        v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
+        desired_output: z* in the world, (N, n_z) [m], or None.
+        foot_positions: Where the controller wanted the feet, (N, 3 n_c) [m], or None.
+    """
+
+    path: Path
+    robot: str
+    time_s: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    desired_output: np.ndarray | None = None
+    foot_positions: np.ndarray | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first row to the last [s]."""
+        return float(self.time_s[-1])
+
+    def states_at(self, at_s: np.ndarray) -> np.ndarray:
+        """Plant states [q, v] at any times of the log, (M, n_q + n_v).
+
+        Rotations are interpolated along the great arc, all else linearly.
+
+        Args:
+            at_s: Times (M,) [s].
+        """
+        rotations = rotations_at(self.time_s, rotations_of(self.q[:, :4]), at_s)
+        rest = values_at(self.time_s, np.hstack([self.q[:, 4:], self.v]), at_s)
+        return np.hstack([rotations.as_quat(scalar_first=True), rest])
+
+
+def read_log(
+    path: str | PathLike[str],
+    log_map: LogMap | str | PathLike[str],
+    robot: RobotModel,
+    *,
+    step_s: float | None = None,
+) -> RobotLog:
+    """Reads a log, checks all of it, and converts it.
+
+    Args:
+        path: A ``.csv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a ROS 2 bag.
+        log_map: What is where in it, or the path of a ``columns.yaml``.
+        robot: The robot.
+        step_s: Time between two rows of the result [s]; by default they are at the instants of
+            the base's positions.
+
+    Raises:
+        ValueError: Whatever is missing or implausible, with file, row and column.
+    """
+    path = Path(path)
+    if not isinstance(log_map, LogMap):
+        log_map = load_log_map(Path(log_map))
+    log_map.check()
+    if step_s is not None and not step_s > 0:
+        raise ValueError(f"read_log: step_s must be positive; got {step_s}")
+    kinematics = RobotKinematics(robot)
+    channels = _read_channels(path, _wanted(log_map, kinematics), log_map)
+    for channel in channels.values():
+        checks.check_time(channel, log_map.max_gap_s)
+        checks.check_finite(channel)
+    orientation = log_map.base_orientation
+    checks.check_norms(channels[orientation.topic], orientation.columns)
+    return _converted(path, log_map, kinematics, channels, step_s)
+
+
+def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
+    """Columns by topic; those of the joints by the joints' names."""
+    wanted: dict[str, list[str]] = {}
+    for name in (
+        "base_position",
+        "base_orientation",
+        "base_linear_velocity",
+        "base_angular_velocity",
+        "desired_output",
+        "foot_positions",
+    ):
+        part = getattr(log_map, name)
+        if part.columns:
+            wanted.setdefault(part.topic, []).extend(part.columns)
+    for name in ("joint_positions", "joint_velocities"):
+        part = getattr(log_map, name)
+        if not (part.template or part.columns):
+            continue
+        unknown = [joint for joint in part.columns if joint not in kinematics.joint_names]
+        missing = [joint for joint in kinematics.joint_names if not part.column(joint)]
+        if unknown or missing:
+            raise ValueError(
+                f"map: '{name}' must give a column to every joint of robot "
+                f"'{kinematics.robot.name}', {kinematics.joint_names}; it has none for {missing}"
+                f", and knows no joints {unknown}"
+            )
+        columns = [part.column(joint) for joint in kinematics.joint_names]
+        wanted.setdefault(part.topic, []).extend(columns)
+    num_feet = len(log_map.foot_positions.columns)
+    if num_feet not in (0, 3 * kinematics.num_contacts):
+        raise ValueError(
+            f"map: 'foot_positions.columns' must be x, y, z of {kinematics.num_contacts} contact "
+            f"points of robot '{kinematics.robot.name}'; got {num_feet} columns"
+        )
+    return {topic: list(dict.fromkeys(names)) for topic, names in wanted.items()}
+
+
+def _read_channels(path: Path, wanted: dict[str, list[str]], log_map: LogMap) -> dict[str, Channel]:
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        return read_bag(path, wanted, log_map.time)
+    if not path.is_file():
+        what = "is a folder without the metadata.yaml of a ROS 2 bag"
+        raise ValueError(f"log '{path}' {what if path.is_dir() else 'does not exist'}")
+    suffix = path.suffix.lower()
+    if suffix == ".bag":
+        return read_bag(path, wanted, log_map.time)
+    if suffix == ".mcap":
+        return read_mcap(path, wanted, log_map.time)
+    if suffix not in FORMATS:
+        raise ValueError(
+            f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
+            "a ROS 2 bag"
+        )
+    topics = [topic for topic in wanted if topic]
+    if topics:
+        raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
+    read = read_csv if suffix == ".csv" else read_parquet
+    return {"": read(path, wanted[""], log_map.time)}
+
+
+def _converted(
+    path: Path,
+    log_map: LogMap,
+    kinematics: RobotKinematics,
+    channels: dict[str, Channel],
+    step_s: float | None,
+) -> RobotLog:
+    origin = min(channel.time[0] for channel in channels.values())
+    times = {topic: channel.seconds_since(origin) for topic, channel in channels.items()}
+    start = max(time[0] for time in times.values())
+    end = min(time[-1] for time in times.values())
+    if not end > start:
+        spans = {topic: (float(t[0]), float(t[-1])) for topic, t in times.items()}
+        raise ValueError(f"log '{path}': its topics do not overlap in time: {spans} [s]")
+    base_time = times[log_map.base_position.topic]
+    if step_s is None:
+        at_s = base_time[(base_time >= start) & (base_time <= end)]
+    else:
+        at_s = start + step_s * np.arange(int((end - start) / step_s + 1e-9) + 1)
+    if len(at_s) < 2:
+        raise ValueError(f"log '{path}': its topics have {end - start:g} s in common: too little")
+    first_row = int(np.searchsorted(base_time, at_s[0]))
+    where = channels[log_map.base_position.topic].where(min(first_row, len(base_time) - 1))
+
+    def positions(read_by: LogMap, at: np.ndarray) -> np.ndarray:
+        rotations = rotations_of(quaternions(read_by, channels))
+        rotations = rotations_at(times[read_by.base_orientation.topic], rotations, at)
+        base = values_at(base_time, base_positions(read_by, channels), at)
+        table = joint_table(read_by, channels, kinematics.joint_names, "joint_positions")
+        joints = values_at(times[read_by.joint_positions.topic], table, at)
+        return np.hstack([rotations.as_quat(scalar_first=True), base, joints])
+
+    checks.check_first_row(
+        kinematics, log_map, lambda read_by: positions(read_by, at_s[:1])[0], where
+    )
+    some = at_s[:: max(len(at_s) // _NUM_LOOKS, 1)]
+    checks.check_stillness(
+        kinematics, log_map, lambda read_by: positions(read_by, some), f"{where} and after it"
+    )
+    q = positions(log_map, at_s)
+    v = _velocities(log_map, kinematics, channels, times, at_s)
+    extra = {}
+    for name in ("desired_output", "foot_positions"):
+        part = getattr(log_map, name)
+        if part.columns:
+            extra[name] = values_at(times[part.topic], points(part, channels), at_s)
+    if "desired_output" in extra:
+        unit = log_map.desired_output.unit
+        checks.check_desired_output(kinematics, extra["desired_output"][0], q[0, 4:7], where, unit)
+    return RobotLog(
+        path=path, robot=kinematics.robot.name, time_s=at_s - at_s[0], q=q, v=v, **extra
+    )
+
+
+def _velocities(
+    log_map: LogMap,
+    kinematics: RobotKinematics,
+    channels: dict[str, Channel],
+    times: dict[str, np.ndarray],
+    at_s: np.ndarray,
+) -> np.ndarray:
+    rotation_time = times[log_map.base_orientation.topic]
+    rotations = rotations_of(quaternions(log_map, channels))
+    base_time = times[log_map.base_position.topic]
+    joint_map = log_map.joint_positions
+    joint_time = times[joint_map.topic]
+    joints = joint_table(log_map, channels, kinematics.joint_names, "joint_positions")
+    joint_columns = [joint_map.column(joint) for joint in kinematics.joint_names]
+    checks.check_limits(kinematics, joints, channels[joint_map.topic], joint_columns)
+    parts = []
+    for velocity, time, derived, unit in (
+        (
+            log_map.base_angular_velocity,
+            rotation_time,
+            angular_velocities(rotation_time, rotations),
+            "rad",
+        ),
+        (
+            log_map.base_linear_velocity,
+            base_time,
+            rates(base_time, base_positions(log_map, channels)),
+            "m",
+        ),
+    ):
+        if velocity.columns:
+            own_time = times[velocity.topic]
+            table = base_velocities(
+                velocity, channels, rotations_at(rotation_time, rotations, own_time)
+            )
+            channel = channels[velocity.topic]
+            checks.check_rates(table, derived, channel, velocity.columns, velocity.unit or unit)
+            parts.append(values_at(own_time, table, at_s))
+        else:
+            parts.append(values_at(time, derived, at_s))
+    rate_map = log_map.joint_velocities
+    derived = rates(joint_time, joints)
+    if rate_map.template or rate_map.columns:
+        table = joint_table(log_map, channels, kinematics.joint_names, "joint_velocities")
+        columns = [rate_map.column(joint) for joint in kinematics.joint_names]
+        checks.check_rates(table, derived, channels[rate_map.topic], columns, rate_map.unit)
+        parts.append(values_at(times[rate_map.topic], table, at_s))
+    else:
+        parts.append(values_at(joint_time, derived, at_s))
+    return np.hstack(parts)

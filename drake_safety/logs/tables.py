@@ -1,0 +1,137 @@
+"""Logs that are tables: CSV and Parquet."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.logs.channel import Channel, require_columns
+from drake_safety.logs.log_map import LogTime
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
+    """Reads columns of a CSV file with a header line.
+
+    Args:
+        path: The file.
+        wanted: Names of the columns.
+        time: Where the time is.
+
+    Raises:
+        ValueError: A column is missing or there twice, or what stands in it is no number.
+    """
+    import pandas as pd
+
+    names = _checked_names(path, wanted, time, _header_of(path))
+    try:
+        # Cells stay text: whatever is no number can then be quoted as it stands.
+        frame = pd.read_csv(
+            path, usecols=names, dtype=str, keep_default_na=False, skip_blank_lines=False
+        )
+    except (pd.errors.ParserError, UnicodeDecodeError) as error:
+        raise ValueError(f"log '{path}' is not a CSV table: {error}") from error
+    return _channel(path, frame, wanted, time, "line", 2)
+
+
+def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
+    """Reads columns of a Parquet file.
+
+    Args:
+        path: The file.
+        wanted: Names of the columns.
+        time: Where the time is.
+
+    Raises:
+        ValueError: It is no Parquet file, or a column is missing or holds no numbers.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            names = _checked_names(path, wanted, time, file.schema_arrow.names)
+            frame = file.read(columns=names).to_pandas(timestamp_as_object=False)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise ValueError(f"log '{path}' is damaged or no Parquet file: {error}") from error
+    return _channel(path, frame, wanted, time, "row", 0)
+
+
+def _header_of(path: Path) -> list[str]:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        try:
+            return next(csv.reader(file), [])
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise ValueError(f"log '{path}' is not a CSV table: {error}") from error
+
+
+def _checked_names(
+    path: Path, wanted: Sequence[str], time: LogTime, existing: list[str]
+) -> list[str]:
+    if not time.column:
+        raise ValueError(
+            f"log '{path}' is a table: 'time.column' of the map must name its time; it has "
+            f"{existing}"
+        )
+    names = list(dict.fromkeys([time.column, *wanted]))
+    require_columns(path, "", names, existing)
+    twice = [name for name in names if existing.count(name) > 1]
+    if twice:
+        raise ValueError(f"log '{path}' has columns of the same name: {twice}")
+    return names
+
+
+def _channel(
+    path: Path,
+    frame: pd.DataFrame,
+    wanted: Sequence[str],
+    time: LogTime,
+    row_name: str,
+    first_row: int,
+) -> Channel:
+    channel = Channel(
+        path=path,
+        topic="",
+        time=np.zeros(len(frame)),
+        time_unit=time.unit,
+        time_name=time.column,
+        columns={},
+        row_name=row_name,
+        first_row=first_row,
+    )
+    stamps = frame[time.column]
+    if stamps.dtype.kind == "M":
+        channel.time = stamps.to_numpy("datetime64[ns]").astype(np.int64)
+        channel.time_unit = "ns"
+    else:
+        channel.time = _numbers(channel, frame, time.column)
+    channel.columns = {name: _numbers(channel, frame, name).astype(float) for name in wanted}
+    return channel
+
+
+def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
+    """A column's numbers; integers stay integers, which a clock of nanoseconds needs."""
+    values = frame[name].to_numpy()
+    if values.dtype.kind in "iuf":
+        return values
+    for kind in (np.int64, np.float64):
+        try:
+            return values.astype(kind)
+        except (ValueError, TypeError, OverflowError):
+            continue
+    row = next(i for i, value in enumerate(values) if not _is_number(value))
+    raise ValueError(f"{channel.where(row, name)}: '{values[row]}' is no number")
+
+
+def _is_number(value: object) -> bool:
+    try:
+        float(value)  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        return False
+    return True

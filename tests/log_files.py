@@ -1,0 +1,277 @@
+"""Recorded runs of our own loops, written as a robot's logs would be: tables, MCAP, ROS bags."""
+
+import functools
+
+import numpy as np
+import pandas as pd
+from pydrake.systems.analysis import Simulator
+from scipy.spatial.transform import Rotation
+
+from drake_safety import load_scenario
+from drake_safety.control.robot import PlantVariation
+from drake_safety.logs.robot_log import RobotLog
+from drake_safety.simulation.rollouts import episode_rng
+
+ORIGIN_NS = 1_700_000_000_123_000_000
+POINT = ("x", "y", "z")
+FORMATS = ("csv", "parquet", "mcap", "ros2", "ros1")
+
+
+@functools.cache
+def balancing_scenario():
+    """Short episodes of the packaged robot, whose actual plant is measured without noise."""
+    scenario = load_scenario("laikago_balancing")
+    scenario.episode_duration_s = 0.6
+    scenario.parameters.push.share = 0.0
+    start = scenario.parameters.start
+    start.plan_duration_s = [0.3, 0.5]  # The log holds all of the plan.
+    start.base_height_m = [0.39, 0.42]
+    scenario.parameters.safe_set.height_m = [0.37, 0.44]
+    scenario.variations["actual"] = PlantVariation(joint_friction_nm=0.4)
+    return scenario
+
+
+@functools.cache
+def balancing_loop():
+    return balancing_scenario().make_loop("actual")
+
+
+def record(loop, index=0, **goal):
+    """An episode's run at the plant's own rate, to the end of its time whatever happens."""
+    scenario = loop.scenario
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, episode_rng(0, index), **goal)
+    feet = loop.start_of(context).foot_positions
+    simulator.Initialize()
+    step_s = scenario.time_step_s
+    times = step_s * np.arange(round(scenario.episode_duration_s / step_s) + 1)
+    # An episode's rows are at these floats, which may be one rounding from the plant's own.
+    rows = scenario.step_s * np.arange(scenario.num_steps + 1)
+    times[np.abs(times[:, None] - rows).argmin(axis=0)] = rows
+    states, desired = [], []
+    for time_s in times:
+        if time_s > 0:  # At zero it would make the plant's first step.
+            simulator.AdvanceTo(time_s)
+        states.append(loop.GetOutputPort("plant_state").Eval(context).copy())
+        desired.append(loop.GetOutputPort("desired_output").Eval(context).copy())
+    q, v = np.split(np.array(states), [loop.kinematics.num_positions], axis=1)
+    q[:, :4] /= np.linalg.norm(q[:, :4], axis=1, keepdims=True)
+    return RobotLog(
+        path="recorded",
+        robot=loop.robot.name,
+        time_s=times,
+        q=q,
+        v=v,
+        desired_output=np.array(desired),
+        foot_positions=None if feet is None else np.tile(feet.ravel(), (len(times), 1)),
+    )
+
+
+@functools.cache
+def recorded(index=0):
+    return record(balancing_loop(), index)
+
+
+def stamps_ns(log):
+    return ORIGIN_NS + np.round(log.time_s * 1e9).astype(np.int64)
+
+
+def frame_of(log, joints):
+    """A table with millimetres, degrees, x y z w and body velocities, whose clock counts ns."""
+    columns = {"stamp": stamps_ns(log)}
+    columns |= {f"base_{a}": 1e3 * log.q[:, 4 + i] for i, a in enumerate(POINT)}
+    columns |= {f"quat_{a}": log.q[:, i] for a, i in zip("xyzw", (1, 2, 3, 0), strict=True)}
+    rotations = Rotation.from_quat(log.q[:, :4], scalar_first=True)
+    body = rotations.inv().apply(log.v[:, :3]), rotations.inv().apply(log.v[:, 3:6])
+    columns |= {f"gyro_{a}": np.rad2deg(body[0][:, i]) for i, a in enumerate(POINT)}
+    columns |= {f"velocity_{a}": body[1][:, i] for i, a in enumerate(POINT)}
+    columns |= {f"{name}_pos": np.rad2deg(log.q[:, 7 + i]) for i, name in enumerate(joints)}
+    columns |= {f"{name}_vel": log.v[:, 6 + i] for i, name in enumerate(joints)}
+    columns |= {f"goal_{a}": log.desired_output[:, i] for i, a in enumerate(POINT)}
+    columns |= {f"feet_{i}": log.foot_positions[:, i] for i in range(log.foot_positions.shape[1])}
+    return pd.DataFrame(columns)
+
+
+TABLE_MAP = """
+time: {column: stamp, unit: ns}
+base_position: {columns: [base_x, base_y, base_z], unit: mm}
+base_orientation: {columns: [quat_x, quat_y, quat_z, quat_w], order: xyzw}
+base_angular_velocity: {columns: [gyro_x, gyro_y, gyro_z], unit: deg, frame: body}
+base_linear_velocity: {columns: [velocity_x, velocity_y, velocity_z], frame: body}
+joint_positions: {template: "{joint}_pos", unit: deg}
+joint_velocities: {template: "{joint}_vel"}
+desired_output: {columns: [goal_x, goal_y, goal_z]}
+foot_positions:
+  columns:
+    - feet_0
+    - feet_1
+    - feet_2
+    - feet_3
+    - feet_4
+    - feet_5
+    - feet_6
+    - feet_7
+    - feet_8
+    - feet_9
+    - feet_10
+    - feet_11
+"""
+
+MESSAGE_MAP = """
+time: {column: header.stamp}
+base_position:
+  topic: /odom
+  columns: [pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
+base_orientation:
+  topic: /odom
+  columns:
+    - pose.pose.orientation.x
+    - pose.pose.orientation.y
+    - pose.pose.orientation.z
+    - pose.pose.orientation.w
+  order: xyzw
+base_linear_velocity:
+  topic: /odom
+  columns: [twist.twist.linear.x, twist.twist.linear.y, twist.twist.linear.z]
+  frame: body
+base_angular_velocity:
+  topic: /odom
+  columns: [twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z]
+  frame: body
+joint_positions: {topic: /joint_states, template: "position[{joint}]"}
+joint_velocities: {topic: /joint_states, template: "velocity[{joint}]"}
+desired_output: {topic: /goal, columns: [point.x, point.y, point.z]}
+foot_positions:
+  topic: /feet
+  columns:
+    - "position[0]"
+    - "position[1]"
+    - "position[2]"
+    - "position[3]"
+    - "position[4]"
+    - "position[5]"
+    - "position[6]"
+    - "position[7]"
+    - "position[8]"
+    - "position[9]"
+    - "position[10]"
+    - "position[11]"
+"""
+
+
+def map_text(kind):
+    return TABLE_MAP if kind in ("csv", "parquet") else MESSAGE_MAP
+
+
+def write(log, joints, kind, folder):
+    """Writes a log in one of the `FORMATS`; returns its path."""
+    if kind == "csv":
+        path = folder / "run.csv"
+        frame_of(log, joints).to_csv(path, index=False)
+    elif kind == "parquet":
+        path = folder / "run.parquet"
+        frame_of(log, joints).to_parquet(path)
+    elif kind == "mcap":
+        path = folder / "run.mcap"
+        _write_mcap(log, joints, path)
+    elif kind == "ros2":
+        path = folder / "run_ros2"
+        _write_ros2(log, joints, path)
+    else:
+        path = folder / "run.bag"
+        _write_ros1(log, joints, path)
+    return path
+
+
+def _typestore(ros1=False):
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+TYPES = {
+    "/odom": "nav_msgs/msg/Odometry",
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/goal": "geometry_msgs/msg/PointStamped",
+    "/feet": "sensor_msgs/msg/JointState",
+}
+
+
+def messages(log, joints, store, array=np.asarray):
+    """Every message as (topic, stamp, message); joints stand in an order of their own."""
+    types = store.types
+    point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
+    quaternion = types["geometry_msgs/msg/Quaternion"]
+    time_type = types["builtin_interfaces/msg/Time"]
+    header_type = types["std_msgs/msg/Header"]
+    pose, twist = types["geometry_msgs/msg/Pose"], types["geometry_msgs/msg/Twist"]
+    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"]
+    twist_with_covariance = types["geometry_msgs/msg/TwistWithCovariance"]
+    joint_state = types[TYPES["/joint_states"]]
+    rotations = Rotation.from_quat(log.q[:, :4], scalar_first=True).inv()
+    w, v = rotations.apply(log.v[:, :3]), rotations.apply(log.v[:, 3:6])
+    order = np.arange(len(joints))[::-1]
+    none, covariance = array(np.zeros(0)), array(np.zeros(36))
+    for i, stamp in enumerate(stamps_ns(log).tolist()):
+        time = time_type(*divmod(stamp, 1_000_000_000))
+        sequence = {"seq": i} if "seq" in header_type.__dataclass_fields__ else {}
+        header = header_type(stamp=time, frame_id="world", **sequence)
+        qw, qx, qy, qz = log.q[i, :4]
+        odometry = types[TYPES["/odom"]](
+            header=header,
+            child_frame_id="base",
+            pose=with_covariance(
+                pose(point(*log.q[i, 4:7]), quaternion(qx, qy, qz, qw)), covariance
+            ),
+            twist=twist_with_covariance(twist(vector(*v[i]), vector(*w[i])), covariance),
+        )
+        yield "/odom", stamp, odometry
+        names = [joints[j] for j in order]
+        state = joint_state(
+            header, names, array(log.q[i, 7:][order]), array(log.v[i, 6:][order]), none
+        )
+        yield "/joint_states", stamp, state
+        yield "/goal", stamp, types[TYPES["/goal"]](header, point(*log.desired_output[i]))
+        yield "/feet", stamp, joint_state(header, [], array(log.foot_positions[i]), none, none)
+
+
+def _write_ros2(log, joints, path):
+    from rosbags.rosbag2 import Writer
+
+    store = _typestore()
+    with Writer(path, version=9) as writer:
+        topics = {
+            topic: writer.add_connection(topic, name, typestore=store)
+            for topic, name in TYPES.items()
+        }
+        for topic, stamp, message in messages(log, joints, store):
+            writer.write(topics[topic], stamp, store.serialize_cdr(message, TYPES[topic]))
+
+
+def _write_ros1(log, joints, path):
+    from rosbags.rosbag1 import Writer
+
+    store = _typestore(ros1=True)
+    with Writer(path) as writer:
+        topics = {
+            topic: writer.add_connection(topic, name, typestore=store)
+            for topic, name in TYPES.items()
+        }
+        for topic, stamp, message in messages(log, joints, store):
+            writer.write(topics[topic], stamp, store.serialize_ros1(message, TYPES[topic]))
+
+
+def _write_mcap(log, joints, path):
+    from mcap_ros2.writer import Writer
+
+    store = _typestore()
+    with path.open("wb") as file, Writer(file) as writer:
+        schemas = {
+            topic: writer.register_msgdef(
+                name.replace("/msg/", "/"), store.generate_msgdef(name, ros_version=2)[0]
+            )
+            for topic, name in TYPES.items()
+        }
+        for topic, stamp, message in messages(log, joints, store, array=list):
+            writer.write_message(topic, schemas[topic], message, stamp, stamp)

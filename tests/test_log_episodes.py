@@ -1,0 +1,123 @@
+"""Episodes from a log: what the loop itself would have recorded of the same motion."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drake_safety import run_episode
+from drake_safety.logs.episodes import cut_log, episodes_from_log
+from log_files import balancing_loop, balancing_scenario, record, recorded
+from reaching_loops import EASY, easy_episode, porter
+from test_rollouts import ARRAYS
+
+SAFE, UNSAFE = 0, 5
+
+
+def part(log, first, last):
+    """The rows of a log from one to another, with the time from the first of them."""
+    rows = slice(first, last)
+    values = {
+        name: getattr(log, name)[rows]
+        for name in ("q", "v", "desired_output", "foot_positions")
+        if getattr(log, name) is not None
+    }
+    times = log.time_s[rows] - log.time_s[first]
+    return dataclasses.replace(log, time_s=times, **values)
+
+
+def assert_same(episode, other, rows=slice(None), names=ARRAYS, atol=1e-9):
+    assert (episode.is_safe, episode.cause) == (other.is_safe, other.cause)
+    for name in names:
+        np.testing.assert_allclose(
+            getattr(episode, name)[rows], getattr(other, name)[rows], atol=atol, err_msg=name
+        )
+
+
+def test_a_safe_run_of_the_loop_gives_the_episode_that_the_loop_recorded():
+    episode = run_episode(balancing_loop(), SAFE)
+    assert episode.is_safe
+    episodes = episodes_from_log(recorded(SAFE), balancing_loop())
+    assert len(episodes) == 1
+    assert_same(episodes[0], episode)
+    assert episodes.info.variation == "actual"
+    assert episodes.info.scenario_hash == balancing_scenario().simulation_hash("actual")
+
+
+def test_an_unsafe_run_ends_with_the_state_and_the_cause_the_loop_ended_with():
+    episode = run_episode(balancing_loop(), UNSAFE)
+    assert not episode.is_safe
+    (logged,) = episodes_from_log(recorded(UNSAFE), balancing_scenario())
+    assert_same(logged, episode, slice(-1))
+    # The loop's clock stops between two steps of its plant, a log's does not.
+    assert_same(logged, episode, slice(-1, None), ("true_state", "output", "margins"))
+    assert abs(logged.time_s[-1] - episode.time_s[-1]) < balancing_scenario().time_step_s
+
+
+def test_a_reaching_log_says_the_same_as_the_loop_for_the_other_hand_too():
+    loop = porter("nominal", hand="right")
+    (logged,) = episodes_from_log(record(loop, 0, goal=EASY * [1.0, -1.0, 1.0]), loop)
+    episode = easy_episode("nominal", "right")
+    assert_same(logged, episode, names=[name for name in ARRAYS if name != "margins"], atol=1e-8)
+    # Of its rows at 3 * 0.1 > 0.3 the loop's monitor has seen one tick more.
+    assert_same(logged, episode, names=["margins"], atol=0.01)
+    exact = np.abs(logged.margins - episode.margins).max(axis=1) < 1e-8
+    assert exact.sum() >= 10
+
+
+def test_the_twin_begins_as_the_log_does_and_where_nothing_differs_goes_on_so():
+    log = recorded(SAFE)
+    episodes, starts = cut_log(log, balancing_loop())
+    assert len(starts) == len(episodes) == 1
+    twin = run_episode(balancing_loop(), start=starts[0])
+    np.testing.assert_allclose(twin.state[0], episodes[0].state[0], atol=1e-12)
+    # Between two rows of the log the plan is a cubic in place of the quintic.
+    assert_same(twin, episodes[0], atol=1e-4)
+
+
+def test_a_longer_log_gives_an_episode_after_the_other_and_drops_a_short_rest():
+    log = recorded(SAFE)
+    scenario = copy.deepcopy(balancing_scenario())
+    scenario.episode_duration_s = 0.2
+    scenario.assessment.horizon = 4
+    loop = scenario.make_loop("actual")
+    episodes, starts = cut_log(part(log, 0, 221), loop)  # 0.55 s: two, and less than a horizon
+    assert [e.num_steps for e in episodes] == [5, 5]
+    np.testing.assert_allclose(episodes[0].true_state[-1], episodes[1].true_state[0], atol=1e-9)
+    np.testing.assert_allclose(starts[1].q, log.q[80], atol=1e-12)
+    # Of the previews the first stays in the second's frame, whose feet have not moved.
+    np.testing.assert_allclose(
+        episodes[0].desired_preview[-1], episodes[1].desired_preview[0], atol=1e-9
+    )
+
+
+def test_after_the_last_row_the_desired_output_stays_as_it_is():
+    log = part(recorded(SAFE), 0, 161)
+    (episode,) = episodes_from_log(log, balancing_loop())
+    preview = episode.desired_preview[-1].reshape(-1, 3)
+    np.testing.assert_allclose(preview, np.tile(preview[0], (len(preview), 1)), atol=1e-9)
+
+
+def test_a_log_without_desired_output_needs_one_that_was_kept():
+    log = dataclasses.replace(recorded(SAFE), desired_output=None)
+    with pytest.raises(ValueError, match="has no desired output"):
+        episodes_from_log(log, balancing_loop())
+    kept = np.array([0.01, 0.0, 0.4])
+    (episode,) = episodes_from_log(log, balancing_loop(), desired_output=kept)
+    np.testing.assert_allclose(episode.desired_output, np.tile(kept, (16, 1)), atol=1e-9)
+    with pytest.raises(ValueError, match="must be 3 finite numbers"):
+        episodes_from_log(log, balancing_loop(), desired_output=np.zeros(2))
+    with pytest.raises(ValueError, match="has a desired output of its own"):
+        episodes_from_log(recorded(SAFE), balancing_loop(), desired_output=kept)
+
+
+def test_what_gives_no_episode_is_refused():
+    log = recorded(SAFE)
+    with pytest.raises(ValueError, match="too short for a segment of 10 steps"):
+        episodes_from_log(part(log, 0, 41), balancing_loop())
+    with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
+        episodes_from_log(log, porter())
+    low = dataclasses.replace(log, q=log.q - np.eye(log.q.shape[1])[6] * 0.1)
+    with pytest.raises(ValueError, match=r"begins outside the safe set.*'height'"):
+        episodes_from_log(low, balancing_loop())

@@ -1,0 +1,244 @@
+"""Logs of any format say the same of a robot, and what is wrong with one is said where it is."""
+
+import builtins
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from drake_safety.logs.conversion import angular_velocities, rates, rotations_of
+from drake_safety.logs.episodes import episodes_from_log
+from drake_safety.logs.log_map import LogMap, load_log_map
+from drake_safety.logs.messages import field_of
+from drake_safety.logs.robot_log import read_log
+from log_files import FORMATS, balancing_loop, frame_of, map_text, recorded, write
+from test_log_episodes import UNSAFE, assert_same, part
+
+JOINTS = balancing_loop().kinematics.joint_names
+ROBOT = balancing_loop().robot
+VALUES = ("time_s", "q", "v", "desired_output", "foot_positions")
+
+
+def map_of(kind, folder, *changes):
+    text = map_text(kind)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "columns.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def few_rows():
+    return part(recorded(UNSAFE), 0, 40)
+
+
+def read_csv(frame, folder, *changes):
+    frame.to_csv(folder / "run.csv", index=False)
+    return read_log(folder / "run.csv", map_of("csv", folder, *changes), ROBOT)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_gives_the_same_episode(kind, tmp_path):
+    log = recorded(UNSAFE)
+    read = read_log(write(log, JOINTS, kind, tmp_path), map_of(kind, tmp_path), ROBOT)
+    for name in VALUES:
+        np.testing.assert_allclose(getattr(read, name), getattr(log, name), atol=1e-11)
+    (direct,) = episodes_from_log(log, balancing_loop())
+    (episode,) = episodes_from_log(read, balancing_loop())
+    assert not direct.is_safe
+    assert_same(episode, direct)
+
+
+def test_a_log_can_be_resampled(few_rows, tmp_path):
+    frame_of(few_rows, JOINTS).to_parquet(tmp_path / "run.parquet")
+    log = read_log(tmp_path / "run.parquet", map_of("parquet", tmp_path), ROBOT, step_s=0.00375)
+    np.testing.assert_allclose(log.time_s, 0.00375 * np.arange(27), atol=1e-12)
+    np.testing.assert_allclose(log.q[2], few_rows.q[3], atol=1e-11)
+    middle = 0.5 * (few_rows.v[1] + few_rows.v[2])
+    np.testing.assert_allclose(log.v[1], middle, atol=1e-11)
+
+
+def test_velocities_that_are_not_logged_are_derivatives(few_rows, tmp_path):
+    path = map_of("csv", tmp_path)
+    lines = [line for line in path.read_text().splitlines() if "velocit" not in line]
+    frame_of(few_rows, JOINTS).to_csv(tmp_path / "run.csv", index=False)
+    path.write_text("\n".join(lines))
+    log = read_log(tmp_path / "run.csv", path, ROBOT)
+    # Drake's discrete velocity is that of the step that led to a state.
+    between = 0.5 * (few_rows.v[2:-2] + few_rows.v[3:-1])
+    np.testing.assert_allclose(log.v[2:-2, 3:6], between[:, 3:6], atol=2e-3)
+    np.testing.assert_allclose(log.v[2:-2, 6:], between[:, 6:], atol=2e-2)
+    np.testing.assert_allclose(log.v[2:-2, :3], between[:, :3], atol=2e-2)
+
+
+def test_derivatives_are_exact_for_constant_acceleration_at_uneven_times():
+    times = np.array([0.0, 0.1, 0.25, 0.3, 0.5])
+    np.testing.assert_allclose(rates(times, times[:, None] ** 2)[:, 0], 2 * times, atol=1e-12)
+    angle = 0.5 * times + times**2
+    half = 0.5 * angle
+    turns = rotations_of(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=1))
+    expected = np.outer(0.5 + 2 * times, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(angular_velocities(times, turns), expected, atol=1e-12)
+
+
+SPOILT = {
+    "a gap": (lambda f: f.drop(index=range(10, 25)), [("ns}", "ns}\nmax_gap_s: 0.03")],
+              r"line 12, column 'stamp': a gap of 0.04 s"),
+    "time backwards": (lambda f: f.iloc[[0, 1, 2, 4, 3, *range(5, 40)]], [],
+                       "line 6, column 'stamp': time runs backwards"),
+    "time twice": (lambda f: f.iloc[[0, 1, 2, 2, *range(3, 40)]], [],
+                   "line 5, column 'stamp': time stands still"),
+    "a missing column": (lambda f: f.drop(columns=["base_y"]), [],
+                         r"no columns \['base_y'\]; it has .*'base_x', 'base_z'"),
+    "an empty cell": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7)), [],
+                      "line 9, column 'gyro_x': '' is no number"),
+    "a NaN": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7, np.inf)), [],
+              "line 9, column 'gyro_x': the value is inf"),
+    "a word": (lambda f: f.assign(goal_x=["stop", *f.goal_x[1:]]), [],
+               "line 2, column 'goal_x': 'stop' is no number"),
+    "no unit quaternion": (lambda f: f.assign(quat_x=f.quat_x + (f.index == 4)), [],
+                           "line 6, columns .*norm of 1.4"),
+    "quaternion order": (
+        lambda f: f.rename(columns={"quat_w": "quat_x", "quat_x": "quat_y", "quat_y": "quat_z",
+                                    "quat_z": "quat_w"}), [],
+        "line 2: .*tilted by .*would stand if 'base_orientation.order' is wxyz"),
+    "degrees as radians": (lambda f: f, [('_pos", unit: deg', '_pos", unit: rad')],
+                           "its stops are .*would stand if 'joint_positions.unit' is deg"),
+    "millimetres as metres": (lambda f: f, [("base_z], unit: mm", "base_z], unit: m")],
+                              "above the ground.*'base_position.unit' is mm"),
+    "metres as millimetres": (lambda f: f.assign(base_z=f.base_z / 1e3), [],
+                              "below the ground.*'base_position.unit' is m$"),
+    "milliseconds": (lambda f: f.assign(stamp=f.stamp / 1e6), [("unit: ns", "unit: s")],
+                     r"2.5 apart, .* one of \['ms'\]"),
+    "goal in millimetres": (lambda f: f.assign(goal_z=1e3 * f.goal_z), [],
+                            "desired output is .* m from the base"),
+    "rates in degrees": (lambda f: f.assign(gyro_x=200.0), [("deg, frame", "rad, frame")],
+                         "column 'gyro_x': velocities are 199 "),
+    "a joint beyond its stop": (
+        lambda f: f.assign(**{f"{JOINTS[2]}_pos": f[f"{JOINTS[2]}_pos"] + 200.0 * (f.index == 9)}),
+        [], rf"line 11, column '{JOINTS[2]}_pos': joint .* far beyond its stops"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_what_is_wrong_is_named_with_row_and_column(what, few_rows, tmp_path):
+    spoil, changes, message = SPOILT[what]
+    with pytest.raises(ValueError, match=message):
+        read_csv(spoil(frame_of(few_rows, JOINTS)), tmp_path, *changes)
+
+
+def test_a_quaternion_order_that_turns_the_robot_around_is_told_by_its_sliding_feet(tmp_path):
+    with pytest.raises(ValueError, match=r"line 2 and .* slide by .* 'base_orient.* is xyzw"):
+        read_csv(frame_of(recorded(UNSAFE), JOINTS), tmp_path, ("order: xyzw", "order: wxyz"))
+
+
+def test_messages_that_lack_something_say_what_there_is(few_rows, tmp_path):
+    path = write(few_rows, JOINTS, "mcap", tmp_path)
+    for old, new, message in [
+        ("topic: /goal", "topic: /aim", r"no messages of topics \['/aim'\]; .*'/goal'"),
+        ("point.x", "point.q", "message 0 of topic '/goal': cannot read 'point.q': .*'x', 'y'"),
+        ("position[{joint}]", "position[l_{joint}]", f"no entry is named 'l_{JOINTS[0]}'"),
+        ("position[{joint}]", "position[99]{joint}", "cannot read"),
+        ("position[0]", "position[0", "is no field of a message"),
+        ("{topic: /goal, ", "{", "must name the topic of .*point.x"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            read_log(path, map_of("mcap", tmp_path, (old, new)), ROBOT)
+
+
+@pytest.mark.parametrize("kind", ["parquet", "mcap", "ros1"])
+def test_a_file_that_was_cut_off_is_refused(kind, few_rows, tmp_path):
+    path = write(few_rows, JOINTS, kind, tmp_path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(ValueError, match=r"damaged|cut off"):
+        read_log(path, map_of(kind, tmp_path), ROBOT)
+
+
+def test_a_line_that_was_cut_off_is_refused(few_rows, tmp_path):
+    path = write(few_rows, JOINTS, "csv", tmp_path)
+    path.write_text(path.read_text().rsplit(",", 30)[0])
+    with pytest.raises(ValueError, match=r"line 41, column .* is no number"):
+        read_log(path, map_of("csv", tmp_path), ROBOT)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros2"])
+def test_without_the_extra_it_is_named(kind, few_rows, tmp_path, monkeypatch):
+    path = write(few_rows, JOINTS, kind, tmp_path)
+    found = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.split(".")[0] in ("mcap", "rosbags"):
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name.split(".")[0])
+        return found(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ValueError, match=r"pip install drake_safety\[logs\]"):
+        read_log(path, map_of(kind, tmp_path), ROBOT)
+
+
+def test_what_is_no_log_or_no_table_with_topics_is_refused(few_rows, tmp_path):
+    columns = map_of("csv", tmp_path)
+    for path, message in [
+        (tmp_path / "none.csv", "does not exist"),
+        (tmp_path, "without the metadata.yaml"),
+        (columns, "suffix '.yaml'; known are"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            read_log(path, columns, ROBOT)
+    path = write(few_rows, JOINTS, "csv", tmp_path)
+    with pytest.raises(ValueError, match="has no topics; the map names"):
+        read_log(path, map_of("mcap", tmp_path), ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base_position: {columns: [a, b]}", "must be 3 names"),
+        ("base_position: {columns: [a, b, a]}", "names a column twice"),
+        ("base_position: {columns: [a, b, c], unit: cm}", r"one of \['m', 'mm'\]; got 'cm'"),
+        ("base_orientation: {order: zyxw}", "'order' must be one of"),
+        ("time: {column: t, unit: h}", "'time.unit' must be one of"),
+        ("joint_positions: {template: q_}", "template must hold"),
+        ("joints: {}", "unknown key 'joints'; keys there are"),
+        ("max_gap_s: 1.0", "'base_position.columns' is missing"),
+    ],
+)
+def test_a_map_that_says_nothing_or_nonsense_is_refused(text, message, tmp_path):
+    path = tmp_path / "columns.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_log_map(path)
+
+
+def test_a_map_without_a_column_for_a_joint_names_it(few_rows, tmp_path):
+    joints = f"{{columns: {{{JOINTS[0]}: a, wing: b}}, unit: deg}}"
+    with pytest.raises(ValueError, match=rf"none for \['{JOINTS[1]}'.*no joints \['wing'\]"):
+        read_csv(
+            frame_of(few_rows, JOINTS), tmp_path, ('{template: "{joint}_pos", unit: deg}', joints)
+        )
+
+
+def test_a_field_is_found_by_name_by_number_and_by_the_name_beside_it():
+    class Motors:
+        name = ("a", "b")
+        q = (1.0, 2.0)
+
+    class State:
+        motors = (Motors(), Motors())
+
+    assert field_of("motors[1].q[0]")(State()) == 1.0
+    assert field_of("motors[0].q[b]")(State()) == 2.0
+    with pytest.raises(LookupError, match="no entry is named 'c'; the names are"):
+        field_of("motors[0].q[c]")(State())
+
+
+def test_a_date_column_needs_no_unit(few_rows, tmp_path):
+    frame = frame_of(few_rows, JOINTS)
+    frame["stamp"] = pd.to_datetime(frame["stamp"])
+    frame.to_parquet(tmp_path / "run.parquet")
+    changes = ("unit: ns", "unit: s")
+    log = read_log(tmp_path / "run.parquet", map_of("parquet", tmp_path, changes), ROBOT)
+    np.testing.assert_allclose(log.time_s, few_rows.time_s, atol=1e-12)
+    assert LogMap() == LogMap()
