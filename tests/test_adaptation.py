@@ -230,18 +230,20 @@ def test_the_shift_solves_its_own_equation():
     logit = rng.normal(size=50)
     nominal = rng.random(50) < 0.3
     actual = nominal | (rng.random(50) < 0.3)
-    b = adaptation.fitted_shift(logit, actual, nominal, weight=0.5, prior_std=2.0)
+    weight = adaptation.sample_weights(np.repeat([0, 1], [10, 40]), 3.0)
+    np.testing.assert_allclose([weight[:10].sum(), weight[10:].sum()], 3.0)
+    b = adaptation.fitted_shift(logit, actual, nominal, weight=weight, prior_std=2.0)
     target = sigmoid(logit) + actual.astype(float) - nominal
-    assert 0.5 * (sigmoid(logit + b) - target).sum() + b / 4.0 == pytest.approx(0.0, abs=1e-6)
+    assert weight @ (sigmoid(logit + b) - target) + b / 4.0 == pytest.approx(0.0, abs=1e-6)
     assert b > 0.0
-    mirrored = adaptation.fitted_shift(-logit, ~actual, ~nominal, weight=0.5, prior_std=2.0)
+    mirrored = adaptation.fitted_shift(-logit, ~actual, ~nominal, weight=weight, prior_std=2.0)
     assert mirrored == pytest.approx(-b, abs=1e-6)
 
 
 def test_the_shift_stays_finite_however_large_the_gap():
     logit = np.full(4000, -8.0)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
-    b = adaptation.fitted_shift(logit, every, none, weight=1.0, prior_std=2.0)
+    b = adaptation.fitted_shift(logit, every, none, weight=np.ones(4000), prior_std=2.0)
     assert 8.0 < b < 1e5
     assert np.isfinite(b)
 

@@ -252,9 +252,7 @@ class _Judge:
                 num_orders=num_orders,
                 seed=self._seed,
                 rivals=rivals,
-                progress=lambda stage, done, total, mode=mode: self._stages(
-                    f"{mode}: {stage}", done, total
-                ),
+                progress=self._stages,
             )
         return found
 

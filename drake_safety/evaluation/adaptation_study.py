@@ -75,7 +75,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
     found = {}
     for name, published in PUBLISHED.items():
         unsafe = 1.0 - published(result)
-        rows = {"": slice(None), "k0.": segments.is_first}
+        rows = {"": np.ones(len(segments), dtype=bool), "k0.": segments.is_first}
         found[name] = {
             f"{prefix}{metric}": value
             for prefix, chosen in rows.items()
@@ -155,7 +155,8 @@ def study(
             adapted = assessment.adapt(drawn[:size], method=method)
             found.setdefault(f"adapted.{size}", []).append(scores(adapted, test))
             if progress is not None:
-                progress("orders of feedback", order * len(sizes) + i + 1, total)
+                stage = f"{assessment.parameters.mode}: orders of feedback"
+                progress(stage, order * len(sizes) + i + 1, total)
     figures = {}
     num_test = len(test.episodes)
     for who, orders in found.items():

@@ -205,7 +205,7 @@ class SafetyAssessment:
                 self.base_logit_.of_output(output),
                 segments.is_unsafe,
                 segments.nominal_is_unsafe,
-                weight=settings.samples_per_set * len(feedback) / len(segments),
+                weight=adaptation.sample_weights(segments.set_index, settings.samples_per_set),
                 prior_std=settings.shift_std,
             )
             adapted.shift_ = adaptation.cell_shift(b, segments, points, self.grid_)
@@ -371,7 +371,9 @@ class SafetyAssessment:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one safetensors file, first under a temporary name: it is whole or absent."""
         self._check_fitted()
-        tensors = {f"embedding.{name}": w for name, w in self.embedding_.weights.items()}
+        tensors: dict[str, np.ndarray] = {
+            f"embedding.{name}": w for name, w in self.embedding_.weights.items()
+        }
         tensors |= {
             "beliefs": self.beliefs_,
             "shift": self.shift_,
