@@ -154,16 +154,20 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     np.testing.assert_allclose(unsafe[..., 3:].sum(axis=2), unsafe[..., 1], atol=1e-12)
 
 
-def test_in_the_papers_mode_a_cell_far_from_all_feedback_keeps_its_prior(paper):
-    segments = paper.feedback_segments(worse(2))
-    x = paper._inputs(segments.state, segments.desired_preview, None)
-    points = paper.embedding_.embed(x)
-    adapted = paper.adapt(worse(2))
+def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prior(paper):
+    feedback = worse()[:1]
+    segments = paper.feedback_segments(feedback)
+    points = paper.embedding_.embed(paper._inputs(segments.state, segments.desired_preview, None))[
+        0
+    ]
+    difference = np.abs(segments.score - segments.nominal_score)
+    _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_points_[0])
     cells = paper.grid_.locate(paper.training_points_[0])
-    apart = np.linalg.norm(paper.training_points_[0][:, None] - points[0], axis=2).min(axis=1)
-    # The longest length scale allowed is 40: beyond it the deviation exceeds the gate.
-    far = np.setdiff1d(cells[apart > 40.0], cells[apart <= 40.0])
-    assert far.size > 0
+    far = np.setdiff1d(
+        cells[deviation > 0.3], [*cells[deviation <= 0.3], *paper.grid_.locate(points)]
+    )
+    assert np.any(paper.beliefs_[0, far, UNCERTAINTY] < 1.0)
+    adapted = paper.adapt(feedback)
     np.testing.assert_array_equal(adapted.beliefs_[0, far], paper.beliefs_[0, far])
 
 
@@ -226,18 +230,20 @@ def test_the_shift_solves_its_own_equation():
     logit = rng.normal(size=50)
     nominal = rng.random(50) < 0.3
     actual = nominal | (rng.random(50) < 0.3)
-    b = adaptation.fitted_shift(logit, actual, nominal, weight=0.5, prior_std=2.0)
+    weight = adaptation.sample_weights(np.repeat([0, 1], [10, 40]), 3.0)
+    np.testing.assert_allclose([weight[:10].sum(), weight[10:].sum()], 3.0)
+    b = adaptation.fitted_shift(logit, actual, nominal, weight=weight, prior_std=2.0)
     target = sigmoid(logit) + actual.astype(float) - nominal
-    assert 0.5 * (sigmoid(logit + b) - target).sum() + b / 4.0 == pytest.approx(0.0, abs=1e-6)
+    assert weight @ (sigmoid(logit + b) - target) + b / 4.0 == pytest.approx(0.0, abs=1e-6)
     assert b > 0.0
-    mirrored = adaptation.fitted_shift(-logit, ~actual, ~nominal, weight=0.5, prior_std=2.0)
+    mirrored = adaptation.fitted_shift(-logit, ~actual, ~nominal, weight=weight, prior_std=2.0)
     assert mirrored == pytest.approx(-b, abs=1e-6)
 
 
 def test_the_shift_stays_finite_however_large_the_gap():
     logit = np.full(4000, -8.0)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
-    b = adaptation.fitted_shift(logit, every, none, weight=1.0, prior_std=2.0)
+    b = adaptation.fitted_shift(logit, every, none, weight=np.ones(4000), prior_std=2.0)
     assert 8.0 < b < 1e5
     assert np.isfinite(b)
 
@@ -325,7 +331,7 @@ def test_a_pair_that_diverged_says_nothing():
 
 
 def test_a_twin_that_has_ended_scores_one():
-    (one,) = pairs_with(lambda episode: False, num=1)
+    one = max(pairs_with(lambda episode: False), key=len)
     ended = dataclasses.replace(
         one,
         nominal_is_unsafe=True,

@@ -9,10 +9,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.control.robot import (
+    Payload,
     PlantVariation,
     actuation_matrix,
     add_robot,
     apply_mass_scale,
+    apply_masses,
     model_file,
     models_package_xml,
     posture_positions,
@@ -121,6 +123,41 @@ def test_the_mass_scale_scales_the_whole_mass_matrix(name):
     for _ in range(2):  # A scale replaces the one before; it does not multiply it.
         apply_mass_scale(plant, context, robot, 0.8)
     np.testing.assert_allclose(plant.CalcMassMatrix(context), 0.8 * M, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_a_payload_moves_the_centre_of_mass_by_its_share(name):
+    robot = robot_model(name)
+    plant = plant_of(robot)
+    context = plant.CreateDefaultContext()
+    position = [0.1, -0.02, 0.05]
+    base = plant.GetBodyByName(robot.base)
+    apply_mass_scale(plant, context, robot, 0.8)
+    mass, centre = plant.CalcTotalMass(context), plant.CalcCenterOfMassPositionInWorld(context)
+    p_WP = base.EvalPoseInWorld(context) @ np.array(position)
+    variation = PlantVariation(mass_scale=0.8, payload=Payload(mass_kg=2.0, position_m=position))
+    for _ in range(2):  # It is not put on twice.
+        apply_masses(plant, context, robot, variation)
+    assert plant.CalcTotalMass(context) == pytest.approx(mass + 2.0)
+    np.testing.assert_allclose(
+        plant.CalcCenterOfMassPositionInWorld(context),
+        (mass * centre + 2.0 * p_WP) / (mass + 2.0),
+        atol=1e-12,
+    )
+
+
+def test_a_payload_on_a_body_that_does_not_exist_is_refused():
+    robot = robot_model("biped")
+    plant = plant_of(robot)
+    variation = PlantVariation(payload=Payload(body="rucksack"))
+    with pytest.raises(ValueError, match="has no body 'rucksack'"):
+        apply_masses(plant, plant.CreateDefaultContext(), robot, variation)
+
+
+@pytest.mark.parametrize("wrong", [{"mass_kg": 0.0}, {"position_m": [0.0, 1.0]}])
+def test_a_payload_that_is_none_is_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Payload(**wrong)
 
 
 def test_the_mass_scale_leaves_other_models_alone():

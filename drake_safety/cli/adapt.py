@@ -52,21 +52,27 @@ def adapt(
     orders: Annotated[int, typer.Option(help="Judging: orders of the feedback.", min=1)] = 5,
     oracle: Annotated[
         int,
-        typer.Option(
-            help="Judging: other actual episodes to train a rival from scratch on.", min=0
-        ),
+        typer.Option(help="Judging: other actual episodes to train a rival on.", min=0),
     ] = 0,
     scratch: Annotated[
         bool,
         typer.Option("--scratch", help="Judging: also train from scratch on the feedback itself."),
     ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="Log of a real robot, in place of a simulated variation.", exists=True),
+    ] = None,
+    log_map: Annotated[
+        Path | None, typer.Option("--map", help="What is where in the log, a YAML file.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 2_000_000,
     workers: WorkersOption = None,
 ) -> None:
     """Adapt Γ to what an actual robot does, and judge it before and after.
 
-    Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT. Episodes
-    are kept there: an adaptation that was stopped goes on when it is called again.
+    Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
+    --log it is named after the log. Episodes are kept in ASSESSMENT: an adaptation that was stopped
+    goes on when it is called again.
     """
     from drake_safety.evaluation.adaptation_figure import adaptation_figure
     from drake_safety.evaluation.figure_style import save
@@ -80,9 +86,17 @@ def adapt(
             f"adapt: seeds {used.start} to {used.stop - 1} would be used, and "
             f"{priors[MODES[0]].info_.seed} is the training episodes' own; choose another"
         )
-    folder = adapted_folder(assessment, variation)
+    if (log is None) != (log_map is None):
+        raise ValueError("adapt: --log and --map go together: a log is read by its map")
+    if log is not None and evaluate:
+        raise ValueError("adapt: there is nothing fresh in a log to judge by; leave out --evaluate")
+    name = variation if log is None else log.stem
+    folder = adapted_folder(assessment, name)
     with open_stages() as stages:
-        pairs = _run_pairs(loaded, feedback, variation, seed, assessment, workers, stages)
+        if log is not None and log_map is not None:
+            pairs = _logged_pairs(loaded, log, log_map, seed)
+        else:
+            pairs = _run_pairs(loaded, feedback, variation, seed, assessment, workers, stages)
         sets = pairs.feedback()
         adapted = {}
         for mode, prior in priors.items():
@@ -113,7 +127,8 @@ def adapt(
         "scenario": loaded.name,
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,
-        "variation": variation,
+        "variation": name,
+        "log": None if log is None else str(log),
         "seed": seed,
         "feedback_sets": num_pairs,
         "differing_pairs": differing,
@@ -127,7 +142,7 @@ def adapt(
     }
     file = folder / "adaptation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    console.print(_adaptation_table(adapted, differing, num_pairs, variation))
+    console.print(_adaptation_table(adapted, differing, num_pairs, name))
     for mode, found in studies.items():
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             console.print(_study_table(found, mode, published, variation))
@@ -161,6 +176,16 @@ def _run_pairs(
     )
 
 
+def _logged_pairs(scenario: Scenario, log: Path, log_map: Path, seed: int) -> EpisodePairs:
+    from drake_safety.logs.episodes import cut_log
+    from drake_safety.logs.robot_log import read_log
+    from drake_safety.models import load_robot
+    from drake_safety.simulation.feedback import pair_starts
+
+    actual, starts = cut_log(read_log(log, log_map, load_robot(scenario.robot)), scenario)
+    return pair_starts(scenario, actual, starts, seed=seed)
+
+
 class _Judge:
     """Simulates what the study needs, and conducts it."""
 
@@ -191,7 +216,7 @@ class _Judge:
             progress=partial(self._stages, what),
             extra={"command": command_line()},
         )
-        return episodes[:num_episodes]
+        return episodes
 
     def studies(
         self,
@@ -227,12 +252,9 @@ class _Judge:
                 num_orders=num_orders,
                 seed=self._seed,
                 rivals=rivals,
-                progress=partial(self._report, mode),
+                progress=self._stages,
             )
         return found
-
-    def _report(self, mode: str, stage: str, done: int, total: int) -> None:
-        self._stages(f"{mode}: {stage}", done, total)
 
 
 def _adaptation_table(

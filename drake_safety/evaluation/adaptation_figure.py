@@ -1,4 +1,4 @@
-"""Pictures of adaptation: the map before and after, where plants differ, and what it is worth."""
+"""Pictures of adaptation: the map before and after, the discrepancy, and what feedback is worth."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
     found = {}
     for name, published in PUBLISHED.items():
         unsafe = 1.0 - published(result)
-        rows = {"": np.ones(len(unsafe), dtype=bool), "k0.": segments.is_first}
+        rows = {"": np.ones(len(segments), dtype=bool), "k0.": segments.is_first}
         found[name] = {
             f"{prefix}{metric}": value
             for prefix, chosen in rows.items()
@@ -101,9 +101,9 @@ class AdaptationStudy:
     """What was found of one gap.
 
     Attributes:
-        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N",
-            "scratch.N" or "oracle"; of several orders it is the mean, and the interval their
-            least and largest.
+        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N" or a
+            rival's name; of several orders it is the mean, and the interval their least and
+            largest.
         sizes: The N.
         num_orders: In how many orders the feedback came.
     """
@@ -155,7 +155,8 @@ def study(
             adapted = assessment.adapt(drawn[:size], method=method)
             found.setdefault(f"adapted.{size}", []).append(scores(adapted, test))
             if progress is not None:
-                progress("orders of feedback", order * len(sizes) + i + 1, total)
+                stage = f"{assessment.parameters.mode}: orders of feedback"
+                progress(stage, order * len(sizes) + i + 1, total)
     figures = {}
     num_test = len(test.episodes)
     for who, orders in found.items():

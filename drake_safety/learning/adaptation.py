@@ -171,12 +171,25 @@ def combined(prior: np.ndarray, feedback: np.ndarray) -> np.ndarray:
     return np.where(has_feedback[:, None], both, prior)
 
 
+def sample_weights(set_index: np.ndarray, samples_per_set: float) -> np.ndarray:
+    """Independent samples that each segment counts for, (M,): as many in all for every set.
+
+    An unsafe end comes early, and leaves few segments: counted alike, segments would say less of
+    it than of a safe one.
+
+    Args:
+        set_index: Which feedback set each segment is of, (M,).
+        samples_per_set: What the segments of a set count for together.
+    """
+    return samples_per_set / np.bincount(set_index)[set_index]
+
+
 def fitted_shift(
     logit: np.ndarray,
     is_unsafe: np.ndarray,
     nominal_is_unsafe: np.ndarray,
     *,
-    weight: float,
+    weight: np.ndarray,
     prior_std: float,
 ) -> float:
     """The one number b that makes sigma(L + b) fit what the feedback says.
@@ -188,7 +201,7 @@ def fitted_shift(
         logit: L of each segment, (M,).
         is_unsafe: Whether the actual episode ended unsafely, (M,).
         nominal_is_unsafe: Whether the twin did, (M,).
-        weight: Independent samples that a segment counts for.
+        weight: Independent samples that each segment counts for, (M,).
         prior_std: Standard deviation of b before any feedback.
     """
     difference = is_unsafe.astype(float) - nominal_is_unsafe.astype(float)
@@ -200,10 +213,10 @@ def fitted_shift(
     target = expit(logit) + difference
 
     def slope(b: float) -> float:
-        return float(weight * (expit(logit + b) - target).sum() + b / prior_std**2)
+        return float(weight @ (expit(logit + b) - target) + b / prior_std**2)
 
     # The slope of the negative log posterior rises throughout; out there it has the sign of b.
-    bound = 2.0 * weight * len(logit) * prior_std**2
+    bound = 2.0 * float(weight.sum()) * prior_std**2
     return float(brentq(slope, -bound, bound, xtol=1e-10))
 
 

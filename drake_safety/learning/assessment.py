@@ -211,7 +211,7 @@ class SafetyAssessment:
                 self.base_logit_.of_output(output),
                 segments.is_unsafe,
                 segments.nominal_is_unsafe,
-                weight=settings.samples_per_set * len(feedback) / len(segments),
+                weight=adaptation.sample_weights(segments.set_index, settings.samples_per_set),
                 prior_std=settings.shift_std,
             )
             adapted.shift_ = adaptation.cell_shift(b, segments, points, self.grid_)

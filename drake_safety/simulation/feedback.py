@@ -141,9 +141,7 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
     times = loop.scenario.step_s * np.arange(len(plan))
     q, v = np.split(window.plant_state, [loop.plant.num_positions(loop.robot_instance)])
-    return EpisodeStart(
-        q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T, True)
-    )
+    return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
 
 
 def run_twins(
@@ -184,6 +182,28 @@ def run_twins(
     finally:
         results.close()
     return Episodes(info, sorted(twins, key=lambda episode: episode.index))
+
+
+def pair_starts(
+    scenario: Scenario, actual: Episodes, starts: Sequence[EpisodeStart], *, seed: int = 0
+) -> EpisodePairs:
+    """Simulates, in this process, the nominal twins of episodes whose starts are known.
+
+    Args:
+        scenario: The scenario.
+        actual: Episodes of an actual robot, such as those of a log.
+        starts: What each begins with.
+        seed: Of the noise.
+
+    Raises:
+        ValueError: The task cannot begin with a given start.
+    """
+    loop = scenario.make_loop(_TWINS)
+    twins = [
+        run_episode(loop, episode.index, seed=seed, start=start)
+        for episode, start in zip(actual, starts, strict=True)
+    ]
+    return EpisodePairs(actual=actual, nominal=Episodes(episodes_info(loop, seed), twins))
 
 
 def _twin_batch(scenario: Scenario, seed: int, windows: list[RecordedWindow]) -> list[Episode]:
