@@ -159,7 +159,8 @@ def map_views(
             return None
         colour = np.array(to_rgb(palette[int(np.argmax(cell["causes"]))]))
         # White where nothing is unsafe, the cause's own colour where all that is known is.
-        return to_hex(0.97 * (1.0 - (1.0 - safe_share(cell)) * (1.0 - colour)))
+        red, green, blue = 0.97 * (1.0 - (1.0 - safe_share(cell)) * (1.0 - colour))
+        return to_hex((red, green, blue))
 
     return {
         "safe": {
@@ -216,8 +217,9 @@ def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Fig
         fig = new_figure(7.0, 6.0)
         axes = fig.subplots()
         axes.set_facecolor("#f1f2f4")
-        shade = ScalarMappable(Normalize(0.0, 1.0), _ramp(SAFETY_STOPS))
-        axes.pcolormesh(shares, cmap=shade.cmap, norm=shade.norm, edgecolors="white", linewidth=0.8)
+        norm, ramp = Normalize(0.0, 1.0), _ramp(SAFETY_STOPS)
+        shade = ScalarMappable(norm, ramp)
+        axes.pcolormesh(shares, cmap=ramp, norm=norm, edgecolors="white", linewidth=0.8)
         for cell in cells:
             if cell["count"]:
                 is_pale = _is_empty(cell) or 0.25 < safe_share(cell) < 0.75
