@@ -191,7 +191,8 @@ def _mark_changes(
         here = cells == cell
         lines.append(
             f"{number}: {before[cell]:.2f} → {after[cell]:.2f}; unsafe "
-            f"{segments.is_unsafe[here].sum()} of {here.sum()} segments, twins {segments.nominal_is_unsafe[here].sum()}"
+            f"{segments.is_unsafe[here].sum()} of {here.sum()} segments, "
+            f"twins {segments.nominal_is_unsafe[here].sum()}"
         )
     axes.set_xlabel("\n".join(lines) or "nothing changed", fontsize=7.5, color=INK)
 
