@@ -19,7 +19,7 @@ from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.physics import Scene, add_physics
+from drake_safety.simulation.physics import ENGINES_WITH_BALLS, Scene, add_physics
 from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
@@ -248,6 +248,13 @@ class Balancing(ClosedLoop):
             MeshcatVisualizer.AddToBuilder(builder, physics.scene_graph, meshcat)
         self.finish(builder)
         self._default = self.CreateDefaultContext()
+
+    @classmethod
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, bool]:
+        """Without a ball on either side where the variation's engine has none."""
+        if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
+            return {}
+        return {"ball": False}
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
