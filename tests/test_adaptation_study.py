@@ -94,7 +94,7 @@ def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, j
     assert "segments, twins" in said
     found = study(assessment, worse(), judged, sizes=(10, 40), num_orders=2)
     curves = study_figure({"sharpened": found}, published="calibrated").axes
-    assert [axes.get_title(loc="left") for axes in curves][0] == "Brier score"
+    assert curves[0].get_title(loc="left") == "Brier score"
     (line,) = curves[0].lines
     np.testing.assert_array_equal(line.get_xdata(), [0, 10, 40])
     assert line.get_ydata()[0] == found.figures["prior.calibrated.brier"].value
