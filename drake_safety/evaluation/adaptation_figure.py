@@ -189,10 +189,10 @@ def _mark_changes(
             fontsize=8,
         )
         here = cells == cell
+        unsafe, twins = segments.is_unsafe[here].sum(), segments.nominal_is_unsafe[here].sum()
         lines.append(
-            f"{number}: {before[cell]:.2f} → {after[cell]:.2f}; unsafe "
-            f"{segments.is_unsafe[here].sum()} of {here.sum()} segments, "
-            f"twins {segments.nominal_is_unsafe[here].sum()}"
+            f"{number}: {before[cell]:.2f} → {after[cell]:.2f}; unsafe {unsafe} of {here.sum()} "
+            f"segments, twins {twins}"
         )
     axes.set_xlabel("\n".join(lines) or "nothing changed", fontsize=7.5, color=INK)
 
