@@ -211,6 +211,8 @@ class Balancing(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
         self.fall_name = safe_set.fall_name
+        self.watched_features = safe_set.watched_features
+        self._rate_features = safe_set.rate_features
         if assessment is not None:
             self.check_assessment()
             assessor = builder.AddNamedSystem(
@@ -260,6 +262,11 @@ class Balancing(ClosedLoop):
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
+
+    @property
+    def rate_names(self) -> list[str]:
+        """Velocities of the state, and the features that they enter."""
+        return [*super().rate_names, *self._rate_features]
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin as a ball hits."""

@@ -13,6 +13,7 @@ import typer
 from rich.logging import RichHandler
 
 from drake_safety.cli import (
+    ablate,
     adapt,
     ask,
     calibrate,
@@ -36,6 +37,7 @@ _COMMANDS = (
     evaluate.evaluate,
     plan_study.plan_study,
     adapt.adapt,
+    ablate.ablate,
     report.report,
 )
 

@@ -14,6 +14,7 @@ from rich.table import Table
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
 from drake_safety.cli.evaluate_calibration import evaluate_calibration
+from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
 from drake_safety.cli.evaluate_plans import (
     PlanOptions,
     check_options,
@@ -76,6 +77,14 @@ def evaluate(
         float,
         typer.Option(help="Targets: spacing of those simulated on it [m]; 0 leaves it out.", min=0),
     ] = 0.1,
+    pushes: Annotated[
+        int,
+        typer.Option(
+            help="Targets: motions on whose way the actual robot is pushed, to see who notices; "
+            "as many more for thresholds.",
+            min=0,
+        ),
+    ] = 0,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
@@ -86,6 +95,8 @@ def evaluate(
 
     Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
     kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
+    With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
+    watch instead.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
@@ -101,6 +112,15 @@ def evaluate(
         throws = 0 if has_goals else _DEFAULT_THROWS
     if throws and not hasattr(loaded.parameters, "recovery"):
         raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
+    if pushes:
+        if not has_goals:
+            raise ValueError(
+                f"evaluate: plans of {loaded.task} have no goal to be pushed on the way to: leave "
+                "out --pushes; balls that are thrown are watched, too"
+            )
+        # Either says so if there is none.
+        loop.sample_push(np.random.default_rng(0))
+        loaded.variation("actual")
     options = PlanOptions(
         other_hand=other_hand,
         learning_curve=parse_sizes(learning_curve),
@@ -173,6 +193,10 @@ def evaluate(
         findings.add(evaluate_calibration(judged))
         if throws:
             findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
+        if pushes:
+            findings.add(
+                evaluate_pushes(judged, pushes, pushes, seed=seed + 1, calibration_seed=seed + 2)
+            )
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -222,6 +246,7 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
     """Everyone as a trigger of recovery."""
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
+    from drake_safety.simulation.pushed_motions import WatchedMotion
 
     recovery = judged.scenario.parameters.recovery
     rules = trigger_rules(
@@ -243,11 +268,19 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
     )
     figures = dict(study.figures)
     figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
-    return Findings(
+    findings = Findings(
         figures=figures,
         pictures=save(_throws_picture(study), judged.folder / "throws"),
         tables=[_throws_table(figures, [rule.name for rule in rules])],
     )
+    findings.add(
+        evaluate_monitoring(
+            judged,
+            [WatchedMotion.of_throw(log) for log in study.calibration_logs],
+            [WatchedMotion.of_throw(log) for log in study.logs],
+        )
+    )
+    return findings
 
 
 def _throws_picture(study: ThrowStudy) -> Picture:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from drake_safety.control.observation import is_rate
 from drake_safety.simulation.view import View
 
 if TYPE_CHECKING:
@@ -45,8 +46,9 @@ class ClosedLoop(Diagram):
     in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, and it
     overrides :meth:`goal_of` and :meth:`reset_standing`; :attr:`fair_box`, :meth:`is_fair`,
     :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets`, :attr:`pushes` and, with them,
-    :meth:`set_push` where they say something of it. A subclass wires its systems in
-    ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
+    :meth:`set_push` and :meth:`sample_push` where they say something of it. A subclass wires its
+    systems in ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with
+    :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -100,6 +102,8 @@ class ClosedLoop(Diagram):
     """Goals that can be asked for by name, in the world, (3,) [m] each."""
     pushes: Mapping[str, Push] = {}
     """Pushes that a run can be disturbed with, by name."""
+    watched_features: Mapping[str, str] = {}
+    """Features that one would set an alarm on by hand, by what they measure; larger is safer."""
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
@@ -279,6 +283,19 @@ class ClosedLoop(Diagram):
             push: Where, how hard, when.
         """
         raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
+
+    def sample_push(self, rng: np.random.Generator) -> Push:
+        """A random push on the robot; tasks with pushes override this.
+
+        Args:
+            rng: Source of every draw.
+        """
+        raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that are made of velocities; tasks may name more."""
+        return [name for name in self.state_names if is_rate(name)]
 
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
