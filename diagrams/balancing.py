@@ -320,6 +320,16 @@ class Balancing(ClosedLoop):
             foot_positions=self._controller.foot_positions(controller_context).copy(),
         )
 
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the standing posture, which the plan keeps."""
+        kinematics = self.kinematics
+        base = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
+        return EpisodeStart(
+            q=kinematics.standing_positions(),
+            v=np.zeros(kinematics.num_velocities),
+            plan=PiecewisePolynomial(base[:, None]),
+        )
+
     def _set(self, context: Context, rng: np.random.Generator, start: Start) -> None:
         joints = np.clip(start.joints, *self.kinematics.position_limits.T)
         q = self.kinematics.positions_at(start.X_WB, joints)

@@ -486,6 +486,15 @@ class Reaching(ClosedLoop):
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
         return EpisodeStart(q=q, v=v, plan=plan)
 
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the standing posture, the hand where it is."""
+        q = self.kinematics.standing_positions()
+        hand = self._controller.model.reaching_position(q).copy()
+        # The plan is told from the feet.
+        hand[:2] += self.kinematics.nominal_base_offset
+        v = np.zeros(self.kinematics.num_velocities)
+        return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(hand[:, None]))
+
     def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
         sampling = self.scenario.parameters.start
         kinematics = self.kinematics

@@ -17,7 +17,9 @@ from drake_safety.cli import (
     adapt,
     ask,
     calibrate,
+    check,
     evaluate,
+    new,
     plan_study,
     report,
     run,
@@ -30,6 +32,8 @@ from drake_safety.cli.targets import TargetCommand
 # In the order in which the help lists them.
 _COMMANDS = (
     scenarios.scenarios,
+    new.new,
+    check.check,
     train.train,
     calibrate.calibrate,
     ask.ask,

@@ -21,6 +21,7 @@ from drake_safety.cli.evaluate_plans import (
     evaluate_plans,
     parse_sizes,
 )
+from drake_safety.cli.evaluate_truth import evaluate_truth
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
@@ -47,7 +48,7 @@ def evaluate(
     throws: Annotated[
         int | None,
         typer.Option(
-            help="Fresh balls at the actual plant; 600 by default, none where plans have a goal.",
+            help="Fresh balls at the actual plant; 600 by default, none where nothing recovers.",
             min=0,
         ),
     ] = None,
@@ -85,6 +86,12 @@ def evaluate(
             min=0,
         ),
     ] = 0,
+    truth_resolution: Annotated[
+        int,
+        typer.Option(
+            help="State planes: starts simulated along either axis; 0 leaves them out.", min=0
+        ),
+    ] = 41,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
@@ -97,6 +104,7 @@ def evaluate(
     kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
     With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
     watch instead.
+    Where a task has state planes, Γ is drawn beside the truth, simulated from every start.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
@@ -108,9 +116,10 @@ def evaluate(
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
     has_goals = loop.target_box is not None
+    has_recovery = hasattr(loaded.parameters, "recovery")
     if throws is None:
-        throws = 0 if has_goals else _DEFAULT_THROWS
-    if throws and not hasattr(loaded.parameters, "recovery"):
+        throws = _DEFAULT_THROWS if has_recovery and not has_goals else 0
+    if throws and not has_recovery:
         raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
     if pushes:
         if not has_goals:
@@ -197,6 +206,8 @@ def evaluate(
             findings.add(
                 evaluate_pushes(judged, pushes, pushes, seed=seed + 1, calibration_seed=seed + 2)
             )
+        if loop.state_planes and truth_resolution:
+            findings.add(evaluate_truth(judged, list(loop.state_planes), truth_resolution))
     report = {
         "command": command_line(),
         "scenario": loaded.name,

@@ -10,6 +10,12 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_safety.control.observation import is_rate
+from drake_safety.simulation.contract import (
+    ASSESSMENT_PORTS,
+    RECORDED_PORTS,
+    REQUIRED_PORTS,
+    check_ports,
+)
 from drake_safety.simulation.view import View
 
 if TYPE_CHECKING:
@@ -19,21 +25,9 @@ if TYPE_CHECKING:
     from drake_safety.simulation.episode_start import EpisodeStart
     from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.state_plane import StatePlane
 
-RECORDED_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
-"""Output ports that an episode records, row by row."""
-REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
-"""Output ports that every task exports."""
-ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-"""Output ports that a task exports besides when it has an assessment."""
+__all__ = ["ASSESSMENT_PORTS", "RECORDED_PORTS", "REQUIRED_PORTS", "ClosedLoop"]
 
 
 class ClosedLoop(Diagram):
@@ -113,19 +107,15 @@ class ClosedLoop(Diagram):
         self.assessment = assessment
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks that it keeps the contract.
+        """Builds the diagram and checks that its ports keep the contract.
 
         Raises:
-            ValueError: A promised port is missing.
+            ValueError: A promised port is missing, or has another size than its names promise.
         """
         builder.BuildInto(self)
-        ports = [self.get_output_port(i).get_name() for i in range(self.num_output_ports())]
-        required = REQUIRED_PORTS + (ASSESSMENT_PORTS if self.assessment else ())
-        missing = [name for name in required if name not in ports]
-        if missing:
-            raise ValueError(
-                f"task '{type(self).__name__}' exports no port {missing}; it exports {ports}"
-            )
+        for finding in check_ports(self):
+            if not finding.is_ok:
+                raise ValueError(finding.message)
 
     def check_assessment(self) -> None:
         """Refuses an assessment that was learned from something else.
@@ -171,6 +161,14 @@ class ClosedLoop(Diagram):
     @property
     def mirror_options(self) -> dict[str, Any]:
         """Options of the diagram that is this one in the mirror; empty where there is none."""
+        return {}
+
+    @property
+    def state_planes(self) -> Mapping[str, StatePlane]:
+        """Planes of starts on which the true safe set can be simulated, by name of the plan.
+
+        Empty for tasks whose state is more than two numbers that matter.
+        """
         return {}
 
     def goal_of(self, episode: Episode) -> np.ndarray:
@@ -260,6 +258,10 @@ class ClosedLoop(Diagram):
             context: The diagram's Context.
         """
         raise ValueError(f"task '{type(self).__name__}' cannot begin with a given start")
+
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the robot's posture, which the plan keeps; tasks with robots override it."""
+        raise ValueError(f"task '{type(self).__name__}' has no posture to stand in")
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
