@@ -128,7 +128,7 @@ def ablate(
             base,
             sets,
             file,
-            version=entries["versions"]["drake_safety"],
+            version=versions()["drake_safety"],
             num_workers=workers,
             progress=partial(stages, "variants"),
         )

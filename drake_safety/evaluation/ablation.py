@@ -262,9 +262,9 @@ def unsafe_scores(
         info = episodes.info
         states = _kept(info.state_names, variant.without)
         features = _kept(info.feature_names, variant.without)
-        seen = segments.state if parameters.is_sharpened else segments.true_state
+        state = segments.state if parameters.is_sharpened else segments.true_state
         result = assessment.predict(
-            seen[:, states],
+            state[:, states],
             segments.desired_preview[:, : parameters.horizon * len(info.output_names)],
             segments.features[:, features] if assessment.uses_features else None,
         )
