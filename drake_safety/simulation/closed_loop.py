@@ -201,6 +201,17 @@ class ClosedLoop(Diagram):
         return 0
 
     @classmethod
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """What the scenario file says of the task's parameters, with defaults that it asks for.
+
+        Args:
+            robot: The scenario's robot.
+            stated: What stands in the file.
+        """
+        del robot
+        return stated
+
+    @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that decide what the plant is; part of its hash."""
         del scenario
