@@ -88,6 +88,13 @@ def test_a_file_that_needs_no_change_is_said_to_be_the_same():
     assert not is_changed
 
 
+def test_a_fixed_joint_mimics_nothing():
+    mimic = '<mimic joint="hip"/>'
+    text = URDF.replace('<origin xyz="0 0 -0.5"/>', f'<origin xyz="0 0 -0.5"/>{mimic}')
+    adapted, is_changed = adapted_urdf(text, keep_collisions=True, convert=lambda name, rgba: name)
+    assert is_changed and "mimic" not in adapted
+
+
 def test_stated_shapes_and_contact_points_are_all_that_collides(tmp_path):
     plant, scene_graph, _ = built(write(tmp_path))
     inspector = scene_graph.model_inspector()

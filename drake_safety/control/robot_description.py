@@ -36,7 +36,7 @@ _SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.
 def adapted_urdf(
     text: str, *, keep_collisions: bool, convert: Callable[[str, str], str]
 ) -> tuple[str, bool]:
-    """A URDF whose geometry Drake can take.
+    """A URDF that Drake can take: its geometry, and no fixed joint that mimics another.
 
     Args:
         text: The URDF.
@@ -70,6 +70,11 @@ def adapted_urdf(
             mesh.set("filename", converted)
             if material is not None and converted.endswith(".gltf"):
                 visual.remove(material)  # The mesh has its own, or this colour by now.
+    for joint in root.findall("joint"):
+        for mimic in joint.findall("mimic"):
+            if joint.get("type") == "fixed":
+                joint.remove(mimic)
+                is_changed = True
     return ElementTree.tostring(root, encoding="unicode"), is_changed
 
 
@@ -101,11 +106,12 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
     add_to_package_map(parser.package_map(), robot.urdf)
     path = model_file(robot.urdf, robot.source_dir)
     text, is_changed = "", False
-    if plant.geometry_source_is_registered() and path.suffix == ".urdf":
+    if path.suffix == ".urdf":
+        has_geometry = plant.geometry_source_is_registered()
         text, is_changed = adapted_urdf(
             path.read_text(encoding="utf-8"),
             keep_collisions=robot.collision == "model_file",
-            convert=lambda name, rgba: _shown(name, rgba, path.parent),
+            convert=lambda name, rgba: _shown(name, rgba, path.parent) if has_geometry else name,
         )
     with _quiet_about(robot):
         if is_changed:
