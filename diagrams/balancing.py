@@ -20,7 +20,7 @@ from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.physics import Scene, add_physics
+from drake_safety.simulation.physics import ENGINES_WITH_BALLS, Scene, add_physics
 from drake_safety.simulation.robot_size import RobotSize, overlaid, scaled_defaults
 from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
 from drake_safety.simulation.scenario import Scenario
@@ -296,6 +296,13 @@ class Balancing(ClosedLoop):
             return stated
         factors = RobotSize.of(RobotKinematics(load_robot(robot))).factors(_DEFAULT_SIZE)
         return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)
+
+    @classmethod
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, bool]:
+        """Without a ball on either side where the variation's engine has none."""
+        if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
+            return {}
+        return {"ball": False}
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:

@@ -518,6 +518,8 @@ class Reaching(ClosedLoop):
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
             raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
+        q = q.copy()
+        q[6] -= self.scenario.parameters.start.sink_m
         stance_pose = fit_stance(
             self.kinematics.contact_positions(q), self.kinematics.nominal_contacts
         )

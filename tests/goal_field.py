@@ -51,4 +51,5 @@ class FieldAssessment:
             cause_probability=np.column_stack([0.2 * unsafe, 0.8 * unsafe]),
             predicted_margins=np.column_stack([gamma - 0.5, np.full(n, 0.02)]),
             unsafe_logit=np.zeros(n),
+            calibrated=gamma,
         )

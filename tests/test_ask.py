@@ -238,7 +238,7 @@ def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothin
     code, told = call("run", SCENARIO, *options, "--force")
     assert code == 0
     written = {path.name for path in (folder / "run").iterdir()}
-    assert written == {"recording.html", "timeline.png", "timeline.svg"}
+    assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
     assert "standing, inside the safe set throughout" in told
 
 

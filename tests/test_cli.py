@@ -260,7 +260,7 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
     shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
     assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
     assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
-    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
+    for name in ("default plan", "chosen by Γ", "best in hindsight"):
         assert name in printed
     assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
     assert "0 is the training episodes' own seed" in capsys.readouterr().out

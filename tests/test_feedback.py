@@ -96,3 +96,12 @@ def test_the_plan_of_a_window_goes_through_what_was_desired(kept):
     for row, time_s in enumerate(episode.time_s[:-1]):
         np.testing.assert_allclose(start.plan.value(time_s).ravel(), preview[row, 0], atol=1e-12)
     np.testing.assert_array_equal(start.q, plant_state[:19])
+
+
+def test_pairs_with_an_engine_without_balls_begin_alike_and_are_the_scenarios_own():
+    scenario = load_scenario("laikago_balancing")
+    scenario.episode_duration_s = 0.48
+    pairs = run_pairs(scenario, 3, variation="mujoco", seed=7, num_workers=1)
+    # Refuses what begins elsewhere.
+    assert {one.nominal_hash for one in pairs.feedback()} == {scenario.simulation_hash()}
+    assert pairs.actual.info.scenario_hash != pairs.nominal.info.scenario_hash

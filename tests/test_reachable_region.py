@@ -57,7 +57,7 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
     inputs = (
         loop.GetOutputPort(name).Eval(context) for name in ("state", "desired_preview", "features")
     )
-    expected = assessment.predict_one(*inputs).normalized
+    expected = assessment.predict_one(*inputs).calibrated
     assert region.safety_probability[row, column] == pytest.approx(expected, abs=1e-6)
 
 

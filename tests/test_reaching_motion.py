@@ -229,3 +229,28 @@ def test_the_hash_follows_what_can_be_touched_and_not_what_is_only_to_be_seen(tm
         )
         hashes.add(own.simulation_hash())
     assert len(hashes) == 2
+
+
+def test_feet_that_begin_loaded_stay_flat_from_the_first_step():
+    loop = atlas()
+    fastest = []
+    for sink_m in (0.0, loop.scenario.parameters.start.sink_m):
+        context = started(loop, 1)
+        plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+        q = positions(loop, context).copy()
+        q[6] += loop.scenario.parameters.start.sink_m - sink_m
+        loop.plant.SetPositions(plant_context, loop.robot_instance, q)
+        Simulator(loop, context).AdvanceTo(0.002)
+        fastest.append(np.abs(loop.plant.GetVelocities(plant_context, loop.robot_instance)).max())
+    unloaded, loaded = fastest
+    assert unloaded > 10.0  # rad/s, of an ankle.
+    assert loaded < 2.0
+
+
+def test_a_preview_across_the_body_reaches_its_plan():
+    loop = atlas()
+    miss = loop.feature_names.index("preview_last_miss")
+    context = loop.CreateDefaultContext()
+    for goal in ([0.47, -0.27, 1.12], [0.49, -0.24, 1.22], [0.54, -0.26, 1.12]):
+        loop.reset_standing(context, np.array(goal))
+        assert evaluated(loop, context, "features")[miss] < 0.02

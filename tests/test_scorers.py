@@ -19,11 +19,17 @@ class StandIn:
 
     def __init__(self, uses_features):
         self.uses_features = uses_features
-        self.parameters = SimpleNamespace(is_sharpened=uses_features)
+        self.parameters = SimpleNamespace(is_sharpened=uses_features, initial_uncertainty=0.3)
 
     def predict(self, state, desired_preview, features):
         assert (features is not None) == self.uses_features
-        return SimpleNamespace(safety_probability=state[:, 0], normalized=2.0 * state[:, 0])
+        unknown = np.where(np.arange(len(state)) % 2, 0.9, 0.3)
+        return SimpleNamespace(
+            safety_probability=state[:, 0],
+            normalized=2.0 * state[:, 0],
+            calibrated=3.0 * state[:, 0],
+            belief=np.stack([0.0 * unknown, 1.0 - unknown, unknown], axis=1),
+        )
 
 
 def test_the_unsafe_score_is_what_the_probability_of_safety_leaves(episodes):
@@ -37,11 +43,11 @@ def test_the_unsafe_score_is_what_the_probability_of_safety_leaves(episodes):
 
 
 @pytest.mark.parametrize("uses_features", [True, False])
-def test_gamma_scores_literally_or_normalised_on_what_its_mode_sees(episodes, uses_features):
+def test_gamma_scores_by_any_of_its_forms_on_what_its_mode_sees(episodes, uses_features):
     segments = split(episodes, stride=1, discount=1.0)
-    literal, normalised = (
-        assessment_scorer("gamma", StandIn(uses_features), is_normalized=is_normalized)
-        for is_normalized in (False, True)
+    literal, normalised, calibrated = (
+        assessment_scorer("gamma", StandIn(uses_features), published)
+        for published in ("safety_probability", "normalized", "calibrated")
     )
     # The paper's mode has no noise in its data.
     assert literal.uses_true_state is not uses_features
@@ -49,6 +55,10 @@ def test_gamma_scores_literally_or_normalised_on_what_its_mode_sees(episodes, us
     np.testing.assert_array_equal(
         2.0 * literal.probability(*inputs), normalised.probability(*inputs)
     )
+    # What is not known is not taken for safe.
+    expected = 3.0 * literal.probability(*inputs)
+    expected[1::2] = 0.0
+    np.testing.assert_array_equal(calibrated.probability(*inputs), expected)
 
 
 def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(episodes):

@@ -215,6 +215,7 @@ class _Judge:
             path=feedback_folder(self._folder, scenario_hash, seed) / self._variation,
             progress=partial(self._stages, what),
             extra={"command": command_line()},
+            **self._scenario.task_class().pairing_options(self._scenario, self._variation),
         )
         return episodes
 

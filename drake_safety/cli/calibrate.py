@@ -93,7 +93,7 @@ def calibrate(
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}
     for mode, gamma in learned.items():
-        score = assessment_scorer(mode, gamma, is_normalized=True).unsafe_score(segments)
+        score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
         for kind in KINDS:
             of_episodes, is_unsafe = episode_scores(segments, score, kind)
             one = choose(

@@ -201,8 +201,8 @@ def _evaluate_segments(judged: Judged) -> Findings:
     from drake_safety.evaluation.scorers import assessment_scorer
 
     scorers = [
-        assessment_scorer("sharpened", judged.sharpened, is_normalized=True),
-        assessment_scorer("paper", judged.paper, is_normalized=True),
+        assessment_scorer("sharpened", judged.sharpened, "calibrated"),
+        assessment_scorer("paper", judged.paper, "calibrated"),
         *judged.classifiers,
     ]
     figures, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)

@@ -46,7 +46,7 @@ def evaluate_calibration(judged: Judged) -> Findings:
         title="Stored calibrations on fresh episodes [%]",
     )
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
-        score = assessment_scorer(mode, gamma, is_normalized=True).unsafe_score(segments)
+        score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
         expected, is_unsafe = episode_scores(segments, score, PLAN)
         curves[mode] = reliability(expected, is_unsafe)
 

@@ -175,9 +175,7 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     from drake_safety.evaluation.scorers import assessment_scorer
 
     rules = [
-        scorer_rule(
-            assessment_scorer(mode, gamma, is_normalized=True), gamma.calibrations_.get("plan")
-        )
+        scorer_rule(assessment_scorer(mode, gamma, "calibrated"), gamma.calibrations_.get("plan"))
         for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items()
     ]
     rules += [

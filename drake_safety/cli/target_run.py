@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.pushes import Push
 
 _MOTION_PORTS = (
-    "normalized_safety_probability",
+    "calibrated_safety_probability",
     "belief",
     "cause_probability",
     "predicted_margins",
@@ -114,7 +114,7 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
     """The first row in which Γ, accepted at the start, is below the threshold; None for never."""
-    is_below = ~(motion.extra["normalized_safety_probability"][:, 0] >= threshold)
+    is_below = ~(motion.extra["calibrated_safety_probability"][:, 0] >= threshold)
     return int(np.argmax(is_below)) if is_below.any() and not is_below[0] else None
 
 
@@ -140,7 +140,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     alarm = alarm_row(motion, threshold)
     return timeline_figure(
         motion.time_s,
-        motion.extra["normalized_safety_probability"][:, 0],
+        motion.extra["calibrated_safety_probability"][:, 0],
         threshold,
         pushes=[] if motion.push is None else [motion.push],
         trigger_times_s=[] if alarm is None else [float(motion.time_s[alarm])],
@@ -165,7 +165,7 @@ def table_of_motion(
         motion: What came of it, with Γ and what it expects.
         threshold: From which Γ on a goal is accepted.
     """
-    gamma = motion.extra["normalized_safety_probability"][:, 0]
+    gamma = motion.extra["calibrated_safety_probability"][:, 0]
     events = [(0.0, f"the {loop.hand} hand sets out")]
     if motion.push is not None:
         push = motion.push

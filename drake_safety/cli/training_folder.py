@@ -14,7 +14,7 @@ class GoalThreshold(NamedTuple):
     """What a verdict on a goal is read from.
 
     Attributes:
-        threshold: From which Γ = b_safe / (1 - μ) on it is accepted.
+        threshold: From which Γ, calibrated, on it is accepted.
         unsafe_below: Below which it is unsafe; between the two the answer is "don't know".
         remark: Where they come from, if that is worth saying.
     """

@@ -14,7 +14,9 @@ from drake_safety.control.whole_body_model import Hand, PointReference, WholeBod
 from drake_safety.control.whole_body_qp import task_errors
 
 _FOOT_WEIGHT = 1e4  # Against task weights of at most some hundreds: feet move by micrometres.
-_LAST_ITERATIONS = 3
+_MAX_ITERATIONS = 4
+_LAST_ITERATIONS = (3, 6)  # At least, at most.
+_NEAR_M = 0.005  # Of the plan: near enough for the sample.
 
 
 class KinematicPreview:
@@ -25,7 +27,8 @@ class KinematicPreview:
 
         Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²,  feet still,
 
-    which are found here by a Gauss-Newton step a sample, a few at the last one.
+    which are found here by Gauss-Newton steps: one a sample, more where the hand is still off the
+    plan, and a few at the last one.
 
     Args:
         model: Tasks and weights of the controller, with a hand.
@@ -61,7 +64,10 @@ class KinematicPreview:
         positions = np.empty((len(path), len(q)))
         for sample, point in enumerate(path):
             reference.reaching = PointReference(position=point)
-            for _ in range(_LAST_ITERATIONS if sample == len(path) - 1 else 1):
+            least, most = _LAST_ITERATIONS if sample == len(path) - 1 else (1, _MAX_ITERATIONS)
+            for iteration in range(most):
+                if iteration >= least and self._is_near(q, point):
+                    break
                 reached, J_feet = kinematics.contact_positions_and_jacobian(q)
                 J, error = task_errors(model, q, reference)
                 weighted = model.task_weights * J
@@ -76,6 +82,10 @@ class KinematicPreview:
                 q[:4] /= np.linalg.norm(q[:4])
             positions[sample] = q
         return positions
+
+    def _is_near(self, q: np.ndarray, point: np.ndarray) -> bool:
+        miss = self.model.reaching_position(q) - point
+        return float(miss.dot(miss)) < _NEAR_M**2
 
 
 def chain_joints(kinematics: RobotKinematics, hand: Hand) -> list[int]:

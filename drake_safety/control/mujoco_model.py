@@ -233,6 +233,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariati
     carrier.add_body(
         name="payload",
         pos=payload.position_m,
+        ipos=[0.0, 0.0, 0.0],
         mass=mass_kg,
         inertia=[inertia] * 3,
         explicitinertial=True,

@@ -21,7 +21,7 @@ from drake_safety.control.safe_sets import (
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
 
-_NUM_PREVIEWED = 6  # Samples of the plan for which the whole body is previewed.
+_NUM_PREVIEWED = 8  # Samples of the plan for which the whole body is previewed.
 _GRAVITY = 9.81
 _SOON_S = 0.1  # How far ahead a velocity is trusted to go on.
 

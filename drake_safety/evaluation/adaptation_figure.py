@@ -129,7 +129,7 @@ def _draw_feedback(
     for rows, colour, label in kinds:
         axes.scatter(points[rows, 0], points[rows, 1], s=6.0, c=colour, linewidths=0.0, label=label)
     axes.set_title(f"Feedback: {num_sets} actual episodes")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, markerscale=2.0)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), fontsize=8, markerscale=2.0)
 
 
 def _draw_discrepancy(
@@ -189,12 +189,12 @@ def _mark_changes(
             fontsize=8,
         )
         here = cells == cell
+        unsafe, twins = segments.is_unsafe[here].sum(), segments.nominal_is_unsafe[here].sum()
         lines.append(
-            f"{number}: {before[cell]:.2f} → {after[cell]:.2f}; of {here.sum()} segments "
-            f"{segments.is_unsafe[here].sum()} end unsafely, "
-            f"{segments.nominal_is_unsafe[here].sum()} of the twins"
+            f"{number}: {before[cell]:.2f} → {after[cell]:.2f}; unsafe {unsafe} of {here.sum()} "
+            f"segments, twins {twins}"
         )
-    axes.set_xlabel("\n".join(lines) or "nothing changed", fontsize=8.5, color=INK)
+    axes.set_xlabel("\n".join(lines) or "nothing changed", fontsize=7.5, color=INK)
 
 
 def study_figure(studies: Mapping[str, AdaptationStudy], *, published: str) -> Figure:

@@ -105,7 +105,8 @@ def compare_scenario(
     assessment = SafetyAssessment(scenario.assessment).fit(training)
     assessment.save(folder / "sharpened.safetensors")
     recovery = scenario.parameters.recovery
-    scorer = assessment_scorer("sharpened", assessment, is_normalized=recovery.is_normalized)
+    published = "normalized" if recovery.is_normalized else "safety_probability"
+    scorer = assessment_scorer("sharpened", assessment, published)
     figures, _, _ = evaluate_episodes([scorer], calibration, fresh)
     study = evaluate_throws(
         scenario,

@@ -82,7 +82,7 @@ def learning_curve(
     figures: dict[str, Figure] = {}
     miss_rate = promised_miss_rate(calibration)
     for size in wanted:
-        rule = scorer_rule(assessment_scorer("sharpened", learned[size], is_normalized=True))
+        rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
         threshold = score_threshold(
             rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate
         )

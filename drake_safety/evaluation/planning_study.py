@@ -162,7 +162,7 @@ def planning_study(
             trial.state,
             trial.desired_preview,
             trial.features if assessment.uses_features else None,
-        ).normalized
+        ).calibrated
         for trial in trials
     ]
     best = [int(np.argmax(values)) for values in gamma]

@@ -11,9 +11,10 @@ from pydrake.systems.framework import Context
 from drake_safety.evaluation.metrics import Figure, proportion
 from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import Reachability
-from drake_safety.evaluation.scorers import StageProgress
+from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.planning import goal_inputs
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
@@ -88,7 +89,7 @@ def reachable_region(
     Args:
         scenario: A scenario of a task whose plans have a goal.
         assessment: Γ.
-        threshold: Γ_thre, on the normalised safety probability.
+        threshold: Γ_thre, on the calibrated safety probability.
         x_m: Where the plane is [m]; the middle of the fair box by default.
         step_m: Between two simulated targets [m].
         variation: Which plant.
@@ -119,34 +120,28 @@ def reachable_region(
     outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
 
     targets = _targets(x_m, *fine)
-    context = loop.CreateDefaultContext()
-    ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
     reachability = None if loop.hand is None else Reachability(loop.robot, loop.hand)
-    inputs: list[list[np.ndarray]] = []
-    is_reachable = np.zeros(len(targets), dtype=bool)
-    for i, target in enumerate(targets):
-        if progress is not None and i % _REPORT_EVERY == 0:
-            progress("verdicts on the plane", i, len(targets))
-        loop.reset_standing(context, target)
-        inputs.append([port.Eval(context).copy() for port in ports])
+    scorer = assessment_scorer("sharpened", assessment, "calibrated")
+    probability, reachable = [], []
+    for start in range(0, len(targets), _REPORT_EVERY):
+        if progress is not None:
+            progress("verdicts on the plane", start, len(targets))
+        chunk = targets[start : start + _REPORT_EVERY]
+        probability.append(scorer.probability(*goal_inputs(loop, chunk)))
         if reachability is not None:
-            is_reachable[i] = reachability.is_reachable(target[None])[0]
+            reachable.append(reachability.is_reachable(chunk))
     if progress is not None:
         progress("verdicts on the plane", len(targets), len(targets))
-    state, desired_preview, features = (np.array(rows) for rows in zip(*inputs, strict=True))
-    result = assessment.predict(
-        state, desired_preview, features if assessment.uses_features else None
-    )
     shape = (len(fine[1]), len(fine[0]))
     edge = [np.arange(low, high + 0.5 * _EDGE_STEP_M, _EDGE_STEP_M) for low, high in box.T]
-    distance = _obstacle_distance(loop, context, _targets(x_m, *edge))
+    distance = _obstacle_distance(loop, loop.CreateDefaultContext(), _targets(x_m, *edge))
     return ReachableRegion(
         x_m=x_m,
         y_m=fine[0],
         z_m=fine[1],
-        safety_probability=result.normalized.reshape(shape),
+        safety_probability=np.concatenate(probability).reshape(shape),
         threshold=threshold,
-        is_reachable=None if reachability is None else is_reachable.reshape(shape),
+        is_reachable=np.concatenate(reachable).reshape(shape) if reachable else None,
         obstacle_y_m=edge[0],
         obstacle_z_m=edge[1],
         obstacle_distance_m=None if distance is None else distance.reshape(len(edge[1]), -1),

@@ -9,6 +9,7 @@ import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes, Segments
 
 StageProgress = Callable[[str, int, int], None]
@@ -36,13 +37,15 @@ class Scorer:
         return 1.0 - self.probability(state, segments.desired_preview, segments.features)
 
 
-def assessment_scorer(name: str, assessment: SafetyAssessment, *, is_normalized: bool) -> Scorer:
+def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -> Scorer:
     """Γ as a scorer.
 
     Args:
         name: Its key in tables.
         assessment: A fitted assessment.
-        is_normalized: Whether it scores b_safe / (1 - μ) or, literally, b_safe.
+        published: Which of Γ's forms it scores by: "safety_probability", literally b_safe;
+            "normalized", b_safe / (1 - μ); or "calibrated", what the maps' heads say, 0 where the
+            belief is "don't know".
     """
 
     def probability(
@@ -51,7 +54,11 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, *, is_normalized:
         result = assessment.predict(
             state, desired_preview, features if assessment.uses_features else None
         )
-        return result.normalized if is_normalized else result.safety_probability
+        probability = getattr(result, published)
+        if published == "calibrated":
+            mu = assessment.parameters.initial_uncertainty
+            return np.where(is_unknown(result.belief, mu), 0.0, probability)
+        return probability
 
     return Scorer(
         name=name,

@@ -54,9 +54,11 @@ def trigger_rules(
     Returns:
         The rules, the scenario's own first, named "sharpened".
     """
-    own = assessment_scorer("sharpened", sharpened, is_normalized=is_normalized)
-    literal = assessment_scorer("literal", sharpened, is_normalized=False)
-    paper_literal = assessment_scorer("paper_literal", paper, is_normalized=False)
+    own = assessment_scorer(
+        "sharpened", sharpened, "normalized" if is_normalized else "safety_probability"
+    )
+    literal = assessment_scorer("literal", sharpened, "safety_probability")
+    paper_literal = assessment_scorer("paper_literal", paper, "safety_probability")
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
         TriggerRule(

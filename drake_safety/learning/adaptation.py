@@ -223,7 +223,7 @@ def fitted_shift(
 def cell_shift(
     shift: float, feedback: FeedbackSegments, points: np.ndarray, grid: Grid
 ) -> np.ndarray:
-    """b of every map's cells, (K, R*R): nowhere safer where the robot was seen to end unsafely.
+    """b of every map's cells, (K, R*R): nowhere safer where most of the feedback was unsafe.
 
     Args:
         shift: b.
@@ -234,8 +234,11 @@ def cell_shift(
     cells = np.full((len(points), grid.num_cells), shift)
     if shift < 0.0:
         for row, member_points in zip(cells, points, strict=True):
-            unsafe_cells = grid.locate(member_points[feedback.is_unsafe])
-            row[unsafe_cells[unsafe_cells >= 0]] = 0.0
+            located = grid.locate(member_points)
+            # Safe counts against unsafe: a majority of unsafe segments is above zero.
+            vote = np.where(feedback.is_unsafe, 1.0, -1.0)[located >= 0]
+            majority = np.bincount(located[located >= 0], vote, minlength=grid.num_cells)
+            row[majority > 0.0] = 0.0
     return cells
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-_MOST_FITTED = 400
+_MOST_FITTED = 250
 _CHUNK = 2048
 
 
@@ -14,7 +14,7 @@ class DiscrepancyFunction:
     """D(y), a Gaussian process regression of |lambda actual - lambda nominal| on Psi(x).
 
     The amplitude of the kernel is fixed at one: a fitted one shrinks with the differences, and then
-    sigma is small everywhere, data or not. Length scale and noise are fitted on at most 400 of the
+    sigma is small everywhere, data or not. Length scale and noise are fitted on at most 250 of the
     points; the posterior is exact with all of them.
     """
 
@@ -77,7 +77,9 @@ class DiscrepancyFunction:
             chunk = rows[start : start + _CHUNK]
             cross = self._covariance(self._points, points[chunk].astype(float))
             mean[chunk] = self._weight @ cross
-            explained = solve_triangular(self._factor, cross, lower=True, overwrite_b=True)
+            explained = solve_triangular(
+                self._factor, cross, lower=True, overwrite_b=True, check_finite=False
+            )
             variance = 1.0 - np.einsum("ij,ij->j", explained, explained)
             deviation[chunk] = np.sqrt(np.maximum(variance, 0.0))
         return np.clip(mean, 0.0, 1.0), deviation

@@ -61,7 +61,9 @@ class FeedbackSet:
         return self.is_unsafe != self.nominal_is_unsafe
 
 
-def feedback_sets(actual: Episodes, nominal: Episodes) -> list[FeedbackSet]:
+def feedback_sets(
+    actual: Episodes, nominal: Episodes, *, nominal_hash: str | None = None
+) -> list[FeedbackSet]:
     """Pairs actual episodes with their nominal twins, by index.
 
     A pair of which one simulation diverged says nothing and is left out.
@@ -69,6 +71,8 @@ def feedback_sets(actual: Episodes, nominal: Episodes) -> list[FeedbackSet]:
     Args:
         actual: Episodes of the actual robot.
         nominal: Their twins; others may be among them.
+        nominal_hash: Scenario hash of the nominal plant, where the twins' own also tells of the
+            options that pairs were made with; theirs by default.
 
     Raises:
         ValueError: The two sets are of different tasks, a twin is missing, or begins elsewhere.
@@ -98,7 +102,7 @@ def feedback_sets(actual: Episodes, nominal: Episodes) -> list[FeedbackSet]:
         sets.append(
             FeedbackSet(
                 info=actual.info,
-                nominal_hash=nominal.info.scenario_hash,
+                nominal_hash=nominal_hash or nominal.info.scenario_hash,
                 index=episode.index,
                 state=segments.state,
                 true_state=segments.true_state,

@@ -110,6 +110,16 @@ class BaseLogit:
         return total / count
 
 
+def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
+    """Where more than half of a belief comes from cells that know nothing, (N,).
+
+    Args:
+        belief: (b_safe, b_unsafe, mu), (N, 3).
+        initial_uncertainty: mu_ini, what a cell that knows all it can leaves open.
+    """
+    return belief[:, belief_masses.UNCERTAINTY] > 0.5 * (1.0 + initial_uncertainty)
+
+
 def sigmoid(z: np.ndarray) -> np.ndarray:
     """1 / (1 + exp(-z)) of logits that are not beyond some hundreds."""
     return 1.0 / (1.0 + np.exp(-z))

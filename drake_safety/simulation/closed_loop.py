@@ -212,6 +212,17 @@ class ClosedLoop(Diagram):
         return stated
 
     @classmethod
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """Options of the diagram with which a variation and its nominal twin begin alike.
+
+        Args:
+            scenario: The scenario.
+            variation: Which plant is the actual one.
+        """
+        del scenario, variation
+        return {}
+
+    @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that decide what the plant is; part of its hash."""
         del scenario

@@ -37,14 +37,16 @@ class EpisodePairs:
     Attributes:
         actual: Episodes of the actual plant.
         nominal: Episodes of the nominal plant from the same states along the same plans.
+        nominal_hash: Scenario hash of the nominal plant.
     """
 
     actual: Episodes
     nominal: Episodes
+    nominal_hash: str
 
     def feedback(self) -> list[FeedbackSet]:
         """One feedback set a pair, in the order of the episodes; diverged ones are left out."""
-        return feedback_sets(self.actual, self.nominal)
+        return feedback_sets(self.actual, self.nominal, nominal_hash=self.nominal_hash)
 
     @property
     def gap(self) -> tuple[int, int]:
@@ -79,7 +81,7 @@ def run_pairs(
             those that it already holds are not simulated again.
         progress: Called with the number of episodes done and the number wanted, two a pair.
         extra: Stored beside the episodes' info.
-        **loop_options: For the task.
+        **loop_options: For the task, over what its ``pairing_options`` say of the variation.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
@@ -90,6 +92,7 @@ def run_pairs(
             return None
         return lambda done, total: progress(offset + done, 2 * num_pairs)
 
+    loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
     for offset, name in enumerate((variation, _TWINS)):
         sets[name] = run_episodes(
@@ -103,7 +106,9 @@ def run_pairs(
             extra=extra,
             **loop_options,
         )
-    return EpisodePairs(actual=sets[variation], nominal=sets[_TWINS])
+    return EpisodePairs(
+        actual=sets[variation], nominal=sets[_TWINS], nominal_hash=scenario.simulation_hash()
+    )
 
 
 def make_recorder(
@@ -203,7 +208,11 @@ def pair_starts(
         run_episode(loop, episode.index, seed=seed, start=start)
         for episode, start in zip(actual, starts, strict=True)
     ]
-    return EpisodePairs(actual=actual, nominal=Episodes(episodes_info(loop, seed), twins))
+    return EpisodePairs(
+        actual=actual,
+        nominal=Episodes(episodes_info(loop, seed), twins),
+        nominal_hash=scenario.simulation_hash(),
+    )
 
 
 def _twin_batch(scenario: Scenario, seed: int, windows: list[RecordedWindow]) -> list[Episode]:

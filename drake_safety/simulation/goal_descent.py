@@ -61,7 +61,7 @@ def descend_to_accepted(
         loop: A closed loop whose plans have a goal.
         assessment: What was learned from its episodes, in the sharpened mode.
         goal: In the world, (3,) [m]; finite.
-        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        threshold: From which Γ, calibrated, on a goal is safe.
         reserve: Share of the way from the threshold to certainty that is asked for besides.
         num_steps: How many steps at most.
         resolution_m: Spacing of the grid that the goal found lies on [m].

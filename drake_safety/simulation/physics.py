@@ -203,6 +203,8 @@ class MujocoPhysics:
 
 
 Physics = DrakePhysics | MujocoPhysics
+ENGINES_WITH_BALLS = ("drake",)
+"""Engines in whose scenes a ball can be thrown."""
 _ENGINES: dict[str, type[DrakePhysics] | type[MujocoPhysics]] = {
     "drake": DrakePhysics,
     "mujoco": MujocoPhysics,

@@ -21,7 +21,7 @@ class PlanChoice:
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        safety_probability: Γ = b_safe / (1 - μ) of each candidate, (M,).
+        safety_probability: Γ, calibrated, of each candidate, (M,).
         threshold: From which Γ on a plan is accepted.
     """
 
@@ -75,7 +75,7 @@ def choose_plan(
         loop: A closed loop whose plans can be chosen.
         assessment: What was learned from its episodes.
         context: Its Context, in the state to plan from; the chosen plan is set in it.
-        threshold: From which Γ = b_safe / (1 - μ) on a plan is accepted. If none is, the best is
+        threshold: From which Γ, calibrated, on a plan is accepted. If none is, the best is
             set all the same and the choice says so: it takes another target.
         rng: Source of the candidates.
         num_plans: How many candidates are judged at most.
@@ -86,6 +86,6 @@ def choose_plan(
     plans = loop.candidate_plans(context, rng, num_plans)
     state, preview, features = plan_inputs(loop, context, plans)
     said = assessment.predict(state, preview, features if assessment.uses_features else None)
-    best = int(np.argmax(said.normalized))  # Of equally good ones the first: no needless change.
+    best = int(np.argmax(said.calibrated))  # Of equally good ones the first: no needless change.
     loop.set_plan(context, plans[best])
-    return PlanChoice(index=best, safety_probability=said.normalized, threshold=threshold)
+    return PlanChoice(index=best, safety_probability=said.calibrated, threshold=threshold)

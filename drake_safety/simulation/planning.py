@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY
+from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 RESERVE = 0.8
@@ -36,7 +37,7 @@ class GoalVerdict:
         goal: The goal in the world, (3,) [m].
         verdict: "safe", "unsafe" or "don't know".
         belief: (safe, unsafe, don't know), (3,).
-        safety_probability: Γ = b_safe / (1 - μ); NaN where Γ was not asked, because the goal is
+        safety_probability: Γ, calibrated; NaN where Γ was not asked, because the goal is
             outside what it has learned.
         threshold: From which Γ on a goal is safe.
         constraint_names: The n_c constraints, the possible causes.
@@ -111,7 +112,7 @@ def assess_goal(
         assessment: What was learned from its episodes.
         goal: In the world, (3,) [m]. One that is not finite, or outside the region that was
             sampled in training, is answered with "don't know" and the region.
-        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        threshold: From which Γ, calibrated, on a goal is safe.
         unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
             default.
 
@@ -156,7 +157,7 @@ def assess_goals(
         loop: A closed loop whose plans have a goal.
         assessment: What was learned from its episodes.
         goals: In the world, (N, 3) [m].
-        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        threshold: From which Γ, calibrated, on a goal is safe.
         unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
             default.
     """
@@ -164,18 +165,18 @@ def assess_goals(
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
     said = assessment.predict(*goal_inputs(loop, goals))
-    most_unknown = 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
+    is_open = is_unknown(said.belief, assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
         reason = ""
-        verdict = SAFE if said.normalized[i] >= threshold else UNSAFE
-        if unsafe_below <= said.normalized[i] < threshold:
+        verdict = SAFE if said.calibrated[i] >= threshold else UNSAFE
+        if unsafe_below <= said.calibrated[i] < threshold:
             verdict = UNKNOWN
             reason = (
-                f"Γ {said.normalized[i]:.3f} lies between {unsafe_below:.3f} and "
+                f"Γ {said.calibrated[i]:.3f} lies between {unsafe_below:.3f} and "
                 f"{threshold:.3f}, where safe and unsafe targets cannot be told apart"
             )
-        if said.belief[i, UNCERTAINTY] > most_unknown:
+        if is_open[i]:
             verdict = UNKNOWN
             reason = "training came too seldom near what this target looks like to the assessment"
         verdicts.append(
@@ -183,7 +184,7 @@ def assess_goals(
                 goal=np.array(goal, dtype=float),
                 verdict=verdict,
                 belief=said.belief[i],
-                safety_probability=float(said.normalized[i]),
+                safety_probability=float(said.calibrated[i]),
                 threshold=threshold,
                 constraint_names=tuple(loop.constraint_names),
                 cause_probability=said.cause_probability[i],
@@ -239,7 +240,7 @@ def nearest_accepted_goal(
         loop: A closed loop whose plans have a goal.
         assessment: What was learned from its episodes.
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
-        threshold: From which Γ = b_safe / (1 - μ) on a goal is safe.
+        threshold: From which Γ, calibrated, on a goal is safe.
         rng: Source of the candidates.
         reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
             is accepted.

@@ -21,6 +21,10 @@ class PostureSampling:
     """Least distance of the arms to an obstacle."""
     joint_margin_rad: float = 0.0
     """Least distance of every joint to the end of its safe range."""
+    sink_m: float = 0.0
+    """How deep the contact points begin in the compliant ground: as deep as they are when the robot
+    stands. Where they only touch it, nothing carries the robot in the plant's first step, and
+    torques that count on the ground turn the feet into it."""
 
     def __post_init__(self) -> None:
         if len(self.base_offset_m) != 2:
@@ -32,6 +36,7 @@ class PostureSampling:
             "joint_offset_rad",
             "clearance_m",
             "joint_margin_rad",
+            "sink_m",
         ):
             value = np.asarray(getattr(self, name), dtype=float)
             if not ((value >= 0) & np.isfinite(value)).all():

@@ -217,9 +217,9 @@ def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Fig
         fig = new_figure(7.0, 6.0)
         axes = fig.subplots()
         axes.set_facecolor("#f1f2f4")
-        norm = Normalize(0.0, 1.0)
-        shade = ScalarMappable(norm, _ramp(SAFETY_STOPS))
-        axes.pcolormesh(shares, cmap=shade.cmap, norm=norm, edgecolors="white", linewidth=0.8)
+        norm, ramp = Normalize(0.0, 1.0), _ramp(SAFETY_STOPS)
+        shade = ScalarMappable(norm, ramp)
+        axes.pcolormesh(shares, cmap=ramp, norm=norm, edgecolors="white", linewidth=0.8)
         for cell in cells:
             if cell["count"]:
                 is_pale = _is_empty(cell) or 0.25 < safe_share(cell) < 0.75

@@ -229,12 +229,12 @@ def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
         for suffix, path in paths.items():
             shutil.copyfile(path, folder / "figures" / f"{flat}{suffix}")
         svg, png = paths.get(".svg"), paths.get(".png")
-        is_small = svg is not None and svg.stat().st_size <= _MAX_SVG_BYTES
-        picture = svg if is_small or png is None else png
-        if picture is None:
+        is_light = svg is not None and (png is None or svg.stat().st_size <= _MAX_SVG_BYTES)
+        chosen = svg if is_light else png
+        if chosen is None:
             continue
-        kind = "svg+xml" if picture.suffix == ".svg" else "png"
-        content = base64.b64encode(picture.read_bytes()).decode("ascii")
+        kind = "svg+xml" if chosen.suffix == ".svg" else "png"
+        content = base64.b64encode(chosen.read_bytes()).decode("ascii")
         words = known.get(stem, {})
         is_calibration = any(word in stem for word in ("calibration", "reliability"))
         shown[name] = {

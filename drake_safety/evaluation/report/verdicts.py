@@ -12,6 +12,7 @@ from drake_safety.evaluation.report.tables import Column, Row, Table
 
 LABELS = {
     "mlp": "MLP",
+    "reachability": "inverse kinematics",
     "sharpened_literal_0.6": "sharpened, literal Γ",
     "paper_literal_0.6": "paper, literal Γ",
 }

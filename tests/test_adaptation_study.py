@@ -1,0 +1,105 @@
+"""The study of adaptation: figures by hand, orders of feedback, and its pictures."""
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.adaptation_figure import adaptation_figure, study_figure
+from drake_safety.evaluation.adaptation_study import TestSet, scores, study, trained_rivals
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from lip_episodes import make_episodes
+from test_adaptation import pairs_with, worse
+from test_assessment import QUICK
+
+
+@pytest.fixture(scope="module")
+def assessment():
+    parameters = AssessmentParameters(**QUICK | {"epochs": 6, "perplexity": 8.0})
+    return SafetyAssessment(parameters).fit(make_episodes(110, noise=0.002))
+
+
+@pytest.fixture(scope="module")
+def judged():
+    return TestSet.of(make_episodes(40, seed=9, noise=0.002), 10)
+
+
+def test_scores_are_those_of_what_is_published(assessment, judged):
+    segments = judged.segments
+    result = assessment.predict(segments.state, segments.desired_preview, segments.features)
+    found = scores(assessment, judged)
+    for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
+        unsafe = 1.0 - probability
+        assert found[name]["brier"] == pytest.approx(np.mean((unsafe - segments.is_unsafe) ** 2))
+        caught = (unsafe > 0.5)[segments.is_unsafe].mean()
+        assert found[name]["unsafe_recall"] == pytest.approx(caught)
+        first = segments.is_first
+        squared = (unsafe - segments.is_unsafe)[first] ** 2
+        assert found[name]["k0.brier"] == pytest.approx(squared.mean())
+
+
+def test_without_a_gap_every_order_leaves_every_figure_as_it_is(assessment, judged):
+    found = study(
+        assessment, pairs_with(lambda episode: False), judged, sizes=(20, 40, 400), num_orders=2
+    )
+    assert found.sizes == [20, 40]
+    assert found.figures["gap"].value == 0.0
+    for published in ("calibrated", "grid"):
+        for metric in ("brier", "auc", "unsafe_recall"):
+            prior = found.figures[f"prior.{published}.{metric}"]
+            for size in (20, 40):
+                figure = found.figures[f"adapted.{size}.{published}.{metric}"]
+                assert figure.low == figure.high == prior.value
+        assert found.figures[f"adapted.40.{published}.orders_won"].value == 0.0
+
+
+def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap(
+    assessment, judged
+):
+    feedback = worse()
+    found = study(
+        assessment,
+        feedback,
+        judged,
+        sizes=(10, 40),
+        num_orders=3,
+        rivals={"oracle": assessment.adapt(feedback)},
+    )
+    few, many = (found.figures[f"adapted.{n}.calibrated.brier"] for n in (10, 40))
+    assert few.low < few.high
+    assert many.low == pytest.approx(many.high)
+    differing = sum(one.differs for one in feedback)
+    assert found.figures["gap"].value == pytest.approx(differing / len(feedback))
+    prior = found.figures["prior.calibrated.brier"].value
+    if many.value < prior:
+        assert found.figures["adapted.40.calibrated.gap_closed"].value == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="only 40 feedback sets"):
+        study(assessment, feedback, judged, sizes=(41,))
+
+
+def test_too_few_episodes_give_no_rival(assessment):
+    episodes = make_episodes(40, seed=5, noise=0.002)
+    few = {"scratch.1": episodes[:1], "scratch.40": episodes}
+    rivals = trained_rivals(assessment, few, num_workers=1)
+    assert list(rivals) == ["scratch.40"]
+    assert rivals["scratch.40"].parameters == assessment.parameters
+    np.testing.assert_array_equal(rivals["scratch.40"].shift_, 0.0)
+
+
+def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, judged):
+    fig = adaptation_figure(assessment, worse(), updates=(1, 4))
+    titles = [axes.get_title(loc="left") for axes in fig.axes]
+    assert "After update 1: 40 feedback sets" in titles
+    assert not any("update 4" in title for title in titles)
+    said = " ".join(axes.get_xlabel() for axes in fig.axes)
+    assert "1: " in said
+    assert "segments, twins" in said
+    found = study(assessment, worse(), judged, sizes=(10, 40), num_orders=2)
+    curves = study_figure({"sharpened": found}, published="calibrated").axes
+    assert curves[0].get_title(loc="left") == "Brier score"
+    (line,) = curves[0].lines
+    np.testing.assert_array_equal(line.get_xdata(), [0, 10, 40])
+    assert line.get_ydata()[0] == found.figures["prior.calibrated.brier"].value
+
+
+def test_too_little_feedback_for_an_update_gives_no_picture(assessment):
+    with pytest.raises(ValueError, match="fewer than the 40 of update 1"):
+        adaptation_figure(assessment, worse()[:39])
