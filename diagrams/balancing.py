@@ -251,6 +251,8 @@ class Balancing(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
         self.fall_name = safe_set.fall_name
+        self.watched_features = safe_set.watched_features
+        self._rate_features = safe_set.rate_features
         if assessment is not None:
             self.check_assessment()
             assessor = builder.AddNamedSystem(
@@ -309,6 +311,11 @@ class Balancing(ClosedLoop):
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
 
+    @property
+    def rate_names(self) -> list[str]:
+        """Velocities of the state, and the features that they enter."""
+        return [*super().rate_names, *self._rate_features]
+
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin as a ball hits."""
         parameters = self.scenario.parameters
@@ -359,6 +366,16 @@ class Balancing(ClosedLoop):
             v=v,
             plan=self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context)),
             foot_positions=self._controller.foot_positions(controller_context).copy(),
+        )
+
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the standing posture, which the plan keeps."""
+        kinematics = self.kinematics
+        base = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
+        return EpisodeStart(
+            q=kinematics.standing_positions(),
+            v=np.zeros(kinematics.num_velocities),
+            plan=PiecewisePolynomial(base[:, None]),
         )
 
     def _set(self, context: Context, rng: np.random.Generator, start: Start) -> None:

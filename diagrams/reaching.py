@@ -263,6 +263,7 @@ class Reaching(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
         self.fall_name = self.safe_set.fall_name
+        self.watched_features = self.safe_set.watched_features
         self.angular_constraints = self.safe_set.angular_names
         self.named_targets = parameters.named_targets
         self.pushes = parameters.pushes
@@ -417,6 +418,18 @@ class Reaching(ClosedLoop):
             duration_s=push.duration_s,
         )
 
+    def sample_push(self, rng: np.random.Generator) -> Push:
+        """A push as episodes begin with it, whatever their share."""
+        push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
+        if self.mirror is None:
+            return push
+        return replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
+
+    @property
+    def rate_names(self) -> list[str]:
+        """Velocities of the state, and the features that they enter."""
+        return [*super().rate_names, *self.safe_set.rate_features]
+
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
     ) -> list[PiecewisePolynomial]:
@@ -472,6 +485,15 @@ class Reaching(ClosedLoop):
         q, v = np.split(state, [self.kinematics.num_positions])
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
         return EpisodeStart(q=q, v=v, plan=plan)
+
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the standing posture, the hand where it is."""
+        q = self.kinematics.standing_positions()
+        hand = self._controller.model.reaching_position(q).copy()
+        # The plan is told from the feet.
+        hand[:2] += self.kinematics.nominal_base_offset
+        v = np.zeros(self.kinematics.num_velocities)
+        return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(hand[:, None]))
 
     def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
         sampling = self.scenario.parameters.start

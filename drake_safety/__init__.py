@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.contract import check_contract
     from drake_safety.simulation.rollouts import run_episode, run_episodes
     from drake_safety.simulation.scenario import Scenario, load_scenario
 
@@ -13,6 +14,7 @@ __all__ = [
     "SafetyAssessment",
     "Scenario",
     "__version__",
+    "check_contract",
     "load_scenario",
     "run_episode",
     "run_episodes",
@@ -26,6 +28,7 @@ if not (Path(__file__).parent / "models").is_dir():
 _HOMES = {
     "SafetyAssessment": "drake_safety.learning.assessment",
     "Scenario": "drake_safety.simulation.scenario",
+    "check_contract": "drake_safety.simulation.contract",
     "load_scenario": "drake_safety.simulation.scenario",
     "run_episode": "drake_safety.simulation.rollouts",
     "run_episodes": "drake_safety.simulation.rollouts",

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import parse_scenario
 
 SIDES = {"left": 1.0, "right": -1.0}
@@ -14,6 +15,7 @@ BOX = np.array([[0.6, -0.3, 0.2], [1.4, 1.4, 1.0]])
 FAIR_X_M = 0.8
 FAILING_Z_M = 0.9
 PERIOD_S = 0.01
+NO_PUSH = [0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 @dataclass(kw_only=True)
@@ -28,6 +30,8 @@ class Shuttle(LeafSystem):
         super().__init__()
         self.reflect = np.array([1.0, sign, 1.0])
         self.DeclareDiscreteState(6)
+        # When a push begins, how long it lasts, and the acceleration that it gives.
+        self.push = self.DeclareNumericParameter(BasicVector(NO_PUSH))
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD_S, 0.0, self._update)
         self.duration_s = scenario.episode_duration_s
         offsets = scenario.step_s * np.arange(scenario.assessment.horizon)
@@ -45,6 +49,7 @@ class Shuttle(LeafSystem):
             "features": (2, lambda p, v, left_s: self.margins(p + left_s * v)),
             "margins": (2, lambda p, v, left_s: self.margins(p)),
             "safe": (1, lambda p, v, left_s: [float(min(self.margins(p)) >= 0)]),
+            "plant_state": (6, lambda p, v, left_s: np.append(p, v)),
         }
         for name, (size, calc) in ports.items():
             self.DeclareVectorOutputPort(
@@ -62,6 +67,9 @@ class Shuttle(LeafSystem):
 
     def _update(self, context, discrete_state):
         p, v, _ = self.read(context)
+        start_s, duration_s, *push = context.get_numeric_parameter(self.push).get_value()
+        if start_s - 1e-9 <= context.get_time() < start_s + duration_s - 1e-9:
+            v = v + PERIOD_S * np.array(push)
         discrete_state.set_value(np.append(p + PERIOD_S * v, v))
 
 
@@ -79,6 +87,8 @@ class Shuttling(ClosedLoop):
         self.output_names = ["x", "y", "z"]
         self.feature_names = ["to_the_front", "to_the_flank"]
         self.constraint_names = ["front", "flank"]
+        self.fall_name = "flank"
+        self.watched_features = {"front_margin": "to_the_front"}
         self.check_assessment()
         builder = DiagramBuilder()
         self.shuttle = builder.AddSystem(Shuttle(scenario, SIDES[side]))
@@ -116,6 +126,19 @@ class Shuttling(ClosedLoop):
         velocity = (goal - start) / self.scenario.episode_duration_s
         shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
         shuttle_context.SetDiscreteState(np.append(start, velocity))
+        self._push(context, NO_PUSH)
+
+    def _push(self, context, push):
+        shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
+        shuttle_context.get_mutable_numeric_parameter(self.shuttle.push).SetFromVector(push)
+
+    def set_push(self, context, push):
+        """The mass weighs a kilogram."""
+        self._push(context, [push.time_s, push.duration_s, *push.force_n])
+
+    def sample_push(self, rng):
+        force = [*rng.uniform(-2, 12, 2), 0.0]
+        return Push(force_n=force, time_s=0.1 * int(rng.integers(1, 4)), duration_s=0.1)
 
     def candidate_plans(self, context, rng, num_plans):
         """Velocities: the one that it has, and slower ones that lead less far."""
@@ -146,7 +169,7 @@ task: shuttle_task:Shuttling
 robot: none
 episode_duration_s: 0.8
 step_s: 0.04
-variations: {nominal: {}}
+variations: {nominal: {}, actual: {mass_scale: 1.1}}
 assessment:
   {epochs: 6, ensemble_size: 1, hidden_sizes: [16], perplexity: 5, shortest_segment: 5}
 """

@@ -57,3 +57,12 @@ def test_random_pushes_push_the_body_they_name():
 def test_random_pushes_that_cannot_be_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         RandomPushes(**change)
+
+
+def test_a_push_that_is_drawn_is_the_one_that_an_episode_would_begin_with():
+    pushes = RandomPushes(share=0.999)
+    episode, drawn = np.random.default_rng(3), np.random.default_rng(3)
+    assert drawn.random() < pushes.share
+    assert pushes.sample(episode, "trunk") == pushes.draw(drawn, "trunk")
+    # Whoever wants a push gets one, however few episodes begin with it.
+    assert RandomPushes(share=0.0).draw(np.random.default_rng(3), "trunk").body == "trunk"

@@ -72,8 +72,8 @@ def test_a_missing_scenario_file_is_named(tmp_path):
     ("text", "message"),
     [
         ("task: [", "scenario 'mine' is not YAML"),
-        ("- a", "must be a mapping with the keys 'task' and 'robot'"),
-        ("task: a:B", "must be a mapping with the keys 'task' and 'robot'"),
+        ("- a", "must be a mapping with the key 'task'"),
+        ("robot: none", "must be a mapping with the key 'task'"),
         (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
         (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
         (BALANCING + "parameters: {push: {sharee: 1}}", "'push.sharee'; keys there are .*'share'"),

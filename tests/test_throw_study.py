@@ -114,6 +114,7 @@ def test_thresholds_left_open_are_chosen_on_other_throws(simulation):
     assert study.thresholds["given"] == 0.6
     assert study.thresholds["open"] == study.figures["throws.open.threshold"].value > 0.6
     assert simulation.calls[0] == ((0, 1, 2, 3, 4, 5), None)
+    assert [log.index for log in study.calibration_logs] == [0, 1, 2, 3, 4, 5]
 
 
 def test_throws_that_are_judged_are_not_those_that_thresholds_are_chosen_on(simulation):

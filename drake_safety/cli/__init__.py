@@ -13,11 +13,14 @@ import typer
 from rich.logging import RichHandler
 
 from drake_safety.cli import (
+    ablate,
     adapt,
     ask,
     calibrate,
+    check,
     compare,
     evaluate,
+    new,
     plan_study,
     report,
     run,
@@ -30,6 +33,8 @@ from drake_safety.cli.targets import TargetCommand
 # In the order in which the help lists them.
 _COMMANDS = (
     scenarios.scenarios,
+    new.new,
+    check.check,
     train.train,
     calibrate.calibrate,
     ask.ask,
@@ -38,6 +43,7 @@ _COMMANDS = (
     compare.compare,
     plan_study.plan_study,
     adapt.adapt,
+    ablate.ablate,
     report.report,
 )
 

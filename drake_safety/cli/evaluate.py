@@ -14,12 +14,14 @@ from rich.table import Table
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
 from drake_safety.cli.evaluate_calibration import evaluate_calibration
+from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
 from drake_safety.cli.evaluate_plans import (
     PlanOptions,
     check_options,
     evaluate_plans,
     parse_sizes,
 )
+from drake_safety.cli.evaluate_truth import evaluate_truth
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
@@ -46,7 +48,7 @@ def evaluate(
     throws: Annotated[
         int | None,
         typer.Option(
-            help="Fresh balls at the actual plant; 600 by default, none where plans have a goal.",
+            help="Fresh balls at the actual plant; 600 by default, none where nothing recovers.",
             min=0,
         ),
     ] = None,
@@ -76,6 +78,20 @@ def evaluate(
         float,
         typer.Option(help="Targets: spacing of those simulated on it [m]; 0 leaves it out.", min=0),
     ] = 0.1,
+    pushes: Annotated[
+        int,
+        typer.Option(
+            help="Targets: motions on whose way the actual robot is pushed, to see who notices; "
+            "as many more for thresholds.",
+            min=0,
+        ),
+    ] = 0,
+    truth_resolution: Annotated[
+        int,
+        typer.Option(
+            help="State planes: starts simulated along either axis; 0 leaves them out.", min=0
+        ),
+    ] = 41,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
@@ -86,6 +102,9 @@ def evaluate(
 
     Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
     kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
+    With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
+    watch instead.
+    Where a task has state planes, Γ is drawn beside the truth, simulated from every start.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
@@ -97,10 +116,20 @@ def evaluate(
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
     has_goals = loop.target_box is not None
+    has_recovery = hasattr(loaded.parameters, "recovery")
     if throws is None:
-        throws = 0 if has_goals else _DEFAULT_THROWS
-    if throws and not hasattr(loaded.parameters, "recovery"):
+        throws = _DEFAULT_THROWS if has_recovery and not has_goals else 0
+    if throws and not has_recovery:
         raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
+    if pushes:
+        if not has_goals:
+            raise ValueError(
+                f"evaluate: plans of {loaded.task} have no goal to be pushed on the way to: leave "
+                "out --pushes; balls that are thrown are watched, too"
+            )
+        # Either says so if there is none.
+        loop.sample_push(np.random.default_rng(0))
+        loaded.variation("actual")
     options = PlanOptions(
         other_hand=other_hand,
         learning_curve=parse_sizes(learning_curve),
@@ -173,6 +202,12 @@ def evaluate(
         findings.add(evaluate_calibration(judged))
         if throws:
             findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
+        if pushes:
+            findings.add(
+                evaluate_pushes(judged, pushes, pushes, seed=seed + 1, calibration_seed=seed + 2)
+            )
+        if loop.state_planes and truth_resolution:
+            findings.add(evaluate_truth(judged, list(loop.state_planes), truth_resolution))
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -222,6 +257,7 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
     """Everyone as a trigger of recovery."""
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
+    from drake_safety.simulation.pushed_motions import WatchedMotion
 
     recovery = judged.scenario.parameters.recovery
     rules = trigger_rules(
@@ -243,11 +279,19 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
     )
     figures = dict(study.figures)
     figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
-    return Findings(
+    findings = Findings(
         figures=figures,
         pictures=save(_throws_picture(study), judged.folder / "throws"),
         tables=[_throws_table(figures, [rule.name for rule in rules])],
     )
+    findings.add(
+        evaluate_monitoring(
+            judged,
+            [WatchedMotion.of_throw(log) for log in study.calibration_logs],
+            [WatchedMotion.of_throw(log) for log in study.logs],
+        )
+    )
+    return findings
 
 
 def _throws_picture(study: ThrowStudy) -> Picture:

@@ -14,6 +14,7 @@ def scenarios() -> None:
     for name in scenario_names():
         try:
             scenario = load_scenario(name)
+            scenario.task_class().model_files(scenario)
         except MissingExtraError:
             table.add_row(name, *4 * ["–"], "drake_safety[robots]")
             continue

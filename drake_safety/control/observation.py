@@ -35,6 +35,11 @@ def state_names(kinematics: RobotKinematics) -> list[str]:
     return names + [f"{name}_rate" for name in kinematics.joint_names]
 
 
+def is_rate(name: str) -> bool:
+    """Whether an entry of :func:`stance_state` is a velocity, by its name."""
+    return name.endswith("_rate") or "velocity" in name
+
+
 def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """The state s_k: base pose and velocity in the stance frame S, joints and their rates.
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from drake_safety.control.kinematics import (
     fit_stance,
     planar_pose,
 )
+from drake_safety.control.observation import is_rate
 from drake_safety.control.obstacles import Clearance
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
@@ -85,6 +87,13 @@ class ReachingSafeSet:
     names = ("support_polygon", "collision", "joint_limits", "fall")
     fall_name = "fall"
     angular_names = ("joint_limits",)
+    watched_features = MappingProxyType(
+        {
+            "capture_point_margin": "capture_point_support",
+            "support_margin": "now_support_polygon",
+        }
+    )
+    """What one would set an alarm on by hand, by what it measures."""
 
     def __init__(
         self,
@@ -132,6 +141,11 @@ class ReachingSafeSet:
             *(f"capture_point_margin_{name}" for name in DIRECTION_NAMES),
             "soon_support_polygon",
             "soon_joint_limits",
+        ]
+        self.rate_features = [
+            name
+            for name in self.feature_names
+            if is_rate(name) or name.startswith(("capture_point_", "soon_"))
         ]
 
     def _support(self, q: np.ndarray) -> list[tuple[float, float]]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 
@@ -120,6 +121,13 @@ class BalanceSafeSet:
 
     names = ("support_polygon", "height", "fall")
     fall_name = "fall"
+    watched_features = MappingProxyType(
+        {
+            "capture_point_margin": "capture_point_support_distance",
+            "support_margin": "base_support_distance",
+        }
+    )
+    """What one would set an alarm on by hand, by what it measures."""
 
     def __init__(self, kinematics: RobotKinematics, limits: BalanceLimits):
         self.kinematics = kinematics
@@ -132,6 +140,7 @@ class BalanceSafeSet:
         self.feature_names += [f"clearance_{i}" for i in range(kinematics.num_contacts)]
         self.feature_names += ["height_over_lowest", "height_under_highest", "yaw_error"]
         self.feature_names += [f"tracking_error_{axis}" for axis in "xyz"]
+        self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def _support(self, p_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         clearance = p_WC[:, 2] - self.kinematics.foot_radii

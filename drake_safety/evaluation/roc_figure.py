@@ -39,7 +39,7 @@ def roc_figure(
         whole, magnified = fig.subplots(1, 2)
         for i, (name, (score, label)) in enumerate(curves.items()):
             score = np.where(np.isnan(score), np.inf, np.asarray(score, dtype=float))
-            false_alarm, unsafe_recall = _operating_points(score, label)
+            false_alarm, unsafe_recall = operating_points(score, label)
             area = area_under_curve(score, label)
             colour = SERIES_COLOURS[i % len(SERIES_COLOURS)]
             for axes in (whole, magnified):
@@ -78,7 +78,7 @@ def roc_figure(
     return fig
 
 
-def _operating_points(score: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def operating_points(score: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Share of false alarms and unsafe recall of every threshold, from (0, 0) to (1, 1).
 
     Args:

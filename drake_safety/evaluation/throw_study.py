@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -83,6 +83,7 @@ class ThrowStudy:
         trigger_times_s: Per rule, when it triggered in each throw [s], (N,); NaN for never.
         recovered: Per rule, the logs with recovery by index of the throw, triggered ones only.
         thresholds: Per rule.
+        calibration_logs: The other throws, on which thresholds were chosen, if any were left open.
     """
 
     figures: dict[str, Figure]
@@ -90,6 +91,7 @@ class ThrowStudy:
     trigger_times_s: dict[str, np.ndarray]
     recovered: dict[str, dict[int, ThrowLog]]
     thresholds: dict[str, float]
+    calibration_logs: list[ThrowLog] = field(default_factory=list)
 
     def outcomes(self, rule: str | None = None) -> list[str]:
         """What became of each throw, in the words of the throws figure.
@@ -184,6 +186,7 @@ def evaluate_throws(
     report = progress or _report_to_nobody
     throw = partial(run_throws, scenario, variation=variation, num_workers=num_workers)
     thresholds = {rule.name: rule.threshold for rule in rules if rule.threshold is not None}
+    calibration: list[ThrowLog] = []
     if len(thresholds) < len(rules):
         calibration = throw(
             list(range(num_calibration)),
@@ -233,6 +236,7 @@ def evaluate_throws(
         trigger_times_s=triggers,
         recovered=recovered,
         thresholds=thresholds,
+        calibration_logs=calibration,
     )
 
 

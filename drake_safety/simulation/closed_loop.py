@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from drake_safety.control.observation import is_rate
+from drake_safety.simulation.contract import (
+    ASSESSMENT_PORTS,
+    RECORDED_PORTS,
+    REQUIRED_PORTS,
+    check_ports,
+)
 from drake_safety.simulation.view import View
 
 if TYPE_CHECKING:
@@ -18,21 +25,9 @@ if TYPE_CHECKING:
     from drake_safety.simulation.episode_start import EpisodeStart
     from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.state_plane import StatePlane
 
-RECORDED_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
-"""Output ports that an episode records, row by row."""
-REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
-"""Output ports that every task exports."""
-ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-"""Output ports that a task exports besides when it has an assessment."""
+__all__ = ["ASSESSMENT_PORTS", "RECORDED_PORTS", "REQUIRED_PORTS", "ClosedLoop"]
 
 
 class ClosedLoop(Diagram):
@@ -45,8 +40,9 @@ class ClosedLoop(Diagram):
     in the world, announces it by :attr:`target_box`; its ``reset`` then takes a goal, and it
     overrides :meth:`goal_of` and :meth:`reset_standing`; :attr:`fair_box`, :meth:`is_fair`,
     :attr:`mirror_options`, :attr:`hand`, :attr:`named_targets`, :attr:`pushes` and, with them,
-    :meth:`set_push` where they say something of it. A subclass wires its systems in
-    ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with :meth:`finish`.
+    :meth:`set_push` and :meth:`sample_push` where they say something of it. A subclass wires its
+    systems in ``__init__``, calls :meth:`check_assessment` before it wires one, and ends with
+    :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -100,6 +96,8 @@ class ClosedLoop(Diagram):
     """Goals that can be asked for by name, in the world, (3,) [m] each."""
     pushes: Mapping[str, Push] = {}
     """Pushes that a run can be disturbed with, by name."""
+    watched_features: Mapping[str, str] = {}
+    """Features that one would set an alarm on by hand, by what they measure; larger is safer."""
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
@@ -109,19 +107,15 @@ class ClosedLoop(Diagram):
         self.assessment = assessment
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks that it keeps the contract.
+        """Builds the diagram and checks that its ports keep the contract.
 
         Raises:
-            ValueError: A promised port is missing.
+            ValueError: A promised port is missing, or has another size than its names promise.
         """
         builder.BuildInto(self)
-        ports = [self.get_output_port(i).get_name() for i in range(self.num_output_ports())]
-        required = REQUIRED_PORTS + (ASSESSMENT_PORTS if self.assessment else ())
-        missing = [name for name in required if name not in ports]
-        if missing:
-            raise ValueError(
-                f"task '{type(self).__name__}' exports no port {missing}; it exports {ports}"
-            )
+        for finding in check_ports(self):
+            if not finding.is_ok:
+                raise ValueError(finding.message)
 
     def check_assessment(self) -> None:
         """Refuses an assessment that was learned from something else.
@@ -167,6 +161,14 @@ class ClosedLoop(Diagram):
     @property
     def mirror_options(self) -> dict[str, Any]:
         """Options of the diagram that is this one in the mirror; empty where there is none."""
+        return {}
+
+    @property
+    def state_planes(self) -> Mapping[str, StatePlane]:
+        """Planes of starts on which the true safe set can be simulated, by name of the plan.
+
+        Empty for tasks whose state is more than two numbers that matter.
+        """
         return {}
 
     def goal_of(self, episode: Episode) -> np.ndarray:
@@ -268,6 +270,10 @@ class ClosedLoop(Diagram):
         """
         raise ValueError(f"task '{type(self).__name__}' cannot begin with a given start")
 
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the robot's posture, which the plan keeps; tasks with robots override it."""
+        raise ValueError(f"task '{type(self).__name__}' has no posture to stand in")
+
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
@@ -290,6 +296,19 @@ class ClosedLoop(Diagram):
             push: Where, how hard, when.
         """
         raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
+
+    def sample_push(self, rng: np.random.Generator) -> Push:
+        """A random push on the robot; tasks with pushes override this.
+
+        Args:
+            rng: Source of every draw.
+        """
+        raise ValueError(f"task '{type(self).__name__}' cannot push its robot's bodies")
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that are made of velocities; tasks may name more."""
+        return [name for name in self.state_names if is_rate(name)]
 
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int

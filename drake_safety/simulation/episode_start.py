@@ -14,6 +14,8 @@ from drake_safety.control.kinematics import RobotKinematics, fit_stance
 class EpisodeStart:
     """A plant state and a plan: what the nominal twin of an actual episode begins with.
 
+    What is said of a robot's state is of a robot; a task with a plant of its own has its own.
+
     Attributes:
         q: Positions in Drake's order: base quaternion (w, x, y, z), base position, joints, (n_q,).
         v: Velocities: of the base in the world, angular first, then of the joints, (n_v,).

@@ -69,6 +69,7 @@ def run_to_goal(
     log_period_s: float = 0.02,
     ports: tuple[str, ...] = (),
     realtime_rate: float = 0.0,
+    until_unsafe: bool = False,
 ) -> GoalMotion:
     """Carries out the plan from the standing posture to a goal, safe or not.
 
@@ -81,6 +82,7 @@ def run_to_goal(
         log_period_s: Time between two rows [s].
         ports: More output ports to log, into ``extra``.
         realtime_rate: How fast to run at most, for watching; 0 for as fast as it goes.
+        until_unsafe: Whether it ends where it leaves the safe set, not only at a fall.
 
     Raises:
         ValueError: The task's plans have no goal, or the robot has no such body to push.
@@ -104,6 +106,8 @@ def run_to_goal(
         margins = margins_port.Eval(context)
         if margins.min() < 0 and not cause:
             leave_s, cause = time, loop.constraint_names[int(np.argmin(margins))]
+            if until_unsafe:
+                break
         if margins[fall_column] < 0:
             fall_s = time
             break

@@ -66,8 +66,15 @@ class RandomPushes:
             rng: Source of every draw.
             body: The body that is pushed when :attr:`body` names none.
         """
-        if rng.random() >= self.share:
-            return None
+        return None if rng.random() >= self.share else self.draw(rng, body)
+
+    def draw(self, rng: np.random.Generator, body: str) -> Push:
+        """A push, whatever the share of episodes that begin with one.
+
+        Args:
+            rng: Source of every draw.
+            body: The body that is pushed when :attr:`body` names none.
+        """
         direction = rng.uniform(-np.pi, np.pi)
         strength = rng.uniform(self.force_n[0], self.force_n[1])
         return Push(

@@ -31,7 +31,8 @@ class Scenario:
     task: str = ""
     """Import path ``package.module:Class`` of a ClosedLoop."""
     robot: str = ""
-    """Name of a robot that comes with the package, or the path of a ``robot.yaml``."""
+    """Name of a robot that comes with the package, or the path of a ``robot.yaml``; empty for a
+    task that brings a plant of its own."""
     episode_duration_s: float = 2.0
     """T [s]."""
     step_s: float = 0.04
@@ -257,8 +258,11 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
         raw = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ValueError(f"scenario '{name}' is not YAML: {error}") from error
-    if not isinstance(raw, dict) or not {"task", "robot"} <= raw.keys():
-        raise ValueError(f"scenario '{name}' must be a mapping with the keys 'task' and 'robot'")
+    if not isinstance(raw, dict) or "task" not in raw:
+        raise ValueError(
+            f"scenario '{name}' must be a mapping with the key 'task', and 'robot' for a task that "
+            "takes one"
+        )
     parameters = raw.pop("parameters", None) or {}
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):

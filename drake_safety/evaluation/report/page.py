@@ -29,7 +29,7 @@ from drake_safety.evaluation.report.verdicts import other_figures, verdict_table
 from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_SVG_BYTES = 1_500_000  # A larger picture is embedded as PNG, which is then the smaller one.
-_KNOWN_PREFIXES = ("segments", "episodes", "throws", "plans")
+_KNOWN_PREFIXES = ("segments", "episodes", "throws", "plans", "monitoring")
 _SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
 
 

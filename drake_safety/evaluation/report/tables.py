@@ -25,7 +25,8 @@ class Column:
         key: The last part of a figure's key.
         title: Its heading.
         meaning: A sentence for somebody who has not read the paper.
-        unit: "", "%", "ms", "s", "of" for counts out of n, or "=" for what has no interval.
+        unit: "", "%", "ms", "s", "of" for counts out of n, "/h" for a rate, or "=" for what has no
+            interval.
         better: 1 where more is better, -1 where less is, 0 where neither.
         digits: After the decimal point.
     """
@@ -51,12 +52,12 @@ class Column:
             return f"{count} of {figure.n}"
         if math.isinf(figure.value):
             return "never"
-        space = "" if self.unit in ("", "=") else f" {self.unit}"
+        space = "" if self.unit in ("", "=", "/h") else f" {self.unit}"
         return f"{self._scale * figure.value:.{self.digits}f}{space}"
 
     def interval_text(self, figure: Figure | None) -> str:
         """Its interval in brackets, or nothing."""
-        if figure is None or self.unit not in ("", "%") or not math.isfinite(figure.value):
+        if figure is None or self.unit not in ("", "%", "/h") or not math.isfinite(figure.value):
             return ""
         if not (math.isfinite(figure.low) and math.isfinite(figure.high)):
             return ""

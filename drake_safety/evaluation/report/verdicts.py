@@ -15,6 +15,12 @@ LABELS = {
     "reachability": "inverse kinematics",
     "sharpened_literal_0.6": "sharpened, literal Γ",
     "paper_literal_0.6": "paper, literal Γ",
+    "sharpened_literal": "sharpened, literal Γ",
+    "sharpened_calibrated": "sharpened, by its heads",
+    "paper_literal": "paper, literal Γ",
+    "capture_point_margin": "capture point's margin",
+    "support_margin": "support polygon's margin",
+    "smallest_margin": "smallest margin (true state)",
 }
 _AUC = Column(
     key="auc",
@@ -92,6 +98,66 @@ _TRIGGER_COLUMNS = (
         digits=2,
     ),
 )
+_ALARM_COLUMNS = (
+    Column(
+        key="detected",
+        title="noticed in time",
+        meaning="Of the motions in which a push drives the robot out of its safe set, those in "
+        "which the alarm comes after the push and before that.",
+        unit="%",
+        better=1,
+        digits=1,
+    ),
+    Column(
+        key="lead_to_leaving_s",
+        title="before leaving",
+        meaning="Median time from the alarm until the robot leaves the safe set; an alarm that "
+        "never comes counts as later than any other.",
+        unit="s",
+        better=1,
+        digits=2,
+    ),
+    Column(
+        key="falls_detected",
+        title="falls noticed",
+        meaning="Of the motions that end in a fall, those with an alarm before it.",
+        unit="%",
+        better=1,
+        digits=1,
+    ),
+    Column(
+        key="lead_to_fall_s",
+        title="before the fall",
+        meaning="Median time from the alarm to the fall.",
+        unit="s",
+        better=1,
+        digits=2,
+    ),
+    Column(
+        key="false_alarms_per_hour",
+        title="false alarms per hour",
+        meaning="Alarms in motions that stay in the safe set, most of them pushed ones, per hour "
+        "of such motion; at most one a motion.",
+        unit="/h",
+        better=-1,
+        digits=0,
+    ),
+    Column(
+        key="undisturbed_false_alarms_per_hour",
+        title="undisturbed",
+        meaning="Alarms while nobody has pushed yet, per hour of such motion.",
+        unit="/h",
+        better=-1,
+        digits=0,
+    ),
+    Column(
+        key="auc",
+        title="AUC",
+        meaning="The probability that the lowest value in a motion that leaves the safe set is "
+        "below that in one that stays: 1 is perfect, 0.5 is guessing. It needs no threshold.",
+        better=1,
+    ),
+)
 _SET_TITLES = {
     "plans": "all targets",
     "plans.fair": "fair targets",
@@ -124,6 +190,7 @@ def verdict_tables(results: Results) -> list[Table]:
             (_AUC, _SAFE_RECALL, _UNSAFE_RECALL, _BRIER),
         ),
         _triggers(results),
+        alarm_table(results),
         *(
             _judges(
                 results,
@@ -258,6 +325,38 @@ def _triggers(results: Results) -> Table:
                 key=name,
                 label=label_of(name),
                 figures=_row(results, f"throws.{name}", _TRIGGER_COLUMNS),
+            )
+            for name in names
+        ],
+    )
+
+
+def alarm_table(results: Results) -> Table:
+    """Who notices a push, how long before, and how often for nothing."""
+    pattern = re.compile(r"monitoring\.(.+)\.lead_to_leaving_s")
+    names = [match[1] for key in results.figures if (match := pattern.fullmatch(key))]
+    share = Column(key="", title="", meaning="", unit="%", digits=1)
+    meaning = (
+        "Everyone may give as many false alarms on other motions: thresholds are chosen for that."
+    )
+    left = results.figures.get("monitoring.motions.leave_safe_set")
+    hours = results.figures.get("monitoring.motions.safe_hours")
+    if left is not None and hours is not None:
+        meaning += (
+            f" Of {left.n} fresh motions {share.value_text(left)} leave the safe set; the others "
+            f"make {hours.value:.2f} hours."
+        )
+    return Table(
+        key="monitoring",
+        title="Watching while it moves: pushes",
+        meaning=meaning,
+        corner="who watches",
+        columns=_ALARM_COLUMNS,
+        rows=[
+            Row(
+                key=name,
+                label=label_of(name),
+                figures=_row(results, f"monitoring.{name}", _ALARM_COLUMNS),
             )
             for name in names
         ],

@@ -1,0 +1,254 @@
+"""``drake-safety ablate``: what each choice in learning Γ is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.console import Stages, console, interval, new_table, open_stages, print_path
+from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.training_folder import (
+    MODES,
+    episodes_folder,
+    fresh_episodes_folder,
+    load_assessment,
+)
+
+if TYPE_CHECKING:
+    from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
+    from drake_safety.evaluation.ablation_study import AblationRow
+    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.learning.assessment import AssessmentParameters
+    from drake_safety.simulation.scenario import Scenario
+
+_COLUMNS = {
+    "auc": "AUC",
+    "auc_gain": "over the baseline",
+    "safe_recall": "safe recall",
+    "unsafe_recall": "unsafe recall",
+    "brier": "Brier",
+    "calibrated_auc": "AUC by the heads",
+    "k0.auc": "AUC, k = 0",
+    "k0.auc_gain": "over the baseline, k = 0",
+}
+_QUICK_EPISODES, _QUICK_TEST, _QUICK_CALIBRATION, _QUICK_EPOCHS = 256, 200, 100, 6
+
+
+def ablate(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="One variant a choice, one short-trained map each, fewer episodes."
+        ),
+    ] = False,
+    episodes: Annotated[
+        int | None, typer.Option(help="Fresh nominal episodes; 1000, or 200.", min=2)
+    ] = None,
+    calibration_episodes: Annotated[
+        int | None,
+        typer.Option(help="Other ones, for the recalls' thresholds; 300, or 100.", min=2),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the fresh ones: those of `evaluate` by default.")
+    ] = 1_000_000,
+    workers: WorkersOption = None,
+) -> None:
+    """Learn Γ anew with one choice made otherwise at a time, and judge it on the same episodes.
+
+    Every variant learns from the training episodes in ASSESSMENT. A row is written as soon as it is
+    finished: an ablation that was stopped goes on when it is called again. Feedback that `adapt`
+    has left in ASSESSMENT serves to compare what n_f may count.
+    """
+    from drake_safety.evaluation.ablation import list_variants
+    from drake_safety.evaluation.ablation_figure import ablation_figure
+    from drake_safety.evaluation.ablation_study import AblationFile, rows_to_csv, run_ablation
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.simulation.dataset import load_episodes
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    base = load_assessment(assessment, MODES[0]).parameters
+    training = load_episodes(episodes_folder(assessment))
+    if training.info.scenario_hash != loaded.simulation_hash():
+        raise ValueError(
+            f"ablate: the training episodes were made by scenario '{training.info.scenario}' with "
+            f"hash {training.info.scenario_hash[:12]}, but '{loaded.name}' now has hash "
+            f"{loaded.simulation_hash()[:12]}: train again"
+        )
+    if training.info.seed in (seed, seed + 3):
+        raise ValueError(
+            f"ablate: seeds {seed} and {seed + 3} would be used, and {training.info.seed} is the "
+            "training episodes' own; choose another"
+        )
+    num_training = len(training)
+    if quick:
+        num_training = min(num_training, _QUICK_EPISODES)
+        base = replace(base, ensemble_size=1, epochs=min(base.epochs, _QUICK_EPOCHS))
+    loop = loaded.make_loop()
+    variants, left_out = list_variants(
+        base,
+        num_training,
+        state_names=training.info.state_names,
+        rate_names=loop.rate_names,
+        quick=quick,
+    )
+    name = "ablation_quick" if quick else "ablation"
+    entries = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "scenario_hash": training.info.scenario_hash,
+        "seed": seed,
+        "training_seed": training.info.seed,
+        "training_episodes": num_training,
+        "versions": versions(),
+    }
+    file = AblationFile.open(assessment / f"{name}.json", entries)
+    with open_stages() as stages:
+        sets = _sets(
+            loaded,
+            assessment,
+            num_training,
+            episodes or (_QUICK_TEST if quick else 1000),
+            calibration_episodes or (_QUICK_CALIBRATION if quick else 300),
+            seed,
+            workers,
+            stages,
+        )
+        rows, failed = run_ablation(
+            variants,
+            base,
+            sets,
+            file,
+            version=versions()["drake_safety"],
+            num_workers=workers,
+            progress=partial(stages, "variants"),
+        )
+        counting = _counting(loaded, assessment)
+    if counting:
+        file.entries["n_f"] = {
+            f"{variation}.{mode}.{who}": {key: figure.to_json() for key, figure in figures.items()}
+            for (variation, mode), found in counting.items()
+            for who, figures in found.items()
+        }
+    else:
+        left_out["n_f"] = "there are no pairs with fresh episodes: `drake-safety adapt --evaluate`"
+    left_out |= failed
+    file.entries["left_out"] = left_out
+    file.write()
+    table = file.path.with_suffix(".csv")
+    table.write_text(rows_to_csv(rows), encoding="utf-8")
+    pictures = save(ablation_figure(rows), file.path)
+    console.print(_table(rows, base))
+    for (variation, mode), found in counting.items():
+        console.print(_counting_table(found, variation, mode))
+    for what, why in left_out.items():
+        console.print(f"left out, {what}: {why}", highlight=False, soft_wrap=True)
+    for path in (file.path, table, *pictures):
+        print_path("ablation", path)
+
+
+def _sets(
+    scenario: Scenario,
+    folder: Path,
+    num_training: int,
+    num_test: int,
+    num_calibration: int,
+    seed: int,
+    workers: int | None,
+    stages: Stages,
+) -> AblationSets:
+    """The training episodes, and fresh ones: what is not there yet is simulated and kept."""
+    from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
+    from drake_safety.simulation.rollouts import run_episodes
+
+    judging = dict(scenario.task_class().judging_options)
+
+    def fresh(what: str, count: int, own_seed: int) -> EpisodeSet:
+        path = fresh_episodes_folder(folder, scenario.simulation_hash(), own_seed, judging)
+        run_episodes(
+            scenario,
+            count,
+            seed=own_seed,
+            num_workers=workers,
+            path=path,
+            progress=partial(stages, what),
+            **judging,
+        )
+        return EpisodeSet(path=path, count=count)
+
+    return AblationSets(
+        training=EpisodeSet(path=episodes_folder(folder), count=num_training),
+        test=fresh("fresh nominal episodes", num_test, seed),
+        calibration=fresh("calibration episodes", num_calibration, seed + 3),
+    )
+
+
+def _counting(
+    scenario: Scenario, folder: Path
+) -> dict[tuple[str, str], dict[str, dict[str, Figure]]]:
+    """What n_f counts, for each plant that `adapt` has left pairs and fresh episodes of."""
+    from drake_safety.evaluation.ablation_adaptation import counting_figures
+    from drake_safety.evaluation.adaptation_study import TestSet
+    from drake_safety.learning.feedback import feedback_sets
+    from drake_safety.learning.segments import Episodes
+    from drake_safety.simulation.dataset import load_episodes
+
+    found = {}
+    for variation in scenario.variations:
+        hash_ = scenario.simulation_hash(variation)[:12]
+        for pairs in sorted((folder / "feedback").glob(f"{hash_}-*")):
+            own_seed = int(pairs.name.rpartition("-")[2])
+            # Beside the pairs, `adapt` keeps what it has judged by.
+            fresh = pairs.with_name(f"{hash_}-{own_seed + 1}") / variation
+            if not ((pairs / "nominal").is_dir() and fresh.is_dir()):
+                continue
+            nominal, actual = (load_episodes(pairs / name) for name in ("nominal", variation))
+            # Where `adapt` was stopped some twins are missing.
+            twins = {episode.index for episode in nominal}
+            paired = Episodes(actual.info, [one for one in actual if one.index in twins])
+            feedback = feedback_sets(paired, nominal)
+            for mode in MODES:
+                prior = load_assessment(folder, mode)
+                test = TestSet.of(load_episodes(fresh), prior.parameters.shortest)
+                found[variation, mode] = counting_figures(prior, feedback, test)
+    return found
+
+
+def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
+    n = rows[0].figures["k0.auc"].n
+    table = new_table(
+        "choice", "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
+    )
+    for i, row in enumerate(rows):
+        is_first = i == 0 or row.group != rows[i - 1].group
+        table.add_row(
+            row.group if is_first else "",
+            row.name,
+            *(interval(row.figures[key]) for key in _COLUMNS),
+        )
+    table.caption = (
+        f"baseline: δ {base.score_weight:g}, H {base.horizon}, perplexity {base.perplexity:g}, "
+        f"{base.resolution} × {base.resolution} cells, k_min {base.min_count}, mode '{base.mode}'"
+    )
+    return table
+
+
+def _counting_table(found: dict[str, dict[str, Figure]], variation: str, mode: str) -> Table:
+    columns = [key for key in _COLUMNS if not key.startswith(("k0.", "calibrated"))]
+    table = new_table(
+        "n_f",
+        *(_COLUMNS[key] for key in columns),
+        title=f"{mode}, the paper's adaptation to '{variation}'",
+    )
+    for who, figures in found.items():
+        table.add_row(who, *(interval(figures[key]) for key in columns))
+    return table

@@ -1,0 +1,125 @@
+"""A standing posture from a URDF alone: feet under the hips, all as low as each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RotationMatrix
+
+from drake_safety.control.urdf_survey import Limb, Survey
+
+_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Of the leg's length.
+_SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
+_TOLERANCE_M = 1e-3
+_STOP_RAD = 0.05  # Distance that the posture keeps from a joint's stops.
+_NUM_GUESSES = 10
+_FREE_RAD = 2.5  # Of a joint without stops.
+
+
+def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
+    """Joint positions in which the robot can stand.
+
+    Every foot stands under its hip, the joint where the long links begin, as far to the side as
+    where the straight leg ends, and is level if it has
+    more than one contact point; the base stands four fifths of a leg's length over the ground, or
+    what is nearest to that. Legs that spread at zero, as a spider's, keep half of their spread.
+    Of several solutions for a leg it takes one that bends the knee as most robots do (backwards;
+    forwards on two legs; upwards where legs spread), with small angles.
+
+    Args:
+        survey: The robot.
+        legs: Its legs.
+
+    Returns:
+        Positions of the legs' joints by name [rad].
+
+    Raises:
+        ValueError: No such posture is within the joints' stops.
+    """
+    survey.set_joints({})
+    solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
+    is_spread = any(solver.is_spread for solver in solvers)
+    reach: dict[str, float] = {}
+    for share in _SPREAD_SHARES if is_spread else _SHARES:
+        lowest = min(solver.hip[2] - share * solver.length for solver in solvers)
+        solved: dict[str, float] = {}
+        for solver in solvers:
+            angles = solver.solve(lowest)
+            if angles is None:
+                reach[solver.limb.name] = share
+                break
+            solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
+        else:
+            survey.set_joints(solved)
+            return {name: round(value, 4) for name, value in solved.items()}
+    raise ValueError(
+        f"no standing posture found: the feet {list(reach)} cannot be put under their hips, as low "
+        "as the others, within their joints' stops. Are these all feet (--feet)?"
+    )
+
+
+class _Leg:
+    def __init__(self, survey: Survey, limb: Limb, num_legs: int):
+        self.limb = limb
+        self._survey = survey
+        limits = np.array([survey.limits[name] for name in limb.joints])
+        limits = np.clip(limits, -_FREE_RAD, _FREE_RAD)
+        room = np.minimum(_STOP_RAD, 0.1 * (limits[:, 1] - limits[:, 0]))
+        self._bounds = limits[:, 0] + room, limits[:, 1] - room
+        neutral = [survey.joint_origin(name) for name in limb.joints]
+        foot = survey.positions(limb).mean(axis=0)
+        hops = np.linalg.norm(np.diff([*neutral, foot], axis=0), axis=1)
+        self._hip_index = int(np.argmax(hops > 0.6 * hops.max()))
+        # A knee is where the first long link ends.
+        self._knee_index = min(self._hip_index + 1, len(neutral) - 1)
+        self.hip = neutral[self._hip_index]
+        self.length = float(hops[self._hip_index :].sum())
+        self._R_BF = survey.pose(limb.body).rotation()
+        across = foot - self.hip
+        self.is_spread = abs(across[2]) < 0.3 * self.length
+        outwards = across[:2] / max(float(np.linalg.norm(across[:2])), 1e-9)
+        self.target = np.array([self.hip[0], foot[1]])
+        if self.is_spread:
+            self.target = self.hip[:2] + 0.5 * self.length * outwards
+        self._forwards = 1.0 if num_legs == 2 else -1.0
+
+    def _set(self, angles: np.ndarray) -> None:
+        self._survey.set_joints(dict(zip(self.limb.joints, angles.tolist(), strict=True)))
+
+    def solve(self, ground: float) -> np.ndarray | None:
+        """Angles that put the spheres' lowest points on the ground, under the hip."""
+        from scipy.optimize import least_squares
+
+        def errors(angles: np.ndarray) -> np.ndarray:
+            self._set(angles)
+            points = self._survey.positions(self.limb)
+            heights = points[:, 2] - self.limb.radius_m - ground
+            parts = [points[:, :2].mean(axis=0) - self.target, heights]
+            if len(points) > 1:
+                # Level, and turned as it is at zero.
+                R_FF = self._R_BF.inverse() @ self._survey.pose(self.limb.body).rotation()
+                yaw = RotationMatrix(R_FF).ToAngleAxis()
+                parts.append(0.1 * yaw.angle() * np.asarray(yaw.axis()))
+            return np.concatenate(parts)
+
+        def residual(angles: np.ndarray) -> np.ndarray:
+            return np.concatenate([errors(angles), 1e-4 * angles])
+
+        low, high = self._bounds
+        rng = np.random.default_rng(0)
+        best: tuple[float, np.ndarray] | None = None
+        for index in range(_NUM_GUESSES):
+            guess = np.clip(np.zeros(len(low)) if index == 0 else rng.uniform(low, high), low, high)
+            found = least_squares(residual, guess, bounds=(low, high), max_nfev=40)
+            if np.abs(errors(found.x)).max() > _TOLERANCE_M:
+                continue
+            score = self._oddness(found.x)
+            if best is None or score < best[0]:
+                best = (score, found.x)
+        return None if best is None else best[1]
+
+    def _oddness(self, angles: np.ndarray) -> float:
+        self._set(angles)
+        knee = self._survey.joint_origin(self.limb.joints[self._knee_index])
+        bend = (knee - self._survey.joint_origin(self.limb.joints[self._hip_index])) / self.length
+        wanted = bend[2] if self.is_spread else self._forwards * bend[0]
+        return float(np.sum(angles**2) + (1.5 if wanted < -0.01 else 0.0))

@@ -1,0 +1,324 @@
+"""What a URDF tells of a robot: its base, its legs and arms, and where its feet touch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import Joint
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_safety.control.robot import add_to_package_map
+
+_CORNER_RADIUS_M = 0.005  # Of the spheres at the corners of a flat foot.
+_GUESSED_RADIUS_M = 0.02
+_LEVEL_M = 0.005  # Spheres that lie this much higher than the lowest still touch.
+
+
+@dataclass(kw_only=True)
+class Limb:
+    """A leg or an arm.
+
+    Attributes:
+        name: That of its last body.
+        body: The body at its end, which touches the ground or reaches.
+        joints: Its own joints, from the base on.
+        points: Where it touches: centres of spheres in the body's frame, (n, 3) [m].
+        radius_m: Of the spheres.
+        is_own_shape: Whether the URDF has these spheres.
+        is_guess: Whether the URDF says nothing of what touches.
+    """
+
+    name: str
+    body: str
+    joints: list[str]
+    points: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    radius_m: float = _GUESSED_RADIUS_M
+    is_own_shape: bool = False
+    is_guess: bool = True
+
+
+class Survey:
+    """A URDF, read by Drake, its base at the world's origin and its joints as near zero as can be.
+
+    Args:
+        path: The URDF.
+        lost_shapes: Boxes around collision meshes that the URDF has lost, by link.
+
+    Raises:
+        ValueError: Drake cannot read it, it has no floating base, or a joint has more than one
+            degree of freedom.
+    """
+
+    def __init__(self, path: Path, lost_shapes: dict[str, list[np.ndarray]] | None = None):
+        builder = DiagramBuilder()
+        plant: MultibodyPlant
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+        parser = Parser(plant)
+        add_to_package_map(parser.package_map())
+        try:
+            (self.instance,) = parser.AddModels(str(path))
+            plant.Finalize()
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"Drake cannot read '{path}': {error}") from error
+        self.plant, self._scene_graph = plant, scene_graph
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self.context = plant.GetMyMutableContextFromRoot(self._root)
+        self._lost = lost_shapes or {}
+        floating = [
+            plant.get_body(i).name()
+            for i in plant.GetBodyIndices(self.instance)
+            if plant.get_body(i).is_floating_base_body()
+        ]
+        if len(floating) != 1:
+            raise ValueError(
+                f"'{path}' must have one body that nothing holds, its base; got "
+                f"{floating or 'none'}. Take a link 'world' out, with its joint"
+            )
+        (self.base,) = floating
+        joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
+        odd = [j.name() for j in joints if 1 < j.num_velocities() < 6]
+        if odd:
+            raise ValueError(f"'{path}': joints {odd} have more than one degree of freedom")
+        self.joints: list[Joint] = sorted(
+            (j for j in joints if j.num_velocities() == 1), key=lambda j: j.position_start()
+        )
+        self.limits = {
+            joint.name(): (joint.position_lower_limit(), joint.position_upper_limit())
+            for joint in self.joints
+        }
+        self._index = {joint.name(): joint.position_start() for joint in self.joints}
+        self._neutral = plant.GetPositions(self.context)
+        for name, (low, high) in self.limits.items():
+            self._neutral[self._index[name]] = min(max(0.0, low), high)
+        self._above = {joint.child_body().name(): joint for joint in joints}
+        self.set_joints({})
+        self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
+
+    def set_joints(self, values: dict[str, float]) -> None:
+        """Sets the joints [rad]: those that are not named as near zero as their limits allow."""
+        q = self._neutral.copy()
+        for name, value in values.items():
+            q[self._index[name]] = value
+        self.plant.SetPositions(self.context, q)
+
+    def chain(self, body: str) -> list[str]:
+        """Joints that move a body, from the base on."""
+        found: list[str] = []
+        while body in self._above:
+            joint = self._above[body]
+            if joint.num_velocities() == 1:
+                found.append(joint.name())
+            body = joint.parent_body().name()
+        return found[::-1]
+
+    def pose(self, body: str) -> RigidTransform:
+        """Pose of a body in the base's frame."""
+        return self.plant.GetBodyByName(body, self.instance).EvalPoseInWorld(self.context)
+
+    def joint_origin(self, joint: str) -> np.ndarray:
+        """Where a joint is, in the base's frame, (3,) [m]."""
+        frame = self.plant.GetJointByName(joint, self.instance).frame_on_child()
+        return frame.CalcPoseInWorld(self.context).translation()
+
+    def positions(self, limb: Limb) -> np.ndarray:
+        """Centres of a limb's contact spheres in the base's frame, (n, 3) [m]."""
+        return (self.pose(limb.body) @ limb.points.T).T
+
+    def center_of_mass(self) -> np.ndarray:
+        """In the base's frame, (3,) [m]."""
+        return self.plant.CalcCenterOfMassPositionInWorld(self.context, [self.instance])
+
+    def leaves(self) -> list[list[str]]:
+        """Groups of bodies, welded to each other, beyond which nothing moves."""
+        carries = {name for joint in self.joints for name in self._welded(joint.parent_body())}
+        groups = []
+        for joint in self.joints:
+            group = self._welded(joint.child_body())
+            if not carries & set(group):
+                groups.append(group)
+        return groups
+
+    def _welded(self, body: object) -> list[str]:
+        return [b.name() for b in self.plant.GetBodiesWeldedTo(body)]
+
+    def legs(self, feet: list[str] | None = None) -> list[Limb]:
+        """The limbs that reach lowest, or those that end in the given links.
+
+        Args:
+            feet: Links that touch the ground; found by their height by default.
+
+        Raises:
+            ValueError: There is no such link, it ends no limb, or there are fewer than two feet.
+        """
+        groups = self.leaves()
+        if feet is None:
+            lowest = [self._lowest(group) for group in groups]
+            floor = min(lowest, default=0.0)
+            # Arms that hang end well above the ground.
+            groups = [
+                group
+                for group, z in zip(groups, lowest, strict=True)
+                if z <= floor + max(-0.25 * floor, 0.02) and len(self.chain(group[0])) >= 2
+            ]
+        else:
+            for name in feet:
+                if not any(name in group for group in groups):
+                    raise ValueError(
+                        f"no limb ends in link '{name}'; limbs end in "
+                        f"{[name for group in groups for name in group]}"
+                    )
+            groups = [group for group in groups if set(group) & set(feet)]
+        if len(groups) < 2:
+            raise ValueError(
+                f"found {len(groups)} feet, of at least 2: name the links that touch the ground by "
+                f"--feet; limbs end in {[name for g in self.leaves() for name in g]}"
+            )
+        limbs = [self._leg(group) for group in groups]
+        shared = set.intersection(*(set(limb.joints) for limb in limbs))
+        for limb in limbs:
+            limb.joints = [name for name in limb.joints if name not in shared]
+        # Those in front first, and of those the right one: the order is for people alone.
+        limbs.sort(
+            key=lambda limb: tuple(np.round(self.positions(limb).mean(axis=0), 1) * [-1, 1, 0])
+        )
+        return limbs
+
+    def arms(self, legs: list[Limb]) -> list[Limb]:
+        """Other limbs of four joints or more; fingers belong to the body that carries them.
+
+        Args:
+            legs: The legs.
+        """
+        feet = {limb.body for limb in legs}
+        chains = [
+            (self.chain(group[0]), group)
+            for group in self.leaves()
+            if not feet & set(group) and len(self.chain(group[0])) >= 4
+        ]
+        arms: dict[tuple[str, ...], list] = {}
+        for chain, group in chains:
+            arms.setdefault(tuple(chain[:4]), []).append((chain, group))
+        found = []
+        for members in arms.values():
+            shared = [
+                names[0]
+                for names in zip(*(chain for chain, _ in members), strict=False)
+                if len(set(names)) == 1
+            ]
+            if len(members) == 1:
+                body = members[0][1][-1]
+            else:
+                joint = self.plant.GetJointByName(shared[-1], self.instance)
+                body = joint.child_body().name()
+            limb = Limb(name=body, body=body, joints=shared)
+            # Arms hang on a torso that is not theirs.
+            others = [set(c[0][0]) for key, c in arms.items() if key != tuple(shared[:4])]
+            limb.joints = [name for name in shared if not any(name in other for other in others)]
+            found.append(limb)
+        return found
+
+    def overlaps(self) -> set[tuple[str, str]]:
+        """Pairs of links that touch each other as the joints stand."""
+        query = self._scene_graph.get_query_output_port().Eval(
+            self._scene_graph.GetMyContextFromRoot(self._root)
+        )
+        inspector = query.inspector()
+
+        def link(geometry: GeometryId) -> str:
+            return self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
+
+        found = set()
+        for pair in query.ComputePointPairPenetration():
+            one, other = sorted((link(pair.id_A), link(pair.id_B)))
+            found.add((one, other))
+        return found
+
+    def _lowest(self, group: list[str]) -> float:
+        shapes = self._shapes(group)
+        if shapes:
+            return min(float(points[:, 2].min()) - radius for _, points, radius, _ in shapes)
+        return min(float(self.pose(name).translation()[2]) for name in group)
+
+    def _leg(self, group: list[str]) -> Limb:
+        joints = self.chain(group[0])
+        shapes = self._shapes(group)
+        # The body that is named foot, or the one farthest out.
+        body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
+        if not shapes:
+            return Limb(name=body, body=body, joints=joints)
+        lows = [float(points[:, 2].min()) - radius for _, points, radius, _ in shapes]
+        name, points, radius, is_sphere = shapes[int(np.argmin(lows))]
+        if is_sphere:
+            points = np.concatenate(
+                [
+                    other
+                    for (body_name, other, r, sphere), low in zip(shapes, lows, strict=True)
+                    if sphere
+                    and body_name == name
+                    and abs(r - radius) < 1e-6
+                    and low < min(lows) + _LEVEL_M
+                ]
+            )
+        else:
+            lowest = float(points[:, 2].min())
+            points = points[points[:, 2] < lowest + _LEVEL_M + radius]
+        return Limb(
+            name=name,
+            body=name,
+            joints=joints,
+            points=(self.pose(name).inverse() @ points.T).T,
+            radius_m=radius,
+            is_own_shape=is_sphere,
+            is_guess=False,
+        )
+
+    def _shapes(self, group: list[str]) -> list[tuple[str, np.ndarray, float, bool]]:
+        """Shapes of bodies: body, where spheres stand for it (n, 3), their radius, is it one."""
+        inspector = self._scene_graph.model_inspector()
+        found: list[tuple[str, np.ndarray, float, bool]] = []
+        for name in group:
+            X_WB = self.pose(name)
+            body = self.plant.GetBodyByName(name, self.instance)
+            for geometry in self.plant.GetCollisionGeometriesForBody(body):
+                shape = inspector.GetShape(geometry)
+                X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
+                if isinstance(shape, Sphere):
+                    found.append((name, X_WG.translation()[None], shape.radius(), True))
+                elif isinstance(shape, Box):
+                    found.append((name, *_corners(X_WG, np.array(shape.size()) / 2), False))
+                elif isinstance(shape, Capsule | Cylinder):
+                    radius = shape.radius()
+                    half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
+                    ends = np.array([[0, 0, -half], [0, 0, half]]) if half > 0 else np.zeros((1, 3))
+                    found.append((name, (X_WG @ ends.T).T, radius, False))
+                else:
+                    box = inspector.GetObbInGeometryFrame(geometry)
+                    if box is not None:
+                        X_WO = X_WG @ box.pose()
+                        found.append((name, *_corners(X_WO, np.array(box.half_width())), False))
+            for low, high in self._lost.get(name, []):
+                X_WO = X_WB @ RigidTransform((low + high) / 2)
+                found.append((name, *_corners(X_WO, (high - low) / 2), False))
+        return found
+
+
+def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
+    """Spheres in place of a box: at its corners, or one below where it is small."""
+    if np.sort(half)[:2].max() < 0.035 and np.linalg.norm(half) < 0.12:
+        radius = float(np.sort(half)[0])
+        down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]
+        axis = int(np.argmax(np.abs(down)))
+        point = np.zeros(3)
+        point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
+        return (X_WG @ point)[None], radius
+    inner = half - _CORNER_RADIUS_M
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M

@@ -1,0 +1,330 @@
+"""Ablations: what each choice is worth, one changed at a time and learned anew.
+
+Every variant learns from the same stored episodes and is judged at the same rows of the same fresh
+ones, whatever it sees of them.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from drake_safety.evaluation.metrics import (
+    Bootstrap,
+    Figure,
+    auc,
+    auc_difference,
+    segment_figures,
+    threshold_at,
+)
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.simulation.dataset import load_episodes
+
+BASELINE = "baseline"
+_SCORE_WEIGHTS = (0.0, 0.001, 0.01, 0.1, 0.3)
+_PERPLEXITIES = (10.0, 30.0, 60.0)
+_RESOLUTIONS = (7, 14, 20, 28, 40)
+_MIN_COUNTS = (1, 5, 20, 50)
+_HORIZON_SHARES = (0.2, 0.5)
+_EPISODE_SHARES = (0.125, 0.25, 0.5)
+# What stands for its group in a hurry.
+_QUICK = {
+    "score_weight=0.1",
+    "perplexity=10",
+    "resolution=20",
+    "min_count=20",
+    "horizon=half",
+    "episodes=half",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One choice that is made otherwise.
+
+    Attributes:
+        name: Its key.
+        group: Which choice it is about.
+        changes: Parameters that differ from the baseline's.
+        num_episodes: How many of the training episodes it learns from; None for all.
+        without: States and features that it does not see.
+    """
+
+    name: str
+    group: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    num_episodes: int | None = None
+    without: Sequence[str] = ()
+
+    def parameters(self, base: AssessmentParameters) -> AssessmentParameters:
+        """The baseline's parameters with the changes."""
+        return replace(copy.deepcopy(base), **self.changes)
+
+    def recut(self, episodes: Episodes, horizon: int) -> Episodes:
+        """The episodes as the variant sees them.
+
+        A shorter horizon is the beginning of the preview that was recorded.
+
+        Args:
+            episodes: As they were recorded.
+            horizon: The variant's own, at most the recorded one.
+        """
+        info = episodes.info
+        states = _kept(info.state_names, self.without)
+        features = _kept(info.feature_names, self.without)
+        num_preview = horizon * len(info.output_names)
+        return Episodes(
+            replace(
+                info,
+                horizon=horizon,
+                state_names=[info.state_names[i] for i in states],
+                feature_names=[info.feature_names[i] for i in features],
+            ),
+            [
+                replace(
+                    episode,
+                    state=episode.state[:, states],
+                    true_state=episode.true_state[:, states],
+                    features=episode.features[:, features],
+                    desired_preview=episode.desired_preview[:, :num_preview],
+                )
+                for episode in episodes
+            ],
+        )
+
+
+def _kept(names: Sequence[str], without: Sequence[str]) -> list[int]:
+    return [i for i, name in enumerate(names) if name not in without]
+
+
+def list_variants(
+    base: AssessmentParameters,
+    num_episodes: int,
+    *,
+    state_names: Sequence[str],
+    rate_names: Sequence[str],
+    quick: bool = False,
+) -> tuple[list[Variant], dict[str, str]]:
+    """What is varied, the baseline first, and what cannot be varied and why.
+
+    Args:
+        base: The baseline's parameters.
+        num_episodes: How many episodes there are to learn from.
+        state_names: Columns of the state.
+        rate_names: States and features that are made of velocities.
+        quick: Whether one variant a choice is enough.
+
+    Returns:
+        The variants, and by choice the reason why it is left out.
+    """
+    found = [Variant(name=BASELINE, group=BASELINE)]
+
+    def vary(group: str, name: str, values: Sequence[Any], **more: Sequence[Any]) -> None:
+        for i, value in enumerate(values):
+            if value != getattr(base, name):
+                changes = {name: value, **{key: one[i] for key, one in more.items()}}
+                found.append(Variant(name=f"{name}={value:g}", group=group, changes=changes))
+
+    vary("score weight δ", "score_weight", _SCORE_WEIGHTS)
+    shortened = {max(1, round(share * base.horizon)): share for share in _HORIZON_SHARES}
+    for horizon, share in shortened.items():
+        if horizon < base.horizon:
+            found.append(
+                Variant(
+                    name="horizon=half" if share == 0.5 else f"horizon={horizon}",
+                    group="horizon H",
+                    changes={
+                        "horizon": horizon,
+                        "shortest_segment": min(base.shortest_segment, horizon),
+                    },
+                )
+            )
+    vary("perplexity", "perplexity", _PERPLEXITIES)
+    width = base.resolution * base.cell_length
+    lengths = [width / resolution for resolution in _RESOLUTIONS]
+    vary("resolution", "resolution", _RESOLUTIONS, cell_length=lengths)
+    vary("k_min", "min_count", _MIN_COUNTS)
+    for share in _EPISODE_SHARES:
+        count = round(share * num_episodes)
+        name = "episodes=half" if share == 0.5 else f"episodes={count}"
+        if count:
+            found.append(Variant(name=name, group="episodes", num_episodes=count))
+    left_out = {
+        "horizon H": "longer horizons need outputs that were desired beyond what is recorded"
+    }
+    rates = [name for name in rate_names if name in state_names]
+    if rates:
+        found.append(Variant(name="state_without_velocities", group="velocities", without=rates))
+        if len(rates) < len(rate_names):
+            found.append(
+                Variant(name="without_velocities", group="velocities", without=list(rate_names))
+            )
+    else:
+        left_out["velocities"] = "none of the states is known to be a velocity"
+    if base.is_sharpened:
+        found.append(Variant(name="paper", group="mode", changes={"mode": "paper"}))
+        # Literally read, the paper's mode stands and falls with its score weight.
+        found.append(
+            Variant(
+                name="paper_score_weight=0.1",
+                group="mode",
+                changes={"mode": "paper", "score_weight": 0.1},
+            )
+        )
+    if quick:
+        groups = ("baseline", "velocities", "mode")
+        found = [one for one in found if one.name in _QUICK or one.group in groups]
+    return found, left_out
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeSet:
+    """The first episodes of a folder.
+
+    Attributes:
+        path: The folder.
+        count: How many of them.
+    """
+
+    path: str | os.PathLike[str]
+    count: int
+
+    def load(self) -> Episodes:
+        """Reads them; a worker process does so once."""
+        return _loaded(os.fspath(self.path))[: self.count]
+
+
+@lru_cache(maxsize=3)
+def _loaded(path: str) -> Episodes:
+    return load_episodes(path)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VariantScores:
+    """What a variant takes the fresh segments to be: 1 - Γ.
+
+    Attributes:
+        calibration: Of the calibration's segments, by b_safe / (1 - μ), (M,).
+        test: Of the test's, likewise, (N,).
+        calibrated: Of the test's, by the maps' heads, (N,); the paper's mode has none, and gives
+            what `test` has.
+    """
+
+    calibration: np.ndarray
+    test: np.ndarray
+    calibrated: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationSets:
+    """What all variants learn from and are judged by.
+
+    Attributes:
+        training: Stored training episodes.
+        calibration: Fresh ones, for the thresholds of the recalls.
+        test: Other fresh ones.
+    """
+
+    training: EpisodeSet
+    calibration: EpisodeSet
+    test: EpisodeSet
+
+
+def unsafe_scores(
+    variant: Variant, base: AssessmentParameters, sets: AblationSets
+) -> VariantScores:
+    """Trains a variant and has it score the fresh segments.
+
+    Args:
+        variant: What is made otherwise.
+        base: The baseline's parameters.
+        sets: The episodes.
+
+    Raises:
+        ValueError: The variant cannot be learned from so few episodes.
+    """
+    parameters = variant.parameters(base)
+    training = sets.training.load()
+    if variant.num_episodes is not None:
+        training = training[: variant.num_episodes]
+    assessment = SafetyAssessment(parameters).fit(variant.recut(training, parameters.horizon))
+    found = []
+    for episodes in (sets.calibration.load(), sets.test.load()):
+        # The baseline's rows: others must not be judged at easier ones.
+        segments = judged_segments(episodes, base)
+        info = episodes.info
+        states = _kept(info.state_names, variant.without)
+        features = _kept(info.feature_names, variant.without)
+        state = segments.state if parameters.is_sharpened else segments.true_state
+        result = assessment.predict(
+            state[:, states],
+            segments.desired_preview[:, : parameters.horizon * len(info.output_names)],
+            segments.features[:, features] if assessment.uses_features else None,
+        )
+        found.append(result)
+    seen, judged = found
+    return VariantScores(
+        calibration=1.0 - seen.normalized,
+        test=1.0 - judged.normalized,
+        calibrated=1.0 - judged.calibrated,
+    )
+
+
+def judged_segments(episodes: Episodes, base: AssessmentParameters) -> Segments:
+    """The segments of fresh episodes that everyone is judged by."""
+    return split(episodes, stride=1, discount=1.0, shortest=base.shortest)
+
+
+def variant_figures(
+    scores: VariantScores,
+    baseline_score: np.ndarray,
+    calibration: Segments,
+    test: Segments,
+    *,
+    bootstrap: Bootstrap | None = None,
+) -> dict[str, Figure]:
+    """How well a variant judges, and by how much better than the baseline.
+
+    Args:
+        scores: Its unsafe scores of M and N segments.
+        baseline_score: The baseline's of the test's, (N,).
+        calibration: The M segments.
+        test: The N segments.
+        bootstrap: How intervals are found.
+
+    Returns:
+        `auc`, `safe_recall`, `unsafe_recall`, `brier` and `auc_gain` of all segments, and "k0.…" of
+        the first of each episode; `calibrated_auc` is by the maps' heads. Recalls are at the
+        threshold of best balanced accuracy.
+    """
+    bootstrap = bootstrap or Bootstrap()
+    calibration_score, score = scores.calibration, scores.test
+    figures: dict[str, Figure] = {}
+    rows_of = {
+        "": (np.ones(len(test), dtype=bool), np.ones(len(calibration), dtype=bool)),
+        "k0.": (test.is_first, calibration.is_first),
+    }
+    for prefix, (rows, seen) in rows_of.items():
+        threshold = threshold_at(calibration_score[seen], calibration.is_unsafe[seen])
+        found = segment_figures(
+            test.take(rows), score[rows], threshold=threshold, bootstrap=bootstrap
+        )
+        found["auc_gain"] = auc_difference(
+            score[rows],
+            baseline_score[rows],
+            test.is_unsafe[rows],
+            test.episode[rows],
+            bootstrap=bootstrap,
+        )
+        found["calibrated_auc"] = auc(
+            scores.calibrated[rows], test.is_unsafe[rows], test.episode[rows], bootstrap=bootstrap
+        )
+        figures |= {f"{prefix}{key}": figure for key, figure in found.items()}
+    return figures

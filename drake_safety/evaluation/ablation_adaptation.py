@@ -1,0 +1,60 @@
+"""What n_f counts in the paper's adaptation: samples of the cell, or literally all feedback."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_safety.evaluation.adaptation_study import THRESHOLD, TestSet
+from drake_safety.evaluation.metrics import Bootstrap, Figure, auc_difference, segment_figures
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.feedback import FeedbackSet
+
+BEFORE, PER_CELL, TOTAL = "before_feedback", "n_f_per_cell", "n_f_total"
+
+
+def counting_figures(
+    prior: SafetyAssessment,
+    feedback: Sequence[FeedbackSet],
+    test: TestSet,
+    *,
+    bootstrap: Bootstrap | None = None,
+) -> dict[str, dict[str, Figure]]:
+    """Judges an assessment before feedback, and after it with either count.
+
+    Args:
+        prior: The assessment, as it was learned.
+        feedback: The feedback sets.
+        test: Fresh episodes of the actual robot.
+        bootstrap: How intervals are found.
+
+    Returns:
+        By who is judged, the figures of every segment by key; `auc_gain` is over the prior.
+    """
+    bootstrap = bootstrap or Bootstrap()
+    judged = {BEFORE: prior}
+    for name, counts_per_cell in ((PER_CELL, True), (TOTAL, False)):
+        one = copy.copy(prior)
+        settings = replace(prior.parameters.adaptation, counts_per_cell=counts_per_cell)
+        one.parameters = replace(prior.parameters, adaptation=settings)
+        judged[name] = one.adapt(feedback, method="paper")
+    segments = test.segments
+    scores = {name: _unsafe_score(one, test) for name, one in judged.items()}
+    found = {}
+    for name, score in scores.items():
+        found[name] = segment_figures(
+            segments, score, threshold=1.0 - THRESHOLD, bootstrap=bootstrap
+        )
+        found[name]["auc_gain"] = auc_difference(
+            score, scores[BEFORE], segments.is_unsafe, segments.episode, bootstrap=bootstrap
+        )
+    return found
+
+
+def _unsafe_score(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
+    segments = test.segments
+    features = segments.features if assessment.uses_features else None
+    return 1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized

@@ -1,0 +1,246 @@
+"""Conducts ablations: a row a variant, kept as soon as it is there; a stopped one goes on."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_safety.evaluation.ablation import (
+    BASELINE,
+    AblationSets,
+    Variant,
+    VariantScores,
+    judged_segments,
+    unsafe_scores,
+    variant_figures,
+)
+from drake_safety.evaluation.metrics import Bootstrap, Figure
+from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.simulation.rollouts import parallel_map
+
+_SCHEMA = "drake_safety.ablation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationRow:
+    """What became of one variant.
+
+    Attributes:
+        name: Of the variant.
+        group: Which choice it is about.
+        fingerprint: Of all that decides the figures.
+        figures: By key.
+    """
+
+    name: str
+    group: str
+    fingerprint: str
+    figures: Mapping[str, Figure]
+
+
+@dataclass(kw_only=True)
+class AblationFile:
+    """The rows that are done, in a JSON file that is whole at any time.
+
+    Attributes:
+        path: The file.
+        entries: What else it says, such as command and versions.
+        rows: By name of the variant.
+    """
+
+    path: Path
+    entries: dict[str, Any] = field(default_factory=dict)
+    rows: dict[str, AblationRow] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, path: Path, entries: Mapping[str, Any]) -> AblationFile:
+        """Reads what an earlier run has left, if anything.
+
+        Raises:
+            ValueError: The file is another's.
+        """
+        opened = cls(path=path, entries=dict(entries))
+        if not path.is_file():
+            return opened
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content["schema"] != _SCHEMA:
+                raise ValueError(f"its schema is {content['schema']!r}")
+            for row in content["rows"]:
+                figures = {key: _figure(value) for key, value in row.pop("figures").items()}
+                opened.rows[row["name"]] = AblationRow(**row, figures=figures)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"{path} holds no ablation: {error!r}") from error
+        return opened
+
+    def keep(self, row: AblationRow) -> None:
+        """Adds a row and writes the file, first under a temporary name."""
+        self.rows[row.name] = row
+        self.write()
+
+    def write(self) -> None:
+        """Writes the file, first under a temporary name."""
+        rows = [
+            {**vars(row), "figures": {key: f.to_json() for key, f in row.figures.items()}}
+            for row in self.rows.values()
+        ]
+        text = json.dumps({"schema": _SCHEMA, **self.entries, "rows": rows}, indent=2)
+        temporary = self.path.with_name(f".{self.path.name}.tmp")
+        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.replace(self.path)
+
+
+def _figure(fields: Mapping[str, Any]) -> Figure:
+    value, low, high = (
+        math.nan if fields[name] is None else float(fields[name])
+        for name in ("value", "low", "high")
+    )
+    return Figure(value, low, high, int(fields["n"]))
+
+
+def rows_to_csv(rows: Sequence[AblationRow]) -> str:
+    """The rows as CSV: value, ends of the interval and n of every figure."""
+    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    ends = ("value", "low", "high", "n")
+    columns = [key if end == "value" else f"{key}.{end}" for key in keys for end in ends]
+    writer.writerow(["choice", "variant", *columns])
+    for row in rows:
+        cells: list[Any] = [row.group, row.name]
+        for key in keys:
+            figure = row.figures.get(key)
+            fields = {} if figure is None else figure.to_json()
+            cells += ["" if fields.get(end) is None else fields[end] for end in ends]
+        writer.writerow(cells)
+    return out.getvalue()
+
+
+def fingerprint(
+    variant: Variant, base: AssessmentParameters, sets: AblationSets, version: str
+) -> str:
+    """Of all that decides a row: what is varied, from what, on which episodes, by which version."""
+    described = {
+        name: [one.load().info.scenario_hash, one.load().info.seed, one.count]
+        for name, one in vars(sets).items()
+    }
+    text = json.dumps(
+        [
+            asdict(variant.parameters(base)),
+            asdict(base),
+            variant.num_episodes,
+            list(variant.without),
+            described,
+            version,
+        ],
+        sort_keys=True,
+    )
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def run_ablation(
+    variants: Sequence[Variant],
+    base: AssessmentParameters,
+    sets: AblationSets,
+    file: AblationFile,
+    *,
+    version: str,
+    bootstrap: Bootstrap | None = None,
+    num_workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[AblationRow], dict[str, str]]:
+    """Trains and judges every variant that the file does not know yet.
+
+    The baseline's scores are kept beside the file: differences to it are paired.
+
+    Args:
+        variants: What is varied; the baseline among them.
+        base: The baseline's parameters.
+        sets: The episodes.
+        file: Where rows are kept as they finish.
+        version: Of the package.
+        bootstrap: How intervals are found.
+        num_workers: Processes; as many as there are cores by default.
+        progress: Called with the number done and the number wanted.
+
+    Returns:
+        The rows in the order of the variants, and by variant why it could not be learned.
+
+    Raises:
+        ValueError: The baseline is not among the variants, or cannot be learned.
+    """
+    baseline = next((one for one in variants if one.name == BASELINE), None)
+    if baseline is None:
+        raise ValueError(f"ablation: there is no variant '{BASELINE}' to compare with")
+    marks = {one.name: fingerprint(one, base, sets, version) for one in variants}
+    calibration, test = (judged_segments(s.load(), base) for s in (sets.calibration, sets.test))
+    # Rows of other episodes, parameters or versions are not of this ablation.
+    file.rows = {n: row for n, row in file.rows.items() if row.fingerprint == marks.get(n)}
+
+    def is_known(variant: Variant) -> bool:
+        return variant.name in file.rows
+
+    def keep(variant: Variant, scores: VariantScores, reference: np.ndarray) -> None:
+        figures = variant_figures(scores, reference, calibration, test, bootstrap=bootstrap)
+        file.keep(
+            AblationRow(
+                name=variant.name,
+                group=variant.group,
+                fingerprint=marks[variant.name],
+                figures=figures,
+            )
+        )
+
+    done = 0
+
+    def report(more: int) -> None:
+        nonlocal done
+        done += more
+        if progress is not None:
+            progress(done, len(variants))
+
+    report(0)
+    # In its name what it is of: it is whole and fits, or it is not there.
+    kept_scores = file.path.with_name(f".{file.path.stem}-{marks[BASELINE]}.npy")
+    if is_known(baseline) and kept_scores.is_file():
+        reference = np.load(kept_scores, allow_pickle=False)
+    else:
+        own = unsafe_scores(baseline, base, sets)
+        reference = own.test
+        temporary = kept_scores.with_suffix(".tmp.npy")
+        np.save(temporary, reference, allow_pickle=False)
+        temporary.replace(kept_scores)
+        keep(baseline, own, reference)
+    others = [one for one in variants if one is not baseline]
+    missing = [one for one in others if not is_known(one)]
+    report(1 + len(others) - len(missing))
+    failed: dict[str, str] = {}
+    by_name = {one.name: one for one in missing}
+    arguments = [(one, base, sets) for one in missing]
+    for name, scores, why in parallel_map(_scores_or_why_not, arguments, num_workers):
+        if scores is None:
+            failed[name] = why
+        else:
+            keep(by_name[name], scores, reference)
+        report(1)
+    file.rows = {one.name: file.rows[one.name] for one in variants if is_known(one)}
+    file.write()
+    return list(file.rows.values()), failed
+
+
+def _scores_or_why_not(
+    variant: Variant, base: AssessmentParameters, sets: AblationSets
+) -> tuple[str, VariantScores | None, str]:
+    try:
+        return variant.name, unsafe_scores(variant, base, sets), ""
+    except ValueError as error:
+        return variant.name, None, str(error)

@@ -1,0 +1,120 @@
+"""Alarms: whoever watches a motion and cries when a number falls below a threshold.
+
+The number of an alarm is larger where the robot is safer: Γ, a classifier's probability, or what a
+control engineer would watch instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.pushed_motions import WatchedMotion
+
+PUBLISHED = {"": "normalized", "_literal": "safety_probability", "_calibrated": "calibrated"}
+"""What an assessment publishes, by what is appended to its name."""
+_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+_TRACKING = "tracking_error_"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """Somebody who watches a motion.
+
+    Attributes:
+        name: Its key in tables.
+        value: How safe it takes every row of a motion to be, (N,); NaN where it does not know,
+            which is an alarm.
+    """
+
+    name: str
+    value: Callable[[WatchedMotion], np.ndarray]
+
+
+def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
+    """Γ in every form that is published: b_safe / (1 - μ), literal b_safe, and by its heads.
+
+    Args:
+        name: Key of the first; those of the others go on from it.
+        assessment: A fitted assessment; one without heads has no third form of its own.
+    """
+    has_heads = assessment.base_logit_ is not None
+    return [
+        scorer_alarm(assessment_scorer(f"{name}{suffix}", assessment, published))
+        for suffix, published in PUBLISHED.items()
+        if has_heads or published != "calibrated"
+    ]
+
+
+def scorer_alarm(scorer: Scorer) -> Alarm:
+    """A scorer of segments as an alarm."""
+    return Alarm(
+        name=scorer.name,
+        value=lambda motion: scorer.probability(
+            motion.state, motion.desired_preview, motion.features
+        ),
+    )
+
+
+def threshold_alarms(
+    state_names: Sequence[str], feature_names: Sequence[str], watched: Mapping[str, str]
+) -> list[Alarm]:
+    """What a control engineer would set a threshold on, as far as a task records it.
+
+    Those are the features that the task says to watch, such as the margins of base and capture
+    point to the edge of the support polygon; the distance from the desired output; the base's
+    tilt; and the smallest of the safe set's margins. That last one is of the true state, which
+    nobody can measure: it is favoured.
+
+    Args:
+        state_names: Columns of the state.
+        feature_names: Columns of the features.
+        watched: Features to watch, by what they measure.
+
+    Raises:
+        ValueError: A feature to watch does not exist.
+    """
+    features, states = list(feature_names), list(state_names)
+    unknown = [name for name in watched.values() if name not in features]
+    if unknown:
+        raise ValueError(f"alarms: there are no features {unknown}; the features are {features}")
+
+    def of_feature(column: int) -> Callable[[WatchedMotion], np.ndarray]:
+        return lambda motion: motion.features[:, column]
+
+    alarms = [
+        Alarm(name=name, value=of_feature(features.index(feature)))
+        for name, feature in watched.items()
+    ]
+    tracking = [i for i, name in enumerate(features) if name.startswith(_TRACKING)]
+    if tracking:
+        alarms.append(
+            Alarm(
+                name="tracking_error",
+                value=lambda motion: -np.linalg.norm(motion.features[:, tracking], axis=1),
+            )
+        )
+    if set(_ROTATION) <= set(states):
+        rotation = [states.index(name) for name in _ROTATION]
+        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion.state[:, rotation])))
+    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion.margins.min(axis=1)))
+    return alarms
+
+
+def tilt(rotation: np.ndarray) -> np.ndarray:
+    """Angle between a body's z axis and the vertical [rad], (N,).
+
+    Args:
+        rotation: Rotation vectors, (N, 3) [rad].
+    """
+    angle = np.linalg.norm(rotation, axis=1)
+    share = np.divide(
+        rotation[:, 2], angle, out=np.ones_like(angle), where=(angle > 0) | np.isnan(angle)
+    )
+    # R_zz of Rodrigues' formula.
+    cosine = np.cos(angle)
+    return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))

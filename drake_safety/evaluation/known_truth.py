@@ -1,0 +1,186 @@
+"""Γ against the truth: where two state variables say all, every start is simulated on a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.rollouts import (
+    Progress,
+    batches,
+    parallel_map,
+    run_episode,
+    worker_loop,
+)
+from drake_safety.simulation.scenario import Scenario
+
+CONFIDENT = 0.9
+"""Γ is confident above this, and below one minus this."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownTruth:
+    """What becomes of every start on a plane, and the first row that an assessor would see.
+
+    Attributes:
+        plane: Name of the plane, which is that of its plan.
+        axes: What the plane's two variables are.
+        points: (n, n, 2), along the first variable first.
+        is_safe: Whether the episode stays in the safe set, (n, n).
+        state, desired_preview, features: At k = 0, (n, n, size) each.
+    """
+
+    plane: str
+    axes: tuple[str, str]
+    points: np.ndarray
+    is_safe: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+
+    def safety_probability(self, assessment: SafetyAssessment) -> np.ndarray:
+        """b_safe / (1 - μ) of every start, (n, n).
+
+        Args:
+            assessment: Γ.
+        """
+        rows = [
+            array.reshape(-1, array.shape[-1])
+            for array in (self.state, self.desired_preview, self.features)
+        ]
+        return assessment.predict(*rows).normalized.reshape(self.is_safe.shape)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """How far Γ and the truth agree on a plane.
+
+    Attributes:
+        threshold: Above it Γ says safe.
+        intersection_over_union: Of what Γ calls safe and what is safe; 1 when both are empty.
+        confident_errors: Share of the starts at which Γ is confident, and wrong.
+        band: How far such an error lies from the true boundary at most, as a share of the plane's
+            sides; 0 without any.
+    """
+
+    threshold: float
+    intersection_over_union: float
+    confident_errors: float
+    band: float
+
+
+def simulate_truth(
+    scenario: Scenario,
+    plane: str,
+    resolution: int,
+    *,
+    num_workers: int | None = None,
+    progress: Progress | None = None,
+) -> KnownTruth:
+    """Simulates the nominal loop from every point of a grid, in worker processes.
+
+    Args:
+        scenario: A scenario whose task has state planes.
+        plane: Which.
+        resolution: Points along either variable.
+        num_workers: Processes; as many as there are cores by default.
+        progress: Called with the number done and the number wanted.
+
+    Raises:
+        ValueError: The task has no such plane.
+    """
+    loop = scenario.make_loop()
+    if plane not in loop.state_planes:
+        raise ValueError(
+            f"task '{type(loop).__name__}' has no state plane '{plane}'; it has "
+            f"{list(loop.state_planes)}"
+        )
+    points = loop.state_planes[plane].points(resolution)
+    flat = points.reshape(-1, 2)
+    parts = batches(list(range(len(flat))))
+    rows: dict[int, tuple] = {}
+    for found in parallel_map(
+        _outcomes, [(scenario, plane, part, flat[part]) for part in parts], num_workers
+    ):
+        rows |= found
+        if progress is not None:
+            progress(len(rows), len(flat))
+    columns = zip(*(rows[index] for index in range(len(flat))), strict=True)
+    shape = (resolution, resolution)
+    is_safe, state, preview, features = (np.array(column).reshape(*shape, -1) for column in columns)
+    return KnownTruth(
+        plane=plane,
+        axes=loop.state_planes[plane].axes,
+        points=points,
+        is_safe=is_safe[..., 0],
+        state=state,
+        desired_preview=preview,
+        features=features,
+    )
+
+
+def _outcomes(
+    scenario: Scenario, plane: str, indices: list[int], points: np.ndarray
+) -> dict[int, tuple]:
+    loop: ClosedLoop = worker_loop(scenario, "nominal", {})
+    start = loop.state_planes[plane].start
+    found = {}
+    for index, point in zip(indices, points, strict=True):
+        episode = run_episode(loop, index, start=start(point))
+        found[index] = (
+            episode.is_safe,
+            episode.state[0],
+            episode.desired_preview[0],
+            episode.features[0],
+        )
+    return found
+
+
+def agreement(is_safe: np.ndarray, probability: np.ndarray, threshold: float = 0.5) -> Agreement:
+    """Compares Γ with the truth on a grid.
+
+    Args:
+        is_safe: The truth, (n, m).
+        probability: Γ, (n, m).
+        threshold: Above it Γ says safe.
+
+    Raises:
+        ValueError: The shapes differ.
+    """
+    if is_safe.shape != probability.shape:
+        raise ValueError(
+            f"known truth: {is_safe.shape} outcomes and {probability.shape} probabilities differ"
+        )
+    says_safe = probability >= threshold
+    union = np.count_nonzero(is_safe | says_safe)
+    shared = np.count_nonzero(is_safe & says_safe)
+    wrong = np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
+    depth = boundary_distance(is_safe)
+    return Agreement(
+        threshold=threshold,
+        intersection_over_union=shared / union if union else 1.0,
+        confident_errors=float(wrong.mean()),
+        band=float(depth[wrong].max()) if wrong.any() else 0.0,
+    )
+
+
+def boundary_distance(is_safe: np.ndarray) -> np.ndarray:
+    """Distance of every point of a grid to the nearest one whose truth is the other.
+
+    Args:
+        is_safe: (n, m).
+
+    Returns:
+        Shares of the grid's sides, (n, m); infinite where all points are alike.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    if is_safe.all() or not is_safe.any():
+        return np.full(is_safe.shape, np.inf)
+    spacing = [1 / (size - 1) for size in is_safe.shape]
+    inside = distance_transform_edt(is_safe, sampling=spacing)
+    outside = distance_transform_edt(~is_safe, sampling=spacing)
+    return np.where(is_safe, inside, outside)

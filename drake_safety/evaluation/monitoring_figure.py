@@ -1,0 +1,93 @@
+"""Who notices a push: the receiver operating characteristic, and how long before it matters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    SERIES_COLOURS,
+    SERIES_DASHES,
+    drawing_style,
+    new_figure,
+    spoken,
+)
+from drake_safety.evaluation.monitoring_study import MonitoringStudy
+from drake_safety.evaluation.roc_figure import operating_points
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LATEST_S = -0.3  # Alarms this late are still drawn.
+
+
+def monitoring_figure(study: MonitoringStudy, names: Sequence[str] | None = None) -> Figure:
+    """The alarms of a study, side by side.
+
+    On the left what each notices against its false alarms, for every threshold; a dot marks the
+    one that was chosen. On the right the share that is noticed at least so long before the robot
+    leaves the safe set, at that threshold.
+
+    Args:
+        study: The study.
+        names: Which alarms; all of them by default.
+    """
+    names = list(study.thresholds) if names is None else list(names)
+    label = study.is_unsafe
+    longest = max(
+        (lead[np.isfinite(lead)].max(initial=0.0) for lead in study.lead_s.values()), default=0.0
+    )
+    with drawing_style():
+        fig = new_figure(11.5, 5.2)
+        roc, lead_axes = fig.subplots(1, 2)
+        for i, name in enumerate(names):
+            score = study.unsafe_score[name]
+            style = {
+                "color": SERIES_COLOURS[i % len(SERIES_COLOURS)],
+                # Beyond as many as there are colours, a colour comes with another dash.
+                "linestyle": SERIES_DASHES[(i + i // len(SERIES_COLOURS)) % len(SERIES_DASHES)],
+                "linewidth": 2.4 if i == 0 else 1.5,
+                "zorder": 4 if i == 0 else 3,
+            }
+            area = study.figures[f"monitoring.{name}.auc"].value
+            roc.plot(*operating_points(score, label), label=f"{spoken(name)}   {area:.3f}", **style)
+            is_alarm = score > -study.thresholds[name]
+            if label.any() and not label.all():
+                roc.plot(
+                    is_alarm[~label].mean(),
+                    is_alarm[label].mean(),
+                    "o",
+                    color=style["color"],
+                    markeredgecolor="white",
+                    markersize=7,
+                    clip_on=False,
+                    zorder=5,
+                )
+            lead_s = np.sort(study.lead_s[name])
+            if lead_s.size:
+                shown = np.concatenate([[longest], lead_s[::-1]])
+                noticed = np.arange(len(shown)) / lead_s.size
+                is_shown = shown >= _LATEST_S
+                shown, noticed = shown[is_shown], noticed[is_shown]
+                lead_axes.step(
+                    np.append(shown, _LATEST_S),
+                    np.append(noticed, noticed[-1]),
+                    where="post",
+                    **style,
+                )
+        roc.set(xlim=(0, 1), ylim=(0, 1.005))
+        roc.set_xlabel("motions that stay safe, with a false alarm")
+        roc.set_ylabel("motions that leave the safe set, noticed before")
+        roc.set_title("At every threshold")
+        roc.legend(loc="lower right", title="area under the curve", alignment="left")
+        lead_axes.axvline(0.0, color=FAINT_INK, linewidth=0.8)
+        lead_axes.set(xlim=(max(longest, 0.1), _LATEST_S), ylim=(0, 1.005))
+        lead_axes.set_xlabel("time left until the robot leaves the safe set [s]")
+        lead_axes.set_ylabel("noticed by then")
+        lead_axes.set_title("At the chosen thresholds")
+        for axes in (roc, lead_axes):
+            axes.grid(color="#eceef0", linewidth=0.7)
+    return fig

@@ -1,0 +1,290 @@
+"""A robot's folder and its first scenario, written from a URDF as far as that tells."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from drake_safety.control.robot_model import load_robot_file
+from drake_safety.control.standing_posture import solve_standing_posture
+from drake_safety.control.urdf_copy import JointLimits, UrdfCopy, read_urdf
+from drake_safety.control.urdf_survey import Limb, Survey
+from drake_safety.simulation.scenario_template import TASKS, Sizes, scenario_yaml
+
+# Servo gains of the balancing task's defaults, whose robot weighs 25.4 kg and stands 0.42 m high:
+# a torque in proportion to mass times height.
+_STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
+_DAMPING_S = 0.027
+_SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
+
+
+@dataclass(kw_only=True)
+class NewRobot:
+    """What was written.
+
+    Attributes:
+        folder: Where.
+        files: The files.
+        asked: What the URDF does not tell and the user is asked for.
+        sizes: Of the robot as it stands.
+    """
+
+    folder: Path
+    files: list[Path]
+    asked: list[str]
+    sizes: Sizes
+
+
+@dataclass(kw_only=True)
+class _Findings:
+    name: str
+    copy: UrdfCopy
+    survey: Survey
+    legs: list[Limb]
+    arms: list[Limb]
+    posture: dict[str, float]
+    limits: dict[str, JointLimits]
+    sizes: Sizes
+    asked: list[str] = field(default_factory=list)
+
+
+def write_robot(
+    name: str, urdf: Path, task: str, folder: Path, *, feet: list[str] | None = None
+) -> NewRobot:
+    """Writes a robot's folder: its URDF as Drake simulates it, robot.yaml, README, a scenario.
+
+    Args:
+        name: Of the robot.
+        urdf: Its URDF.
+        task: ``balancing`` or ``reaching``.
+        folder: Where to; it must not exist yet.
+        feet: Links that touch the ground; found by their height by default.
+
+    Raises:
+        ValueError: A name that is none, an unknown task, a folder that exists, or a URDF of which
+            no legged robot can be made.
+    """
+    if not re.fullmatch(r"[A-Za-z]\w*", name):
+        raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")
+    if task not in TASKS:
+        raise ValueError(f"new: task must be one of {list(TASKS)}; got '{task}'")
+    if folder.exists():
+        raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
+    with tempfile.TemporaryDirectory() as scratch:
+        found = _survey(name, urdf, task, Path(scratch) / f"{name}.urdf", feet)
+        # Only what is whole is moved to where the user looks.
+        staged = Path(scratch) / "robot"
+        staged.mkdir()
+        found.copy.write(staged / f"{name}.urdf")
+        (staged / "robot.yaml").write_text(_robot_yaml(found, task), encoding="utf-8")
+        load_robot_file(staged / "robot.yaml")
+        text = scenario_yaml(task, found.sizes)
+        (staged / f"{task}.yaml").write_text(text, encoding="utf-8")
+        (staged / "README.md").write_text(_readme(found), encoding="utf-8")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(staged, folder)
+    files = [folder / file for file in (f"{name}.urdf", "robot.yaml", "README.md", f"{task}.yaml")]
+    return NewRobot(folder=folder, files=files, asked=found.asked, sizes=found.sizes)
+
+
+def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | None) -> _Findings:
+    copy = read_urdf(urdf)
+    copy.write(scratch)
+    survey = Survey(scratch, copy.lost_shapes)
+    legs = survey.legs(feet)
+    arms = survey.arms(legs)
+    if task == "reaching" and not arms:
+        raise ValueError(
+            f"new: '{urdf}' has no arm, a limb of four joints or more that is no leg, so it cannot "
+            "reach; use --task balancing"
+        )
+    used = {joint for limb in (*legs, *arms) for joint in survey.chain(limb.body)}
+    idle = [joint.name() for joint in survey.joints if joint.name() not in used]
+    for limb in legs:
+        if not limb.is_own_shape:
+            copy.replace_collisions(limb.body, limb.points, limb.radius_m)
+    if idle or not all(limb.is_own_shape for limb in legs):
+        copy.fix_joints(idle)
+        copy.write(scratch)
+        survey = Survey(scratch)
+    posture = solve_standing_posture(survey, legs)
+    overlaps = survey.overlaps()
+    copy.ignore_collisions(overlaps)
+    found = _Findings(
+        name=name,
+        copy=copy,
+        survey=survey,
+        legs=legs,
+        arms=arms,
+        posture=posture,
+        limits=copy.joint_limits(),
+        sizes=_sizes(survey, legs, arms, copy),
+    )
+    found.asked += [
+        f"where foot '{limb.name}' touches: the URDF has no shape there [m]"
+        for limb in legs
+        if limb.is_guess
+    ]
+    return found
+
+
+def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -> Sizes:
+    points = [survey.positions(limb) for limb in legs]
+    lowest = min(float(p[:, 2].min()) - limb.radius_m for p, limb in zip(points, legs, strict=True))
+    everything = np.concatenate(points)
+    centroid = everything.mean(axis=0)
+    half = np.abs(everything - centroid).max(axis=0)
+    feet = np.array([p.mean(axis=0) for p in points])
+    reach = 0.0
+    shoulder = np.zeros(3)
+    if arms:
+        arm = arms[0]
+        origins = [survey.joint_origin(joint) for joint in arm.joints]
+        hand = survey.pose(arm.body).translation()
+        reach = float(np.linalg.norm(np.diff([*origins, hand], axis=0), axis=1).sum())
+        shoulder = origins[0] - [*centroid[:2], lowest]
+    return Sizes(
+        mass_kg=survey.total_mass,
+        height_m=-lowest,
+        half_length_m=float(half[0]),
+        half_width_m=float(half[1]),
+        lateral_m=float(np.abs(feet[:, 1] - centroid[1]).min()),
+        reach_m=reach,
+        shoulder_m=shoulder.tolist(),
+        base=survey.base,
+        joint_friction_nm=float(np.median(list(copy.joint_friction.values())))
+        if copy.joint_friction
+        else None,
+    )
+
+
+def _robot_yaml(found: _Findings, task: str) -> str:
+    survey, sizes = found.survey, found.sizes
+    names = [joint.name() for joint in survey.joints]
+    unit = sizes.mass_kg * sizes.height_m
+    lines = [
+        f"# {found.name}: written from {found.copy.source.name}. Lines marked ASK hold what a URDF",
+        "# does not tell: look them up, and say in README.md where the figures come from.",
+        f"name: {found.name}",
+        f"urdf: {found.name}.urdf",
+        f"base: {survey.base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
+        "posture:  # standing, found by putting the feet under the hips [rad]",
+        *(f"  {name}: {found.posture[name]:g}" for name in names if found.posture.get(name)),
+        "feet:  # contact_points are centres of spheres, in the body's frame [m]",
+    ]
+    for limb in found.legs:
+        points = [[round(float(value), 5) for value in point] for point in limb.points]
+        ask = "  # ASK where it touches [m]" if limb.is_guess else ""
+        lines += [
+            f"  {limb.name}:{ask}",
+            f"    body: {limb.body}",
+            f"    contact_points: {points}",
+            f"    radius_m: {float(f'{limb.radius_m:.5g}')}",
+            f"    joints: [{', '.join(limb.joints)}]",
+        ]
+    if found.arms:
+        lines.append("reaching_frames:")
+    for limb in found.arms:
+        lines += [
+            f"  {limb.name}:",
+            f"    body: {limb.body}",
+            "    point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
+            "    radius_m: 0.05  # ASK the sphere around the hand that must not touch [m]",
+            f"    joints: [{', '.join(limb.joints)}]",
+        ]
+        found.asked.append(f"the point of hand '{limb.name}' that reaches, and its size [m]")
+    lines.append(
+        "joint_gains:  # ASK the maker's; these grow with mass times height [N·m/rad, N·m·s/rad]"
+    )
+    found.asked.append("the maker's servo gains [N·m/rad, N·m·s/rad]; estimated from the mass")
+    legs = {name for limb in found.legs for name in limb.joints}
+    for name in names:
+        stiffness = _STIFFNESS * unit * (1.0 if name in legs else 0.5)
+        lines.append(
+            f"  {name}: {{stiffness: {stiffness:.4g}, damping: {_DAMPING_S * stiffness:.4g}}}"
+        )
+    lines += _effort_lines(found, names, unit)
+    lines.append("foot_friction: 0.6  # ASK Coulomb's coefficient of feet on your ground [1]")
+    found.asked.append("the friction of feet on your ground [1]; 0.6 is assumed")
+    mirror = _mirror(names)
+    if mirror:
+        lines += ["mirror:", *(f"  {one}: {other}" for one, other in mirror.items())]
+    lines += ["whole_body:", f"  orientation: {{{survey.base}: {{weight: 20.0}}}}"]
+    if task == "balancing" and len(found.legs) > 2:
+        lines.append("  posture: {weight: 0.001}")
+    return "\n".join(lines) + "\n"
+
+
+def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
+    plant = found.survey.plant
+    motors = {
+        plant.get_joint_actuator(index).joint().name()
+        for index in plant.GetJointActuatorIndices(found.survey.instance)
+    }
+    lines = []
+    for name in names:
+        if name in motors:
+            continue
+        effort = found.limits[name].effort
+        if effort > 0 and math.isfinite(effort):
+            lines.append(f"  {name}: {effort:g}")
+        else:
+            lines.append(f"  {name}: {4 * unit:.3g}  # ASK the motor's largest torque [N·m]")
+            found.asked.append(f"the largest torque of joint '{name}' [N·m]")
+    if not lines:
+        return []
+    return [
+        "effort_limits:  # the URDF has no transmissions; from its joints' limits [N·m]",
+        *lines,
+    ]
+
+
+def _mirror(names: list[str]) -> dict[str, str]:
+    """Joints of one side and their partners, by the usual words for left and right."""
+    pairs: dict[str, str] = {}
+    for name in names:
+        for left, right in _SIDES:
+            # As a word, or as the letter that begins or ends one: FL_hip, hip_left, l_arm.
+            for match in re.finditer(left, name):
+                partner = f"{name[: match.start()]}{right}{name[match.end() :]}"
+                if partner in names and name not in pairs:
+                    pairs[name] = partner
+    return pairs
+
+
+def _readme(found: _Findings) -> str:
+    sizes = found.sizes
+    notes = (
+        "\n".join(f"- {note[0].upper()}{note[1:]}." for note in found.copy.notes) or "- Nothing."
+    )
+    asked = "\n".join(f"- [ ] {what}" for what in found.asked)
+    return f"""# {found.name}
+
+{sizes.mass_kg:.2f} kg; its base, `{sizes.base}`, stands {sizes.height_m:.3f} m high on
+{len(found.legs)} feet.
+
+## Where the figures come from
+Fill in: whoever reads this must be able to look every figure up.
+
+| figure | source |
+|---|---|
+| masses, inertias, joints, limits | `{found.copy.source.name}`, from ... (address, version) |
+| standing posture | solved: feet under the hips |
+| servo gains | estimated from mass and height; replace them by ... |
+| friction of the feet | assumed; replace it by ... |
+
+## What the URDF does not tell
+{asked}
+
+## What was changed in the URDF
+{notes}
+
+## Licence
+Of the URDF: ...
+"""

@@ -1,0 +1,141 @@
+"""First scenarios for a new robot: the tasks' defaults, scaled to its mass and its height."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+# The robot that the balancing task's defaults suit.
+_MASS_KG = 25.433
+_HEIGHT_M = 0.4245
+_HALF_LENGTH_M = 0.21
+_HALF_WIDTH_M = 0.1245
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """A robot as it stands.
+
+    Attributes:
+        mass_kg: Of all bodies.
+        height_m: Of the base over the ground.
+        half_length_m: Of the feet's contact points about their centroid, along x.
+        half_width_m: The same along y.
+        lateral_m: Least distance of a foot from the midline.
+        reach_m: Length of an arm; 0 without.
+        shoulder_m: Where that arm begins, over the feet's centroid on the ground, (3,).
+        base: Name of the base.
+        joint_friction_nm: Dry friction of a joint by the URDF; None where it tells none.
+    """
+
+    mass_kg: float
+    height_m: float
+    half_length_m: float
+    half_width_m: float
+    lateral_m: float
+    reach_m: float
+    shoulder_m: list[float]
+    base: str
+    joint_friction_nm: float | None = None
+
+
+def scenario_yaml(task: str, sizes: Sizes) -> str:
+    """The scenario of a task, as commented YAML.
+
+    Args:
+        task: One of `TASKS`.
+        sizes: Of the robot.
+    """
+    return TASKS[task](sizes)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
+
+
+def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: float) -> str:
+    friction = sizes.joint_friction_nm
+    if friction is None:
+        friction = 0.4 * sizes.mass_kg * sizes.height_m / (_MASS_KG * _HEIGHT_M)
+    noise = f"{{position: {position:g}, velocity: {velocity:g}}}  # of your sensors [m, rad; 1/s]"
+    return f"""variations:
+  nominal:  # what Γ learns from: the model, believed
+    mass_scale: {mass_scale:g}
+    input_noise: {noise}
+  actual:  # ASK how the real robot differs from its URDF
+    joint_friction_nm: {friction:.2g}  # dry friction of a joint [N·m]
+    observation_noise: {noise}
+"""
+
+
+def _balancing(sizes: Sizes) -> str:
+    h = sizes.height_m
+    # Times go with the square root of the height: so does a pendulum.
+    tall, slow = h / _HEIGHT_M, math.sqrt(h / _HEIGHT_M)
+    length, width = sizes.half_length_m / _HALF_LENGTH_M, sizes.half_width_m / _HALF_WIDTH_M
+    heavy = sizes.mass_kg / _MASS_KG
+    return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high.
+task: drake_safety.diagrams.balancing:Balancing
+robot: robot.yaml
+{_variations(sizes, 0.8, 0.004, 0.016)}parameters:
+  safe_set:
+    height_m: {_numbers([0.71 * h, 1.18 * h])}  # ASK lowest and highest safe height of the base [m]
+    fall_height_m: {0.47 * h:.3g}  # below it, it has fallen [m]
+    support_clearance_m: {0.03 * tall:.3g}  # a foot lower than this carries [m]
+  start:  # where episodes begin, and where their plans lead; widen for more unsafe ones
+    foot_offset_m: {0.02 * tall:.3g}
+    base_offset_m: {_numbers([0.08 * length, 0.05 * width])}  # x, y [m]
+    base_height_m: {_numbers([0.85 * h, 1.06 * h])}  # [m]
+    velocity_std_m_s: {_numbers([0.5 * length / slow, 0.35 * width / slow, 0.1 * slow])}
+    angular_velocity_std_rad_s: {0.4 / slow:.3g}
+    target_offset_m: {_numbers([0.2 * length, 0.11 * width])}  # x, y [m]
+    target_height_m: {_numbers([0.8 * h, 1.08 * h])}  # [m]
+  push:  # ASK the balls that are thrown at it
+    share: 0.35
+    mass_kg: {_numbers([2 * heavy, 4 * heavy])}  # [kg]
+    speed_m_s: {_numbers([2 * slow, 11 * slow])}  # [m/s]
+    height_m: {0.03 * tall:.3g}
+    target_offset_m: {_numbers([0.05 * length, 0.03 * width])}
+  recovery:
+    threshold: 0.4
+    step:
+      step_duration_s: {0.09 * slow:.3g}  # [s]
+      lift_m: {0.06 * tall:.3g}
+      velocity_gain_s: {0.07 * slow:.3g}
+      max_reach_m: {0.18 * tall:.3g}  # of a foothold from its hip [m]
+      min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]
+      settle_speed_m_s: {0.5 * slow:.3g}
+      settle_margin_m: {0.05 * width:.3g}
+"""
+
+
+def _reaching(sizes: Sizes) -> str:
+    h, reach = sizes.height_m, sizes.reach_m
+    x, y, z = sizes.shoulder_m
+    low, high = y - 0.8 * reach, y + 0.8 * reach
+    return f"""# Reaching: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high, arms of {reach:.2f} m.
+task: drake_safety.diagrams.reaching:Reaching
+robot: robot.yaml
+episode_duration_s: 3.0
+step_s: 0.1
+time_step_s: 0.002
+control_period_s: 0.004
+{_variations(sizes, 1.0, 0.0005, 0.01)}assessment:
+  {{horizon: 30, shortest_segment: 5, raw_input_scale: 0.05, feature_unit: 0.02}}
+parameters:
+  start:
+    base_lowering_m: {0.08 * h / 0.74:.3g}  # [m]
+    joint_margin_rad: 0.02
+  target:  # ASK the box that targets come from, in the world: x forwards, y left, z up [m]
+    x_m: {_numbers([x + 0.3 * reach, x + 1.1 * reach])}
+    y_m: {_numbers([low, high])}
+    z_m: {_numbers([max(z - 0.7 * reach, 0.1), z + 0.6 * reach])}
+  # ASK what stands in the way: a model file and where it is [m]
+  # obstacles:
+  #   - {{model: package://drake_safety_models/scenes/bookshelf.urdf, position: [0.95, 0.0, 0.0]}}
+"""
+
+
+TASKS: dict[str, Callable[[Sizes], str]] = {"balancing": _balancing, "reaching": _reaching}
+"""What a scenario can be written for."""

@@ -1,0 +1,78 @@
+"""check_contract: what a diagram lacks is told, item by item, and how to mend it."""
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_safety import check_contract, load_scenario
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.contract import REQUIRED_PORTS
+from gliding_task import Gliding
+from shuttle_task import Shuttling, shuttling
+from test_closed_loop import gliding
+
+
+class Constant(ClosedLoop):
+    """Ports of given sizes that say the same for ever."""
+
+    def __init__(self, sizes, value=1.0, names=True):
+        super().__init__(gliding(), "nominal", None)
+        builder = DiagramBuilder()
+        for name in REQUIRED_PORTS:
+            source = builder.AddSystem(ConstantVectorSource(np.full(sizes.get(name, 1), value)))
+            builder.ExportOutput(source.get_output_port(), name)
+        if names:
+            self.state_names = self.output_names = ["x"]
+            self.feature_names = self.constraint_names = ["x"]
+        self.finish(builder)
+
+    def reset(self, context, rng):
+        return 0
+
+
+WHOLE = {"desired_preview": 10}
+
+
+def problems(diagram):
+    return {finding.item: finding for finding in check_contract(diagram) if not finding.is_ok}
+
+
+@pytest.mark.parametrize("make", [lambda: Gliding(gliding()), lambda: Shuttling(shuttling())])
+def test_a_task_that_keeps_the_contract_has_no_problem(make):
+    assert problems(make()) == {}
+
+
+def test_the_pendulum_of_the_package_keeps_it():
+    assert problems(load_scenario("pendulum").make_loop()) == {}
+
+
+def test_a_port_of_another_size_than_its_names_is_refused_when_the_task_is_built():
+    with pytest.raises(ValueError, match="'state' has 2 and not 1"):
+        Constant(WHOLE | {"state": 2})
+    with pytest.raises(ValueError, match="'desired_preview' has 9 and not 10"):
+        Constant({"desired_preview": 9})
+
+
+def test_names_that_are_not_set_are_a_problem_with_a_remedy():
+    found = problems(Constant(WHOLE, names=False))
+    assert "does not set ['state_names', 'output_names'" in found["names"].message
+    assert found["names"].remedy
+
+
+def test_values_that_are_not_finite_are_named_by_port():
+    found = problems(Constant(WHOLE, value=np.nan))
+    assert "'features'" in found["values at the start"].message
+
+
+def test_a_reset_that_raises_or_returns_nothing_is_a_problem_and_no_exception():
+    class Raising(Constant):
+        def reset(self, context, rng):
+            raise ValueError("no start today")
+
+    class Silent(Constant):
+        def reset(self, context, rng):
+            return None
+
+    assert problems(Raising(WHOLE))["reset"].message == "no start today"
+    assert problems(Silent(WHOLE))["reset"].message == "returns None"

@@ -1,0 +1,91 @@
+"""Known truth: overlap, confident errors and their distance from the boundary, worked by hand."""
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.known_truth import (
+    KnownTruth,
+    agreement,
+    boundary_distance,
+    simulate_truth,
+)
+from drake_safety.evaluation.known_truth_figure import known_truth_figure
+from drake_safety.simulation.state_plane import StatePlane
+from shuttle_task import shuttling
+
+# Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
+HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)
+
+
+def test_the_truth_itself_agrees_wholly():
+    found = agreement(HALF, HALF.astype(float))
+    assert found.intersection_over_union == 1.0
+    assert found.confident_errors == 0.0
+    assert found.band == 0.0
+
+
+def test_one_row_too_many_costs_a_third_of_the_overlap():
+    says = np.zeros((5, 5))
+    says[:3] = 0.8
+    found = agreement(HALF, says)
+    assert found.intersection_over_union == pytest.approx(2 / 3)
+    # 0.8 is no confident word; 0 where it is safe would be.
+    assert found.confident_errors == 0.0
+
+
+def test_a_confident_error_is_as_far_off_as_the_nearest_start_of_the_other_kind():
+    says = np.zeros((5, 5))
+    says[:2] = 1.0
+    says[4, 2] = 0.95
+    found = agreement(HALF, says)
+    assert found.confident_errors == pytest.approx(1 / 25)
+    # From row 4 to row 1 there are three of four spacings.
+    assert found.band == pytest.approx(0.75)
+
+
+def test_distances_count_from_either_side():
+    distance = boundary_distance(HALF)
+    np.testing.assert_allclose(distance[:, 0], [0.5, 0.25, 0.25, 0.5, 0.75])
+    assert np.isinf(boundary_distance(np.ones((3, 3), dtype=bool))).all()
+
+
+def test_grids_of_different_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"\(5, 5\) outcomes and \(4, 5\) probabilities"):
+        agreement(HALF, np.zeros((4, 5)))
+
+
+def test_a_task_without_planes_says_so():
+    with pytest.raises(ValueError, match="'Shuttling' has no state plane 'hold'; it has"):
+        simulate_truth(shuttling(), "hold", 3, num_workers=1)
+
+
+def test_a_grid_reaches_to_its_corners_with_the_first_variable_first():
+    plane = StatePlane(
+        axes=("x", "y"), lowest=(0.0, -1.0), highest=(2.0, 1.0), start=lambda point: point
+    )
+    points = plane.points(3)
+    np.testing.assert_array_equal(points[0, 0], [0.0, -1.0])
+    np.testing.assert_array_equal(points[2, 0], [2.0, -1.0])
+    np.testing.assert_array_equal(points[1, 2], [1.0, 1.0])
+    with pytest.raises(ValueError, match="resolution must be at least 2; got 1"):
+        plane.points(1)
+
+
+def test_the_picture_marks_each_confident_error_once():
+    plane = StatePlane(
+        axes=("x", "y"), lowest=(0.0, 0.0), highest=(1.0, 1.0), start=lambda point: point
+    )
+    says = HALF.astype(float)
+    says[4, 2] = 0.95
+    truth = KnownTruth(
+        plane="still",
+        axes=plane.axes,
+        points=plane.points(5),
+        is_safe=HALF,
+        state=np.zeros((5, 5, 1)),
+        desired_preview=np.zeros((5, 5, 1)),
+        features=np.zeros((5, 5, 1)),
+    )
+    figure = known_truth_figure([(truth, says, agreement(HALF, says))], "a title")
+    (marks,) = figure.axes[0].lines
+    np.testing.assert_allclose(marks.get_xydata(), [[1.0, 0.5]])

@@ -1,0 +1,215 @@
+"""Alarms on motions worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+from drake_safety.evaluation.alarms import Alarm, threshold_alarms, tilt
+from drake_safety.evaluation.monitoring_figure import monitoring_figure
+from drake_safety.evaluation.monitoring_study import (
+    equal_share_threshold,
+    evaluate_alarms,
+    first_alarm,
+    lowest_value,
+    rate_per_hour,
+)
+from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.report.verdicts import alarm_table
+from drake_safety.simulation.pushed_motions import WatchedMotion
+
+PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
+
+
+def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
+    """What is seen of it is one number: `values` by the time from which it holds."""
+    end_s = FALL_S if falls else END_S
+    time_s = np.round(np.arange(0.0, end_s + 0.05, 0.1), 9)
+    state = np.ones((len(time_s), 1))
+    for start_s, value in values.items():
+        state[time_s >= start_s - 1e-9] = value
+    rows = np.zeros((len(time_s), 1))
+    return WatchedMotion(
+        index=index,
+        push_time_s=push_time_s,
+        time_s=time_s,
+        state=state,
+        desired_preview=rows,
+        features=rows,
+        margins=rows,
+        leave_time_s=LEAVE_S if leaves else math.inf,
+        fall_time_s=FALL_S if falls else math.inf,
+    )
+
+
+def seen(name="sharpened", delay_rows=0):
+    def value(motion):
+        calm = motion.state[:, 0]
+        return np.concatenate([np.ones(delay_rows), calm[: len(calm) - delay_rows]])
+
+    return Alarm(name=name, value=value)
+
+
+CALM = [motion_of(i, {1.1: 0.9 - 0.01 * i}) for i in range(20)]
+TEST = [
+    motion_of(0, {1.1: 0.2}, leaves=True, falls=True),
+    motion_of(1, {1.3: 0.2}, leaves=True),
+    motion_of(2, {1.5: 0.2}, leaves=True, falls=True),
+    motion_of(3, {0.3: 0.2, 0.5: 1.0}, leaves=True),
+    motion_of(4, {2.0: 0.2}),
+    motion_of(5, {}),
+]
+
+
+def figures_of(alarm, **options):
+    return evaluate_alarms([alarm], CALM, TEST, **options)
+
+
+def test_what_is_noticed_is_noticed_between_push_and_leaving():
+    study = figures_of(seen())
+    figures = study.figures
+    # The first two in time, the third too late but before the fall, the fourth only too early.
+    assert figures["monitoring.sharpened.detected"].value == 2 / 4
+    assert study.lead_s["sharpened"] == pytest.approx([0.3, 0.1, -0.1, -math.inf])
+    assert figures["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
+    assert figures["monitoring.sharpened.falls_detected"].value == 2 / 2
+    assert figures["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
+    assert figures["monitoring.motions.leave_safe_set"].value == 4 / 6
+    assert figures["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
+
+
+def test_who_sees_the_same_later_has_that_much_less_time():
+    late = figures_of(seen(delay_rows=2)).figures
+    prompt = figures_of(seen()).figures
+    lead = [f["monitoring.sharpened.lead_to_fall_s"].value for f in (prompt, late)]
+    assert lead[0] - lead[1] == pytest.approx(0.2)
+    assert late["monitoring.sharpened.detected"].value == 1 / 4
+
+
+def test_false_alarms_are_counted_once_a_motion_over_all_hours():
+    figures = figures_of(seen()).figures
+    assert figures["monitoring.sharpened.false_alarm_share"].value == 1 / 2
+    # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
+    assert figures["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
+    rate = figures["monitoring.sharpened.undisturbed_false_alarms_per_hour"]
+    assert rate.value == pytest.approx(600)
+    assert figures["monitoring.motions.safe_hours"].value == pytest.approx(0.002)
+
+
+def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
+    for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
+        for scale in (1.0, -3.0 + 4.0):
+            alarm = Alarm(name="one", value=lambda m, scale=scale: scale * m.state[:, 0] - 5.0)
+            threshold = figures_of(alarm, false_alarm_share=share).thresholds["one"]
+            cries = [math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM]
+            assert sum(cries) == count
+            # No higher threshold would do.
+            higher = threshold + 0.011
+            assert sum(math.isfinite(first_alarm(m, alarm.value(m), higher)) for m in CALM) > count
+
+
+def test_an_alarm_is_the_same_in_whatever_unit_it_is_measured():
+    metres = figures_of(seen()).figures
+    inches = figures_of(
+        Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0)
+    ).figures
+    for key in metres.keys() - {"monitoring.sharpened.threshold"}:
+        np.testing.assert_equal(metres[key], inches[key])
+
+
+def test_who_does_not_know_cries():
+    motion = motion_of(0, {2.0: np.nan})
+    value = motion.state[:, 0]
+    assert first_alarm(motion, value, -1e9) == 2.0
+    assert first_alarm(motion, value, 0.5, since_s=2.25) == pytest.approx(2.3)
+    assert lowest_value(motion, value) == -math.inf
+    assert first_alarm(motion_of(0, {}), np.ones(37), 1.0) == math.inf
+
+
+def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
+    motion = motion_of(0, {0.2: 0.0, 0.4: 0.8, 1.3: 0.5, 1.4: 0.1}, leaves=True)
+    assert lowest_value(motion, motion.state[:, 0]) == 0.5
+    at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
+    assert lowest_value(at_once, at_once.state[:, 0]) == math.inf
+
+
+def test_motions_that_leave_before_the_push_are_left_out():
+    early = motion_of(6, {}, leaves=True, push_time_s=2.0)
+    unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
+    study = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
+    assert study.figures["monitoring.motions.left_out"].value == 2 / 8
+    assert len(study.is_unsafe) == 6
+
+
+def test_rates_have_the_exact_interval_of_a_poisson_process():
+    figure = rate_per_hour(5, 7200.0, 100)
+    assert figure.value == 2.5
+    assert poisson.sf(4, 2 * figure.low) == pytest.approx(0.025)
+    assert poisson.cdf(5, 2 * figure.high) == pytest.approx(0.025)
+    assert rate_per_hour(0, 3600.0, 1).low == 0.0
+    assert math.isnan(rate_per_hour(0, 0.0, 0).value)
+
+
+@pytest.mark.parametrize(
+    ("lowest", "share", "message"),
+    [
+        ([], 0.1, "no calibration motion stays in the safe set"),
+        ([1.0], 1.0, r"must be in \[0, 1\); got 1.0"),
+    ],
+)
+def test_a_threshold_that_cannot_be_chosen_is_refused(lowest, share, message):
+    with pytest.raises(ValueError, match=message):
+        equal_share_threshold(np.array(lowest), share)
+
+
+def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
+    about_x = np.array([0.3, 0.0, 0.0])
+    yaw = np.array([0.0, 0.0, 2.0])
+    # Half a turn about a horizontal axis, and about one at 45 degrees.
+    upside_down = np.pi * np.array([0.6, 0.8, 0.0])
+    sideways = np.pi * np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+    angles = tilt(np.array([about_x, yaw, upside_down, sideways, np.zeros(3)]))
+    assert angles == pytest.approx([0.3, 0.0, np.pi, np.pi / 2, 0.0], abs=1e-7)
+    assert np.isnan(tilt(np.full((1, 3), np.nan))).all()
+
+
+def test_what_an_engineer_would_watch_is_found_by_name():
+    names = ["edge", "tracking_error_x", "tracking_error_y"]
+    alarms = threshold_alarms(
+        ["rotation_x", "rotation_y", "rotation_z"], names, {"support_margin": "edge"}
+    )
+    motion = motion_of(0, {})
+    motion.features = np.array([[0.1, 3.0, -4.0]])
+    motion.state = np.array([[0.0, -0.2, 0.0]])
+    motion.margins = np.array([[0.5, -0.1]])
+    values = {alarm.name: alarm.value(motion)[0] for alarm in alarms}
+    assert values == pytest.approx(
+        {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
+    )
+    assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
+    with pytest.raises(ValueError, match=r"no features \['rim'\]; the features are \['edge'"):
+        threshold_alarms([], names, {"support_margin": "rim"})
+
+
+def test_the_table_says_where_another_alarm_is_ahead():
+    study = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST)
+    table = alarm_table(Results(figures=study.figures))
+    assert [row.key for row in table.rows] == ["sharpened", "tilt"]
+    (first, *_) = table.rivals_ahead()
+    assert first.startswith("noticed in time: tilt, 50.0 % against 25.0 %")
+    assert "4 of" not in table.meaning and "66.7 % leave the safe set" in table.meaning
+
+
+def test_the_figure_marks_the_threshold_on_its_own_curve():
+    study = evaluate_alarms([seen(), seen("tilt", 1)], CALM, TEST)
+    roc, lead = monitoring_figure(study).axes
+    for i, name in enumerate(study.thresholds):
+        curve, dot = roc.lines[2 * i], roc.lines[2 * i + 1]
+        figure = study.figures[f"monitoring.{name}.detected"]
+        assert dot.get_ydata()[0] == figure.value
+        points = set(zip(*(np.round(xy, 9) for xy in curve.get_data()), strict=True))
+        assert (round(dot.get_xdata()[0], 9), round(dot.get_ydata()[0], 9)) in points
+    # At zero the right panel says what is noticed in time.
+    times, noticed = lead.lines[0].get_data()
+    assert noticed[times >= 1e-9].max() == 2 / 4

@@ -1,0 +1,153 @@
+"""`new` and `check`: from a URDF alone to a robot that stands, and mistakes told one by one."""
+
+import shutil
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drake_safety.cli import app
+from drake_safety.simulation.robot_template import write_robot
+from drake_safety.simulation.scenario_check import check_scenario
+from legged_robots import edited, write_hexapod, write_porter
+
+
+@pytest.fixture(scope="module")
+def spider(tmp_path_factory):
+    """What `new` writes for a URDF of six legs."""
+    folder = tmp_path_factory.mktemp("urdf")
+    write_hexapod(folder)
+    return write_robot("spider", folder / "hexapod.urdf", "balancing", folder / "spider")
+
+
+@pytest.fixture
+def own(spider, tmp_path):
+    """A copy of it that a test may spoil."""
+    return shutil.copytree(spider.folder, tmp_path / "own")
+
+
+def problems(scenario, **options):
+    options = {"num_episodes": 0} | options
+    return {f.item: f for f in check_scenario(scenario, **options) if not f.is_ok}
+
+
+def test_what_new_writes_passes_its_check_as_it_is(spider):
+    assert problems(spider.folder / "balancing.yaml", num_episodes=4) == {}
+
+
+def test_what_a_urdf_does_not_tell_is_asked_for_with_its_unit(spider):
+    text = (spider.folder / "robot.yaml").read_text()
+    asks = [line for line in text.splitlines() if "# ASK" in line]
+    assert len(asks) >= 2
+    assert all(line.rstrip().endswith("]") for line in asks)
+    assert any("gains [N·m/rad" in what for what in spider.asked)
+    readme = (spider.folder / "README.md").read_text()
+    assert all(what in readme for what in spider.asked)
+
+
+def test_numbers_scale_with_the_robot(spider):
+    scenario = yaml.safe_load((spider.folder / "balancing.yaml").read_text())
+    low, high = scenario["parameters"]["safe_set"]["height_m"]
+    assert low < spider.sizes.height_m < high
+    start = scenario["parameters"]["start"]["base_height_m"]
+    assert low < start[0] < spider.sizes.height_m < start[1] < high
+    assert spider.sizes.mass_kg == pytest.approx(6.0 + 6 * 0.7)
+
+
+def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
+    write_porter(tmp_path)
+    written = write_robot("carrier", tmp_path / "porter.urdf", "reaching", tmp_path / "carrier")
+    robot = yaml.safe_load((written.folder / "robot.yaml").read_text())
+    assert {frame["body"] for frame in robot["reaching_frames"].values()} == {
+        "left_palm",
+        "right_palm",
+    }
+    assert robot["mirror"]["left_elbow"] == "right_elbow"
+    assert problems(written.folder / "reaching.yaml") == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "item", "message"),
+    [
+        ({"base": "trunk"}, "bodies and joints", "has no body 'trunk'"),
+        ({"urdf": "gone.urdf"}, "files", "not found"),
+        ({"feed": {}}, "robot.yaml", "unknown key 'feed'"),
+        ({"posture": {"lift_0": 0.9}}, "feet level", "hang up to"),
+        ({"joint_gains": {"lift_.*": {"stiffness": 50.0}}}, "servo gains", "'swing_0'"),
+        ({"effort_limits": {".*": 0.01}}, "effort against gravity", "of 0.0 N·m"),
+        ({"effort_limits": {}}, "motors", "have none"),
+    ],
+)
+def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(own, change, item, message):
+    edited(own / "robot.yaml", **change)
+    found = problems(own / "balancing.yaml")
+    assert message in found[item].message
+    assert found[item].remedy
+
+
+def test_a_contact_point_without_its_sphere_is_found(own):
+    robot = yaml.safe_load((own / "robot.yaml").read_text())
+    next(iter(robot["feet"].values()))["radius_m"] = 0.03
+    edited(own / "robot.yaml", feet=robot["feet"])
+    assert (
+        "the model file has no such sphere"
+        in problems(own / "balancing.yaml")["contact spheres"].message
+    )
+
+
+def test_servos_that_are_too_soft_show_in_the_simulation(own):
+    edited(own / "robot.yaml", joint_gains={".*": {"stiffness": 0.05, "damping": 0.05}})
+    assert "it has sunk" in problems(own / "balancing.yaml")["stands for 1 s"].message
+
+
+def test_a_safe_set_of_another_size_is_found_before_any_episode(own):
+    scenario = yaml.safe_load((own / "balancing.yaml").read_text())
+    scenario["parameters"]["safe_set"] = {"height_m": [0.8, 0.9]}
+    edited(own / "balancing.yaml", **scenario)
+    assert "violates ['height'" in problems(own / "balancing.yaml")["safe while it stands"].message
+
+
+def test_starts_without_danger_are_told_to_be_widened(own):
+    scenario = yaml.safe_load((own / "balancing.yaml").read_text())
+    calm = {
+        "base_offset_m": [0.0, 0.0],
+        "velocity_std_m_s": [0.0, 0.0, 0.0],
+        "target_offset_m": [0.0, 0.0],
+        "tilt_rad": 0.0,
+        "angular_velocity_std_rad_s": 0.0,
+    }
+    scenario["parameters"]["start"] |= calm
+    scenario["parameters"]["push"]["share"] = 0.0
+    edited(own / "balancing.yaml", **scenario)
+    found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
+    assert found.message.startswith("0 % of 2 episodes")
+    assert "widen the ranges" in found.remedy
+
+
+def test_a_scenario_that_is_no_yaml_or_does_not_exist_is_a_finding(tmp_path):
+    path = tmp_path / "odd.yaml"
+    assert "does not exist" in problems(path)["scenario"].message
+    path.write_text("task: [")
+    assert "is not YAML" in problems(path)["scenario"].message
+    path.write_text("task: os:path\nrobot: x")
+    assert "has no task 'path'" in problems(path)["scenario"].message
+
+
+def test_new_refuses_what_it_cannot_write(tmp_path):
+    write_hexapod(tmp_path)
+    urdf = tmp_path / "hexapod.urdf"
+    with pytest.raises(ValueError, match="a robot's name is letters"):
+        write_robot("my robot", urdf, "balancing", tmp_path / "a")
+    with pytest.raises(ValueError, match=r"task must be one of \['balancing', 'reaching'\]"):
+        write_robot("spider", urdf, "dancing", tmp_path / "a")
+    with pytest.raises(ValueError, match="exists already"):
+        write_robot("spider", urdf, "balancing", tmp_path)
+    with pytest.raises(ValueError, match="has no arm"):
+        write_robot("spider", urdf, "reaching", tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_mend_it(own):
+    edited(own / "robot.yaml", base="trunk")
+    result = CliRunner().invoke(app, ["check", str(own / "balancing.yaml"), "--episodes", "0"])
+    assert result.exit_code == 1

@@ -1,0 +1,130 @@
+"""Pendulum: physics worked by hand, the motor's limit, and a true safe set that Γ learns."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety.evaluation.known_truth import agreement, simulate_truth
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.rollouts import run_episode
+from drake_safety.simulation.scenario import parse_scenario
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("pendulum")
+
+
+@pytest.fixture(scope="module")
+def loop(scenario):
+    return scenario.make_loop()
+
+
+def start(loop, angle, rate, goal=0.0):
+    return EpisodeStart(q=np.array([angle]), v=np.array([rate]), plan=loop.plan(0.0, goal, 1.0))
+
+
+def test_the_pendulum_follows_its_plan(loop):
+    episode = run_episode(loop, start=start(loop, 0.0, 0.0, goal=0.2))
+    assert episode.is_safe
+    length = loop.scenario.parameters.length_m
+    expected = length * np.array([math.sin(0.2), 0.0, math.cos(0.2)])
+    np.testing.assert_allclose(episode.desired_output[-1], expected, atol=1e-9)
+    np.testing.assert_allclose(episode.output[-1], expected, atol=2e-3)
+
+
+def test_beyond_the_angle_that_the_motor_holds_there_is_no_way_back(loop):
+    hold = loop.scenario.parameters.hold_angle_rad
+    assert run_episode(loop, start=start(loop, hold - 0.02, 0.0)).is_safe
+    lost = run_episode(loop, start=start(loop, hold + 0.02, 0.0))
+    assert (lost.is_safe, lost.cause) == (False, "front")
+    assert run_episode(loop, start=start(loop, -hold - 0.02, 0.0)).cause == "back"
+
+
+def test_at_rest_and_upright_gravity_accelerates_what_leans(loop):
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    # The motor's torque is at its limit, m g l share: φ̈ = (sin φ - share) g / l.
+    loop.reset_to(context, None, start(loop, 0.5, 0.0))
+    simulator.AdvanceTo(0.04)
+    parameters = loop.scenario.parameters
+    acceleration = (math.sin(0.5) - parameters.effort_share) * 9.81 / parameters.length_m
+    rate = loop.GetOutputPort("state").Eval(context)[1]
+    assert rate == pytest.approx(0.04 * acceleration, rel=0.03)
+
+
+def test_a_heavier_pendulum_is_lost_where_the_nominal_one_is_held(scenario, loop):
+    angle = loop.scenario.parameters.hold_angle_rad - 0.015
+    heavy = scenario.make_loop("actual")
+    assert run_episode(loop, start=start(loop, angle, 0.0)).is_safe
+    assert not run_episode(heavy, start=start(heavy, angle, 0.0)).is_safe
+
+
+def test_an_episode_goes_on_as_its_start_says(loop):
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, np.random.default_rng(3))
+    now = loop.start_of(context)
+    other = loop.CreateDefaultContext()
+    loop.reset_to(other, None, now)
+    for name in ("state", "desired_preview", "features"):
+        port = loop.GetOutputPort(name)
+        np.testing.assert_allclose(port.Eval(other), port.Eval(context), atol=1e-12)
+
+
+def test_features_are_worked_by_hand(loop):
+    context = loop.CreateDefaultContext()
+    loop.reset_to(context, None, start(loop, 0.1, 0.5, goal=0.2))
+    values = dict(
+        zip(loop.feature_names, loop.GetOutputPort("features").Eval(context), strict=True)
+    )
+    hold = math.asin(0.35)
+    capture = 0.1 + 0.5 * math.sqrt(0.5 / 9.81)
+    assert values["now_margin_front"] == pytest.approx(0.5)
+    assert values["now_margin_back"] == pytest.approx(0.7)
+    assert values["capture_reserve_front"] == pytest.approx(hold - capture)
+    assert values["goal_reserve_back"] == pytest.approx(hold + 0.2)
+    assert values["plan_reserve_front"] == pytest.approx(hold - 0.2)
+    assert values["tracking_error"] == pytest.approx(-0.1)
+
+
+def test_a_variation_that_asks_for_what_a_pendulum_has_not_is_refused():
+    text = (
+        "task: drake_safety.diagrams.pendulum:Pendulum\n"
+        "variations: {nominal: {foot_friction: 0.3}}\n"
+    )
+    scenario = parse_scenario(text, name="slippery", folder=None)
+    with pytest.raises(ValueError, match="'nominal' sets foot_friction, which this plant has not"):
+        scenario.make_loop()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ("{effort_share: 1.2}", "effort_share must be below 1"),
+        ("{mass_kg: 0}", "mass_kg must be finite and positive"),
+        ("{plan_duration_s: [2, 1]}", r"plan_duration_s must be \[shortest, longest\]"),
+        ("{start_angle_rad: 0.9}", "must not exceed largest_angle_rad 0.6"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(parameters, message):
+    text = f"task: drake_safety.diagrams.pendulum:Pendulum\nparameters: {parameters}\n"
+    with pytest.raises(ValueError, match=message):
+        parse_scenario(text, name="odd", folder=None)
+
+
+def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario):
+    episodes = run_episodes(scenario, 160, num_workers=1)
+    parameters = replace(scenario.assessment, ensemble_size=1, perplexity=20.0)
+    gamma = SafetyAssessment(parameters).fit(episodes)
+    truth = simulate_truth(scenario, "hold", 9, num_workers=1)
+    found = agreement(truth.is_safe, truth.safety_probability(gamma))
+    assert 0.2 < truth.is_safe.mean() < 0.8
+    assert found.intersection_over_union >= 0.75
+    assert found.band <= 0.26
+    # The pendulum is the same in the mirror, and so is what becomes of it.
+    np.testing.assert_array_equal(truth.is_safe, truth.is_safe[::-1, ::-1])
