@@ -26,9 +26,13 @@ ALLOWED = {
 }
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
 # What only an extra brings, and the files that may import it.
-EXTRAS = {"logs": "drake_safety/logs/", "mujoco": "drake_safety/control/mujoco"}
+EXTRAS = {
+    "logs": "drake_safety/logs/",
+    "mujoco": "drake_safety/control/mujoco",
+    "robots": "drake_safety/control/mesh_cache",
+}
 ONLY_IN = {
     "torch": "drake_safety/learning/embedding.py",
     "tslearn": "drake_safety/learning/distance.py",

@@ -48,8 +48,9 @@ def random_configuration(scene: Scene, rng: np.random.Generator):
     return (R_WB, p_WB), positions
 
 
-def test_every_robot_of_the_package_is_compared_with_its_published_figures():
-    assert robot_names() == ROBOTS
+def test_every_robot_described_in_the_package_is_compared_with_its_published_figures():
+    own = "package://drake_safety_models/"
+    assert [name for name in robot_names() if load_robot(name).urdf.startswith(own)] == ROBOTS
 
 
 def test_the_robot_weighs_what_is_published(scene):

@@ -7,11 +7,17 @@ from drake_safety.cli.console import console, new_table
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
+    from drake_safety.control.model_files import MissingExtraError
     from drake_safety.simulation.scenario import load_scenario, scenario_names
 
-    table = new_table("scenario", "task", "robot", "plants", "horizon")
+    table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")
     for name in scenario_names():
-        scenario = load_scenario(name)
+        try:
+            scenario = load_scenario(name)
+            scenario.task_class().model_files(scenario)
+        except MissingExtraError:
+            table.add_row(name, *4 * ["–"], "drake_safety[robots]")
+            continue
         horizon_s = scenario.assessment.horizon * scenario.step_s
         table.add_row(
             name,
@@ -19,5 +25,6 @@ def scenarios() -> None:
             scenario.robot,
             ", ".join(scenario.variations),
             f"{scenario.assessment.horizon} steps, {horizon_s:g} s",
+            "",
         )
     console.print(table)

@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
-from urllib.parse import urlparse
 
 import numpy as np
 from pydrake.geometry import (
@@ -13,7 +11,6 @@ from pydrake.geometry import (
     SceneGraph,
     Sphere,
 )
-from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     JointActuator,
@@ -23,6 +20,14 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
+from drake_safety.control.model_files import add_to_package_map as add_to_package_map
+from drake_safety.control.model_files import model_file as model_file
+from drake_safety.control.model_files import models_package_xml as models_package_xml
+from drake_safety.control.robot_description import (
+    add_description,
+    add_stated_shapes,
+    ignore_neighbours,
+)
 from drake_safety.control.robot_model import RobotModel, by_pattern
 
 ENGINES = ("drake", "mujoco")
@@ -98,39 +103,6 @@ _FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry fric
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
-def models_package_xml() -> Path:
-    """The ``package.xml`` behind ``package://drake_safety_models/``."""
-    import drake_safety
-
-    for folder in drake_safety.__path__:
-        candidate = Path(folder) / "models" / "package.xml"
-        if candidate.is_file():
-            return candidate
-    raise ValueError(f"no models/package.xml beside or inside {list(drake_safety.__path__)}")
-
-
-def add_to_package_map(package_map: PackageMap) -> None:
-    """Makes ``package://drake_safety_models/…`` known to a parser's package map."""
-    if not package_map.Contains("drake_safety_models"):
-        package_map.AddPackageXml(str(models_package_xml()))
-
-
-def model_file(url: str, folder: str = "") -> Path:
-    """The file behind a ``package://…`` URL, or behind a path that starts in ``folder``.
-
-    Raises:
-        ValueError: The package is unknown.
-    """
-    parts = urlparse(url)
-    if parts.scheme != "package":
-        return Path(folder) / url
-    package_map = PackageMap()
-    add_to_package_map(package_map)
-    if not package_map.Contains(parts.netloc):
-        raise ValueError(f"'{url}': no package '{parts.netloc}'; add its files by path")
-    return Path(package_map.GetPath(parts.netloc)) / parts.path.lstrip("/")
-
-
 def _require(exists: bool, robot: RobotModel, what: str, name: str, known: list[str]) -> None:
     if not exists:
         raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
@@ -197,15 +169,7 @@ def add_robot(
             ambiguous.
     """
     variation = variation or PlantVariation()
-    parser = Parser(plant)
-    parser.SetAutoRenaming(True)
-    add_to_package_map(parser.package_map())
-    if robot.urdf.startswith("package://"):
-        (instance,) = parser.AddModels(url=robot.urdf)
-    else:
-        (instance,) = parser.AddModels(str(Path(robot.source_dir) / robot.urdf))
-    plant.RenameModelInstance(instance, robot.name)
-
+    instance = add_description(plant, robot)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
     _require(robot.base in bodies, robot, "body", robot.base, bodies)
@@ -220,6 +184,8 @@ def add_robot(
     for body_name in robot.whole_body.orientation:
         _require(body_name in bodies, robot, "body", body_name, bodies)
     robot.mirror_partners(servo_joints(plant, robot))
+    if robot.collision == "stated" and plant.geometry_source_is_registered():
+        add_stated_shapes(plant, robot, instance)
 
     actuated = {
         plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i)
@@ -241,6 +207,9 @@ def add_robot(
         gains = by_pattern(robot.joint_gains, joint.name(), "gains", robot.name)
         if gains is not None and servos:
             actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
+        speed = by_pattern(robot.velocity_limits, joint.name(), "velocity limit", robot.name)
+        if speed is not None:
+            joint.set_velocity_limits([-speed], [speed])
         if variation.joint_damping:
             joint.set_default_damping(joint.default_damping() + variation.joint_damping)
     if variation.joint_friction_nm:
@@ -254,6 +223,7 @@ def add_robot(
     if scene_graph is not None:
         mu = variation.foot_friction or robot.foot_friction
         _set_friction(scene_graph, plant, robot, mu)
+        ignore_neighbours(plant, scene_graph, instance)
     for joint_name, position in posture_positions(plant, robot).items():
         plant.GetJointByName(joint_name, instance).set_default_positions([position])
     return instance

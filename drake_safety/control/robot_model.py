@@ -110,12 +110,52 @@ def _check_not_negative(what: str, value: float) -> None:
 
 
 @dataclass(kw_only=True)
+class CollisionShape:
+    """A shape fixed to a body: a box, a sphere, or with ``to_m`` a capsule."""
+
+    position_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Centre of a box or sphere, centre of a capsule's first end, in the body's frame, (3,)."""
+    box_m: list[float] = field(default_factory=list)
+    """Edges of a box along the body's axes, (3,)."""
+    radius_m: float = 0.0
+    """Of a sphere or capsule."""
+    to_m: list[float] = field(default_factory=list)
+    """Centre of a capsule's other end, (3,)."""
+
+    def check(self, who: str) -> None:
+        """Refuses what is no shape, or more than one.
+
+        Raises:
+            ValueError: Numbers are missing, or say two things.
+        """
+        for name in ("position_m", "box_m", "to_m"):
+            values = getattr(self, name)
+            if len(values) != 3 and (values or name == "position_m"):
+                raise ValueError(f"{who}: {name} must be three numbers [m]; got {values}")
+        if bool(self.box_m) == (self.radius_m > 0):
+            raise ValueError(
+                f"{who}: either box_m or a positive radius_m; got box_m {self.box_m}, radius_m "
+                f"{self.radius_m}"
+            )
+        if self.to_m and (self.box_m or self.to_m == self.position_m):
+            raise ValueError(
+                f"{who}: to_m must be a capsule's other end, away from position_m; got to_m "
+                f"{self.to_m} with position_m {self.position_m}, box_m {self.box_m}"
+            )
+
+
+COLLISIONS = ("model_file", "stated")
+"""Whose collision geometry a robot has."""
+
+
+@dataclass(kw_only=True)
 class RobotModel:
     """The schema of ``robot.yaml``: all that controllers and safe sets need to know of a robot."""
 
     name: str = ""
     urdf: str = ""
-    """``package://…`` or a path beside the YAML file; any format that Drake's Parser reads."""
+    """``package://…`` (ours, Drake's or a pip package's) or a path beside the YAML file; any
+    format that Drake's Parser reads."""
     base: str = ""
     """Floating base body."""
     posture: dict[str, float] = field(default_factory=dict)
@@ -130,6 +170,13 @@ class RobotModel:
     """Position servo gains, by regular expression over joint names."""
     effort_limits: dict[str, float] = field(default_factory=dict)
     """Effort limits [N·m] of actuators that the model file lacks, by regular expression."""
+    velocity_limits: dict[str, float] = field(default_factory=dict)
+    """Joint speed limits [rad/s] in place of the model file's, by regular expression."""
+    collision: str = "model_file"
+    """``model_file``: the model file's collision geometry. ``stated``: the contact points of the
+    feet and ``shapes`` alone, where the file has meshes or none (URDF only)."""
+    shapes: dict[str, list[CollisionShape]] = field(default_factory=dict)
+    """With ``stated`` collisions, by regular expression over body names."""
     foot_friction: float = 0.8
     """Coulomb friction coefficient of the contact points."""
     source_dir: str = ""
@@ -160,6 +207,18 @@ class RobotModel:
                     f"robot '{self.name}': mirror pattern '{pattern}' is not a regular "
                     f"expression: {error}"
                 ) from error
+        if self.collision not in COLLISIONS:
+            raise ValueError(
+                f"robot '{self.name}': collision must be one of {list(COLLISIONS)}; got "
+                f"'{self.collision}'"
+            )
+        for pattern, shapes in self.shapes.items():
+            for shape in shapes:
+                shape.check(f"robot '{self.name}', shapes '{pattern}'")
+        if self.collision == "model_file" and self.shapes:
+            raise ValueError(
+                f"robot '{self.name}': shapes {list(self.shapes)} need collision: stated"
+            )
         if not self.foot_friction > 0:
             raise ValueError(
                 f"robot '{self.name}': foot_friction must be positive; got {self.foot_friction}"
@@ -305,7 +364,9 @@ def load_robot_file(path: str | Path) -> RobotModel:
     return robot
 
 
-def by_pattern(patterns: dict[str, _Value], name: str, what: str, robot_name: str) -> _Value | None:
+def by_pattern(
+    patterns: dict[str, _Value], name: str, what: str, robot_name: str, kind: str = "joint"
+) -> _Value | None:
     """The value of the only pattern that matches ``name`` in full; None when none does.
 
     Raises:
@@ -313,5 +374,5 @@ def by_pattern(patterns: dict[str, _Value], name: str, what: str, robot_name: st
     """
     found = [key for key in patterns if re.fullmatch(key, name)]
     if len(found) > 1:
-        raise ValueError(f"robot '{robot_name}': {what} of joint '{name}' matches {found}")
+        raise ValueError(f"robot '{robot_name}': {what} of {kind} '{name}' matches {found}")
     return patterns[found[0]] if found else None

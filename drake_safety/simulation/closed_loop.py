@@ -203,6 +203,17 @@ class ClosedLoop(Diagram):
         return 0
 
     @classmethod
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """What the scenario file says of the task's parameters, with defaults that it asks for.
+
+        Args:
+            robot: The scenario's robot.
+            stated: What stands in the file.
+        """
+        del robot
+        return stated
+
+    @classmethod
     def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Options of the diagram with which a variation and its nominal twin begin alike.
 

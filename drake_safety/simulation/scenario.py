@@ -267,6 +267,8 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
-    schema = scenario.task_class().Parameters
-    scenario.parameters = load_typed(schema, parameters, f"scenario '{name}', parameters")
+    task = scenario.task_class()
+    if isinstance(parameters, dict):
+        parameters = task.complete_parameters(scenario.robot, parameters)
+    scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
     return scenario

@@ -1,0 +1,69 @@
+"""``drake-safety compare``: one table over several robots or scenarios."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_safety.cli.arguments import WorkersOption
+from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.provenance import command_line, versions
+
+
+def compare(
+    scenarios: Annotated[
+        list[str], typer.Argument(help="Names of scenarios with recovery, or paths of YAML files.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder: one inside it a scenario, and the table.")],
+    episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=20)] = 2048,
+    fresh: Annotated[int, typer.Option(help="Fresh nominal episodes to judge by.", min=20)] = 500,
+    throws: Annotated[int, typer.Option(help="Fresh balls at the actual plant.", min=1)] = 300,
+    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
+    workers: WorkersOption = None,
+) -> None:
+    """Train several scenarios alike and write one table: recalls, falls with and without recovery.
+
+    A comparison that was stopped goes on when it is called again; finished rows are kept.
+    """
+    from drake_safety.evaluation.comparison import (
+        Effort,
+        compare_scenario,
+        figure_names,
+        row_figure,
+        to_csv,
+        to_markdown,
+    )
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = [load_scenario(name) for name in scenarios]
+    names = [scenario.name for scenario in loaded]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"compare: {twice} are named more than once")
+    effort = Effort(num_episodes=episodes, num_fresh=fresh, num_throws=throws, seed=seed)
+    rows = []
+    with open_stages() as stages:
+        for scenario in loaded:
+            row = compare_scenario(
+                scenario, out / scenario.name, effort, num_workers=workers, progress=stages
+            )
+            rows.append(row)
+            # After every row: what is finished can be read while the next is simulated.
+            _write(out, rows, to_csv(rows), to_markdown(rows))
+    table = new_table("scenario", *(name.replace("_", " ") for name in figure_names()))
+    for row in rows:
+        figures = [row_figure(row, name) for name in figure_names()]
+        table.add_row(row["scenario"], *("–" if f is None else interval(f) for f in figures))
+    console.print(table)
+    for suffix in ("json", "csv", "md"):
+        print_path("table", out / f"comparison.{suffix}")
+
+
+def _write(out: Path, rows: list[dict[str, object]], csv: str, markdown: str) -> None:
+    report = {"command": command_line(), "versions": versions(), "rows": rows}
+    texts = {"json": json.dumps(report, indent=2) + "\n", "csv": csv, "md": markdown}
+    for suffix, text in texts.items():
+        (out / f"comparison.{suffix}").write_text(text, encoding="utf-8")

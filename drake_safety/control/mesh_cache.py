@@ -1,0 +1,102 @@
+"""Meshes in formats that Drake does not show, converted once and kept in the user's cache."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from drake_safety.control.model_files import MissingExtraError
+
+SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
+"""Formats that Drake shows as they are."""
+CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
+"""Environment variable that names the cache's folder."""
+_GREY = [0.6, 0.6, 0.6, 1.0]
+_VERSION = b"3"  # Of the conversion: another one converts again.
+
+
+def cache_folder() -> Path:
+    """``$DRAKE_SAFETY_CACHE``; else ``drake_safety`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    if os.environ.get(CACHE_VARIABLE):
+        return Path(os.environ[CACHE_VARIABLE])
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "drake_safety"
+
+
+def shown_mesh(path: Path, rgba: str = "") -> Path:
+    """A mesh in a format that Drake shows: the file itself, or a glTF file in the cache.
+
+    Args:
+        path: The mesh.
+        rgba: Colour of a mesh that has none of its own, "r g b a".
+
+    Raises:
+        MissingExtraError: There is something to convert, and nothing to convert it with.
+        ValueError: The file does not exist or cannot be read.
+    """
+    if path.suffix.lower() in SHOWN_FORMATS:
+        return path
+    if not path.is_file():
+        raise ValueError(f"mesh '{path}' does not exist")
+    digest = _digest(path, path.stat().st_mtime_ns, rgba)
+    target = cache_folder() / "meshes" / f"{path.stem}-{digest[:16]}.gltf"
+    if not target.is_file():
+        _write(target, _to_gltf(path, rgba))
+    return target
+
+
+@lru_cache(maxsize=1024)
+def _digest(path: Path, changed_ns: int, rgba: str) -> str:
+    del changed_ns  # A file that has changed is another key.
+    return hashlib.sha256(_VERSION + rgba.encode() + path.read_bytes()).hexdigest()
+
+
+def _write(target: Path, content: bytes) -> None:
+    """Under another name first: a process beside this one never reads half a file."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=target.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        Path(name).replace(target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _to_gltf(path: Path, rgba: str) -> bytes:
+    try:
+        import trimesh
+
+        if path.suffix.lower() == ".dae":
+            import collada  # noqa: F401  # trimesh reads this format through it.
+    except ImportError as error:
+        raise MissingExtraError(
+            f"mesh '{path}': Drake does not show {path.suffix} files, and '{error.name}', which "
+            "would convert it, is not installed: pip install 'drake_safety[robots]'"
+        ) from error
+    try:
+        scene = trimesh.load_scene(path)
+    except Exception as error:  # trimesh's readers raise whatever they stumble on.
+        raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
+    if path.suffix.lower() == ".stl":
+        colour = [float(value) for value in rgba.split()] or _GREY
+        for mesh in scene.geometry.values():
+            mesh.visual = trimesh.visual.TextureVisuals(
+                material=trimesh.visual.material.PBRMaterial(
+                    baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8
+                )
+            )
+    # A robot's z axis points up, a glTF file's y axis: Drake turns it back.
+    X_YZ = np.eye(4)
+    X_YZ[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    scene.apply_transform(X_YZ)
+    (content,) = trimesh.exchange.gltf.export_gltf(
+        scene, merge_buffers=True, embed_buffers=True
+    ).values()
+    return bytes(content)

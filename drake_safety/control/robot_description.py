@@ -1,0 +1,244 @@
+"""A robot's model file as it enters a plant: what robot.yaml says instead of it, stands."""
+
+from __future__ import annotations
+
+import io
+import logging
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
+
+from drake_safety.control.mesh_cache import SHOWN_FORMATS, shown_mesh
+from drake_safety.control.model_files import add_to_package_map, model_file
+from drake_safety.control.robot_model import CollisionShape, RobotModel, by_pattern
+
+_logger = logging.getLogger("drake_safety")
+_SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.
+
+
+def adapted_urdf(
+    text: str, *, keep_collisions: bool, convert: Callable[[str, str], str]
+) -> tuple[str, bool]:
+    """A URDF that Drake can take: its geometry, and no fixed joint that mimics another.
+
+    Args:
+        text: The URDF.
+        keep_collisions: Whether its own collision geometry stays.
+        convert: From a mesh's file name, as the URDF has it, and its colour ("r g b a" or "") to
+            the file name of one which Drake shows.
+
+    Returns:
+        The URDF, and whether it differs.
+    """
+    for _, (prefix, uri) in ElementTree.iterparse(io.StringIO(text), events=("start-ns",)):
+        ElementTree.register_namespace(prefix, uri)
+    root = ElementTree.fromstring(text)
+    is_changed = False
+    colours = {one.get("name", ""): one for one in root.findall("material")}
+    for link in root.findall("link"):
+        if not keep_collisions:
+            for element in link.findall("collision"):
+                link.remove(element)
+                is_changed = True
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            if mesh is None:
+                continue
+            material = visual.find("material")
+            name = mesh.get("filename", "")
+            converted = convert(name, _colour(material, colours))
+            if converted == name:
+                continue
+            is_changed = True
+            mesh.set("filename", converted)
+            if material is not None and converted.endswith(".gltf"):
+                visual.remove(material)  # The mesh has its own, or this colour by now.
+    for joint in root.findall("joint"):
+        for mimic in joint.findall("mimic"):
+            if joint.get("type") == "fixed":
+                joint.remove(mimic)
+                is_changed = True
+    return ElementTree.tostring(root, encoding="unicode"), is_changed
+
+
+def _colour(material: ElementTree.Element | None, colours: dict[str, ElementTree.Element]) -> str:
+    if material is None:
+        return ""
+    for one in (material, colours.get(material.get("name", ""))):
+        colour = None if one is None else one.find("color")
+        if colour is not None:
+            return colour.get("rgba", "")
+    return ""
+
+
+def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
+    """Adds a robot's bodies, joints and shapes to a plant, as its model file and robot.yaml say.
+
+    Args:
+        plant: A plant before ``Finalize``. Without a scene graph, geometry is left out.
+        robot: The robot.
+
+    Returns:
+        The model instance, named as the robot.
+
+    Raises:
+        ValueError: The file's package is not installed, or a mesh cannot be converted.
+    """
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    add_to_package_map(parser.package_map(), robot.urdf)
+    path = model_file(robot.urdf, robot.source_dir)
+    text, is_changed = "", False
+    if path.suffix == ".urdf":
+        has_geometry = plant.geometry_source_is_registered()
+        text, is_changed = adapted_urdf(
+            path.read_text(encoding="utf-8"),
+            keep_collisions=robot.collision == "model_file",
+            convert=lambda name, rgba: _shown(name, rgba, path.parent) if has_geometry else name,
+        )
+    with _quiet_about(robot):
+        if is_changed:
+            (instance,) = parser.AddModelsFromString(text, "urdf")
+        elif robot.urdf.startswith("package://"):
+            (instance,) = parser.AddModels(url=robot.urdf)
+        else:
+            (instance,) = parser.AddModels(str(path))
+    plant.RenameModelInstance(instance, robot.name)
+    return instance
+
+
+@contextmanager
+def _quiet_about(robot: RobotModel) -> Iterator[None]:
+    """Says what the parser has to say of another's published file at the level of debugging.
+
+    A user can change nothing about it, and every worker process would repeat it.
+    """
+    drake = logging.getLogger("drake")
+    is_own = not robot.urdf.startswith("package://")
+
+    def pass_on(record: logging.LogRecord) -> bool:
+        if is_own or record.levelno > logging.WARNING:
+            return True
+        _logger.debug("%s: %s", robot.name, record.getMessage())
+        return False
+
+    drake.addFilter(pass_on)
+    try:
+        yield
+    finally:
+        drake.removeFilter(pass_on)
+
+
+def _shown(name: str, rgba: str, folder: Path) -> str:
+    # What is given to a parser as text has no folder that a relative name could start in.
+    if Path(name).suffix.lower() in SHOWN_FORMATS:
+        return name if "://" in name else (folder / name).resolve().as_uri()
+    return shown_mesh(model_file(name, str(folder)), rgba).resolve().as_uri()
+
+
+def add_stated_shapes(
+    plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
+) -> None:
+    """Gives a robot the collision geometry of robot.yaml: its contact points and its shapes.
+
+    Args:
+        plant: A plant before ``Finalize``, with a scene graph.
+        robot: The robot; its bodies are in the plant.
+        instance: Its model instance.
+
+    Raises:
+        ValueError: A pattern of ``shapes`` matches no body, or two match one.
+    """
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
+    matched = set()
+    for body in bodies:
+        shapes = by_pattern(robot.shapes, body.name(), "shapes", robot.name, "body")
+        if shapes is None:
+            continue
+        matched.add(id(shapes))
+        for i, stated in enumerate(shapes):
+            X_BG, shape = _shape_of(stated)
+            plant.RegisterCollisionGeometry(
+                body,
+                X_BG,
+                shape,
+                f"{body.name()}_shape_{i}",
+                CoulombFriction(_SHAPE_FRICTION, _SHAPE_FRICTION),
+            )
+    unused = [pattern for pattern, shapes in robot.shapes.items() if id(shapes) not in matched]
+    if unused:
+        raise ValueError(
+            f"robot '{robot.name}' has no body for shapes {unused}; it has "
+            f"{[body.name() for body in bodies]}"
+        )
+    for name, foot in robot.feet.items():
+        body = plant.GetBodyByName(foot.body, instance)
+        for i, point in enumerate(foot.contact_points):
+            plant.RegisterCollisionGeometry(
+                body,
+                RigidTransform(point),
+                Sphere(foot.radius_m),
+                f"{name}_contact_{i}",
+                CoulombFriction(robot.foot_friction, robot.foot_friction),
+            )
+
+
+def ignore_neighbours(
+    plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
+) -> None:
+    """Links that a joint connects do not collide, nor do those that are welded to them.
+
+    Drake itself ignores the two bodies of a joint, but not a foot or a motor's housing that its
+    model file welds to one of them.
+
+    Args:
+        plant: A plant before ``Finalize``.
+        scene_graph: Its scene graph.
+        instance: The robot's model instance.
+    """
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    for joint in joints:
+        if joint.num_velocities() == 0:
+            continue
+        sides = [
+            plant.GetBodiesWeldedTo(body) for body in (joint.parent_body(), joint.child_body())
+        ]
+        if all(len(side) == 1 for side in sides):
+            continue
+        parent, child = (GeometrySet(_geometries(plant, side)) for side in sides)
+        scene_graph.collision_filter_manager().Apply(
+            CollisionFilterDeclaration().ExcludeBetween(parent, child)
+        )
+
+
+def _geometries(plant: MultibodyPlant, bodies: list[RigidBody]) -> list[GeometryId]:
+    return [one for body in bodies for one in plant.GetCollisionGeometriesForBody(body)]
+
+
+def _shape_of(stated: CollisionShape) -> tuple[RigidTransform, Shape]:
+    start = np.array(stated.position_m, dtype=float)
+    if stated.box_m:
+        return RigidTransform(start), Box(*stated.box_m)
+    if not stated.to_m:
+        return RigidTransform(start), Sphere(stated.radius_m)
+    axis = np.array(stated.to_m, dtype=float) - start
+    length = float(np.linalg.norm(axis))
+    R_BG = RotationMatrix.MakeFromOneVector(axis / length, 2)
+    return RigidTransform(R_BG, start + 0.5 * axis), Capsule(stated.radius_m, length)

@@ -1,0 +1,182 @@
+"""One row a scenario: how well Γ judges its plans beforehand, and what recovery saves."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drake_safety.evaluation.episode_study import evaluate_episodes
+from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.models import load_robot
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario
+
+_FIGURES = {
+    "share_unsafe": "episodes.share_unsafe",
+    "auc": "episodes.sharpened.auc",
+    "safe_recall": "episodes.sharpened.safe_recall",
+    "unsafe_recall": "episodes.sharpened.unsafe_recall",
+    "falls_without_recovery": "throws.falls_without_recovery",
+    "falls_with_recovery": "throws.sharpened.falls_with_recovery",
+    "false_triggers": "throws.sharpened.false_triggers",
+    "recoveries_with_legs_collide": "throws.sharpened.recoveries_with_legs_collide",
+    "recoveries_with_joint_velocity": "throws.sharpened.recoveries_with_joint_velocity",
+}
+"""Columns, and the figures behind them. Recalls and AUC are of whole episodes, at k = 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """How much is simulated for a row."""
+
+    num_episodes: int
+    """To learn from."""
+    num_fresh: int
+    """To judge by; half as many others choose the threshold."""
+    num_throws: int
+    seed: int
+
+
+def compare_scenario(
+    scenario: Scenario,
+    folder: Path,
+    effort: Effort,
+    *,
+    num_workers: int | None = None,
+    progress: StageProgress,
+) -> dict[str, Any]:
+    """Learns a scenario's Γ and judges it; what the folder already holds is not done again.
+
+    Args:
+        scenario: A scenario with balls and recovery.
+        folder: Where its episodes, its assessment and its row are kept.
+        effort: How much is simulated.
+        num_workers: Processes.
+        progress: Called with a stage, the number done and the number wanted.
+
+    Returns:
+        The row: names and numbers, and for each figure its value, interval and n.
+
+    Raises:
+        ValueError: The task has no recovery, or the folder holds another scenario's episodes.
+    """
+    if not hasattr(scenario.parameters, "recovery"):
+        raise ValueError(f"compare: task '{scenario.task}' of '{scenario.name}' has no recovery")
+    made_by = {
+        "scenario": scenario.to_yaml(),
+        "simulation_hash": scenario.simulation_hash(),
+        "actual_hash": scenario.simulation_hash("actual"),
+        **vars(effort),
+    }
+    file = folder / "row.json"
+    if file.is_file():
+        stored = json.loads(file.read_text(encoding="utf-8"))
+        if stored["made_by"] == made_by:
+            return stored["row"]
+    run = partial(run_episodes, scenario, num_workers=num_workers)
+    seed = effort.seed
+    training = run(
+        effort.num_episodes,
+        seed=seed,
+        path=folder / "episodes",
+        progress=partial(progress, f"{scenario.name}: training"),
+    )
+    fresh, calibration = (
+        run(
+            number,
+            seed=seed + offset,
+            path=folder / name,
+            progress=partial(progress, f"{scenario.name}: {name}"),
+        )
+        for name, number, offset in (
+            ("fresh", effort.num_fresh, 1_000_000),
+            ("calibration", max(effort.num_fresh // 2, 20), 1_000_001),
+        )
+    )
+    assessment = SafetyAssessment(scenario.assessment).fit(training)
+    assessment.save(folder / "sharpened.safetensors")
+    recovery = scenario.parameters.recovery
+    published = "normalized" if recovery.is_normalized else "safety_probability"
+    scorer = assessment_scorer("sharpened", assessment, published)
+    figures, _, _ = evaluate_episodes([scorer], calibration, fresh)
+    study = evaluate_throws(
+        scenario,
+        [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
+        num_throws=effort.num_throws,
+        num_calibration=0,
+        seed=seed + 1_000_002,
+        calibration_seed=seed + 1_000_003,
+        num_workers=num_workers,
+        progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
+    )
+    figures |= study.figures
+    row = {
+        "scenario": scenario.name,
+        "robot": load_robot(scenario.robot).name,
+        "episodes": effort.num_episodes,
+        "throws": effort.num_throws,
+        **{name: figures[key].to_json() for name, key in _FIGURES.items() if key in figures},
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"made_by": made_by, "row": row}, indent=2)
+    part = file.with_suffix(".part")
+    part.write_text(text + "\n", encoding="utf-8")
+    part.replace(file)
+    return row
+
+
+def row_figure(row: dict[str, Any], name: str) -> Figure | None:
+    """A figure of a row; None where the study had nothing to say."""
+    stored = row.get(name)
+    if not isinstance(stored, dict) or stored["value"] is None:
+        return None
+    return Figure(stored["value"], stored["low"], stored["high"], stored["n"])
+
+
+def figure_names() -> list[str]:
+    """The columns that hold figures."""
+    return list(_FIGURES)
+
+
+def to_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as CSV; each figure has its value and the ends of its interval."""
+    text = io.StringIO()
+    plain = ["scenario", "robot", "episodes", "throws"]
+    ends = ("value", "low", "high")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(plain + [f"{name}_{end}" for name in _FIGURES for end in ends])
+    for row in rows:
+        cells = [row[name] for name in plain]
+        for name in _FIGURES:
+            cells += [row.get(name, {}).get(end) for end in ends]
+        writer.writerow(cells)
+    return text.getvalue()
+
+
+def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as a Markdown table, shares in percent, 95 % intervals in brackets."""
+    heads = ["scenario", "robot", "episodes", "throws", *(n.replace("_", " ") for n in _FIGURES)]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for row in rows:
+        cells = [str(row[name]) for name in ("scenario", "robot", "episodes", "throws")]
+        for name in _FIGURES:
+            cells.append(_in_words(row_figure(row, name), name))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _in_words(figure: Figure | None, name: str) -> str:
+    if figure is None:
+        return "–"
+    scale, digits = (1.0, 3) if name == "auc" else (100.0, 1)
+    low, value, high = (f"{scale * x:.{digits}f}" for x in (figure.low, figure.value, figure.high))
+    return f"{value} [{low}, {high}]"

@@ -1,0 +1,78 @@
+"""Meshes that Drake does not show are converted once, upright, in their colour."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from drake_safety.control.mesh_cache import cache_folder, shown_mesh
+
+trimesh = pytest.importorskip("trimesh")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def tower(tmp_path):
+    """A box 1 by 2 by 4 m, upright."""
+    path = tmp_path / "tower.stl"
+    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
+    return path
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "here"))
+    assert cache_folder() == tmp_path / "here"
+    monkeypatch.delenv("DRAKE_SAFETY_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_folder() == tmp_path / "xdg" / "drake_safety"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / ".cache" / "drake_safety"
+
+
+def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):
+    assert shown_mesh(tmp_path / "trunk.obj") == tmp_path / "trunk.obj"
+    assert not cache.exists()
+
+
+def test_up_stays_up_and_the_colour_is_the_models(cache, tower):
+    converted = shown_mesh(tower, "0.1 0.2 0.3 1")
+    gltf = json.loads(converted.read_text())
+    (colour,) = [one["pbrMetallicRoughness"]["baseColorFactor"] for one in gltf["materials"]]
+    # trimesh keeps colours as bytes.
+    np.testing.assert_allclose(colour, [0.1, 0.2, 0.3, 1.0], atol=1 / 255)
+    # A glTF file's y axis points up.
+    extents = trimesh.load_scene(converted).extents
+    np.testing.assert_allclose(extents, [1.0, 4.0, 2.0], atol=1e-6)
+
+
+def test_a_mesh_is_converted_once_until_it_or_its_colour_changes(cache, tower):
+    first = shown_mesh(tower)
+    written = first.stat().st_mtime_ns
+    assert shown_mesh(tower) == first
+    assert first.stat().st_mtime_ns == written
+    assert shown_mesh(tower, "1 0 0 1") != first
+    trimesh.creation.box(extents=[1.0, 1.0, 1.0]).export(tower)
+    assert shown_mesh(tower) != first
+    assert [path for path in first.parent.iterdir() if path.suffix != ".gltf"] == []
+
+
+def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path):
+    with pytest.raises(ValueError, match=r"gone\.stl' does not exist"):
+        shown_mesh(tmp_path / "gone.stl")
+    (tmp_path / "text.dae").write_text("no mesh")
+    with pytest.raises(ValueError, match=r"text\.dae' cannot be read"):
+        shown_mesh(tmp_path / "text.dae")
+    assert list(cache.rglob("*.gltf")) == []
+
+
+def test_without_the_converter_the_extra_is_named(cache, tower, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[robots\]'"):
+        shown_mesh(tower)

@@ -1,0 +1,156 @@
+"""A model file enters a plant with what robot.yaml says instead of it."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.geometry import Box, Capsule, Sphere
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_safety.control import model_files
+from drake_safety.control.model_files import MissingExtraError, model_file
+from drake_safety.control.robot import add_robot
+from drake_safety.control.robot_description import adapted_urdf
+from drake_safety.control.robot_model import load_robot_file
+
+URDF = """<robot name="stool">
+<material name="red"><color rgba="1 0 0 1"/></material>
+<link name="seat"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+ iyz="0"/></inertial>
+ <visual><geometry><mesh filename="seat.stl"/></geometry><material name="red"/></visual>
+ <collision><geometry><mesh filename="package://nowhere/seat.stl"/></geometry></collision></link>
+<link name="leg"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+ iyz="0"/></inertial></link>
+<link name="tip"/>
+<joint name="hip" type="revolute"><parent link="seat"/><child link="leg"/><axis xyz="0 1 0"/>
+ <limit lower="-1" upper="1" effort="5" velocity="1000"/></joint>
+<joint name="ankle" type="fixed"><parent link="leg"/><child link="tip"/>
+ <origin xyz="0 0 -0.5"/></joint>
+</robot>"""
+ROBOT = {
+    "name": "stool",
+    "urdf": "stool.urdf",
+    "base": "seat",
+    "posture": {},
+    "feet": {
+        "tip": {"body": "tip", "contact_points": [[0, 0, 0.1]], "radius_m": 0.1, "joints": ["hip"]}
+    },
+    "effort_limits": {"hip": 5.0},
+    "velocity_limits": {"hip": 7.0},
+    "collision": "stated",
+    "shapes": {
+        "seat": [{"box_m": [0.4, 0.4, 0.1]}],
+        "leg": [{"radius_m": 0.05, "position_m": [0, 0, -0.1], "to_m": [0, 0.3, -0.5]}],
+    },
+}
+
+
+def write(folder, **changes):
+    # No visual mesh: there is no file behind it.
+    root = ElementTree.fromstring(URDF)
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    (folder / "stool.urdf").write_text(ElementTree.tostring(root, encoding="unicode"))
+    (folder / "robot.yaml").write_text(yaml.safe_dump(ROBOT | changes))
+    return load_robot_file(folder / "robot.yaml")
+
+
+def built(robot):
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    add_robot(plant, robot, scene_graph=scene_graph)
+    plant.Finalize()
+    return plant, scene_graph, builder.Build()
+
+
+def test_meshes_are_replaced_with_their_colour_and_collisions_dropped():
+    asked = []
+
+    def convert(name, rgba):
+        asked.append((name, rgba))
+        return "file:///cache/seat.gltf"
+
+    text, is_changed = adapted_urdf(URDF, keep_collisions=False, convert=convert)
+    root = ElementTree.fromstring(text)
+    assert asked == [("seat.stl", "1 0 0 1")]
+    assert is_changed and list(root.iter("collision")) == []
+    (visual,) = root.iter("visual")
+    assert visual.find("geometry/mesh").get("filename") == "file:///cache/seat.gltf"
+    # Its colour is in the mesh: Drake warns of a second one.
+    assert visual.find("material") is None
+
+
+def test_a_file_that_needs_no_change_is_said_to_be_the_same():
+    _, is_changed = adapted_urdf(URDF, keep_collisions=True, convert=lambda name, rgba: name)
+    assert not is_changed
+
+
+def test_a_fixed_joint_mimics_nothing():
+    mimic = '<mimic joint="hip"/>'
+    text = URDF.replace('<origin xyz="0 0 -0.5"/>', f'<origin xyz="0 0 -0.5"/>{mimic}')
+    adapted, is_changed = adapted_urdf(text, keep_collisions=True, convert=lambda name, rgba: name)
+    assert is_changed and "mimic" not in adapted
+
+
+def test_stated_shapes_and_contact_points_are_all_that_collides(tmp_path):
+    plant, scene_graph, _ = built(write(tmp_path))
+    inspector = scene_graph.model_inspector()
+    shapes = {}
+    for name in ("seat", "leg", "tip"):
+        (geometry,) = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name))
+        shapes[name] = (inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry))
+    seat, leg, tip = (shapes[name] for name in ("seat", "leg", "tip"))
+    assert isinstance(seat[0], Box) and seat[0].size().tolist() == [0.4, 0.4, 0.1]
+    assert isinstance(tip[0], Sphere) and tip[1].translation()[2] == 0.1
+    # From (0, 0, -0.1) to (0, 0.3, -0.5): half a metre, its middle between them.
+    assert isinstance(leg[0], Capsule) and leg[0].length() == pytest.approx(0.5)
+    np.testing.assert_allclose(leg[1].translation(), [0.0, 0.15, -0.3])
+    np.testing.assert_allclose(leg[1].rotation().col(2), [0.0, 0.6, -0.8], atol=1e-12)
+
+
+def test_what_is_welded_to_a_neighbour_does_not_collide_with_it(tmp_path):
+    # The tip is welded to the leg, so Drake alone would let it push the seat.
+    plant, scene_graph, _ = built(write(tmp_path))
+    seat, tip = (
+        plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name))[0]
+        for name in ("seat", "tip")
+    )
+    assert scene_graph.model_inspector().CollisionFiltered(seat, tip)
+
+
+def test_a_stated_speed_limit_stands_in_for_the_files(tmp_path):
+    plant, _, _ = built(write(tmp_path))
+    assert plant.GetJointByName("hip").velocity_upper_limit() == 7.0
+    assert plant.GetJointByName("hip").velocity_lower_limit() == -7.0
+
+
+def test_shapes_of_no_body_and_shapes_that_are_none_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="no body for shapes \\['lid'\\]"):
+        built(write(tmp_path, shapes={"lid": [{"radius_m": 0.1}]}))
+    with pytest.raises(ValueError, match="either box_m or a positive radius_m"):
+        write(tmp_path, shapes={"seat": [{}]})
+    with pytest.raises(ValueError, match="to_m must be a capsule's other end"):
+        write(tmp_path, shapes={"seat": [{"box_m": [1, 1, 1], "to_m": [0, 0, 1]}]})
+    with pytest.raises(ValueError, match="collision must be one of"):
+        write(tmp_path, collision="meshes")
+    with pytest.raises(ValueError, match="need collision: stated"):
+        write(tmp_path, collision="model_file")
+
+
+def test_a_package_that_an_extra_would_bring_is_asked_for_by_the_extras_name(monkeypatch):
+    monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):
+        model_file("package://example-robot-data/robots/a.urdf")
+    with pytest.raises(ValueError, match="no package 'nobody'"):
+        model_file("package://nobody/a.urdf")
+
+
+def test_a_package_of_pips_is_found_by_its_share_folder_or_as_a_python_package():
+    robots = model_file("package://example-robot-data/robots")
+    assert robots.is_dir() and robots.parent.name == "example-robot-data"
+    import jinja2
+
+    assert str(model_file("package://jinja2/loaders.py")) == jinja2.loaders.__file__

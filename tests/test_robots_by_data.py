@@ -1,0 +1,97 @@
+"""Robots of the extra `robots`: each stands, by its robot.yaml and its scenario alone."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.model_files import MissingExtraError
+from drake_safety.models import load_robot, robot_names
+from drake_safety.simulation.sampling import calm_start
+from drake_safety.simulation.scenario import load_scenario, scenario_names
+from drake_safety.simulation.throws import ViolationCounter
+
+OF_THE_EXTRA = [
+    name
+    for name in robot_names()
+    if load_robot(name).urdf.startswith("package://example-robot-data/")
+]
+BALANCING = [name for name in OF_THE_EXTRA if f"{name}_balancing" in scenario_names()]
+
+
+def heights_standing(name, duration_s):
+    """Heights of the base, twenty a second, and what must not happen while standing."""
+    loop = load_scenario(f"{name}_balancing").make_loop("actual", recovery=False, ball=False)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    rng = np.random.default_rng(0)
+    start = calm_start(loop.kinematics, rng, half_widths_m=[0, 0], plan_duration_s=[1.0, 1.0])
+    loop.reset_calm(context, rng)
+    loop._set(context, rng, start)
+    simulator.Initialize()
+    violations = ViolationCounter(loop)
+    heights = []
+    for row in range(1, round(20 * duration_s) + 1):
+        simulator.AdvanceTo(0.05 * row)
+        violations.count(context)
+        heights.append(loop.GetOutputPort("plant_state").Eval(context)[6])
+    return np.array(heights), loop.kinematics.standing_height, violations.counts
+
+
+def check_standing(name, duration_s):
+    heights, standing, violations = heights_standing(name, duration_s)
+    assert np.abs(heights - standing).max() < 0.02
+    assert not any(violations.values()), violations
+
+
+def test_six_quadrupeds_besides_the_packages_own_balance_by_data_alone():
+    assert len(BALANCING) >= 6
+    assert all(len(load_robot(name).feet) == 4 for name in BALANCING)
+
+
+@pytest.mark.parametrize("name", BALANCING)
+def test_it_stands_for_two_seconds(name):
+    check_standing(name, 2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BALANCING)
+def test_it_stands_for_ten_seconds(name):
+    check_standing(name, 10.0)
+
+
+@pytest.mark.parametrize("name", BALANCING)
+def test_every_joint_is_driven_and_the_ranges_are_of_its_size(name):
+    scenario = load_scenario(f"{name}_balancing")
+    kinematics = RobotKinematics(load_robot(name))
+    assert kinematics.plant.num_actuators() == kinematics.num_joints == 12
+    parameters, height = scenario.parameters, kinematics.standing_height
+    half_width = np.abs(kinematics.nominal_contacts[:, 1]).max()
+    low, high = parameters.safe_set.height_m
+    assert parameters.safe_set.fall_height_m < low < height < high
+    assert parameters.start.base_height_m[0] < height < parameters.start.base_height_m[1]
+    assert parameters.start.target_offset_m[1] < half_width
+    assert 0 < parameters.recovery.step.min_lateral_m < half_width
+    assert parameters.recovery.step.max_reach_m < height
+
+
+def test_without_the_extra_a_scenario_says_what_to_install(monkeypatch):
+    from drake_safety.control import model_files
+
+    monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):
+        load_scenario(f"{BALANCING[0]}_balancing")
+
+
+def test_without_the_extra_the_list_of_scenarios_says_which_need_it(monkeypatch, capsys):
+    from drake_safety.cli.scenarios import scenarios
+    from drake_safety.control import model_files
+
+    monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
+    monkeypatch.setenv("COLUMNS", "200")
+    scenarios()
+    lines = capsys.readouterr().out.splitlines()
+    for name in scenario_names():
+        (line,) = [one for one in lines if f" {name} " in one]
+        of_extra = name.rpartition("_")[0] in OF_THE_EXTRA
+        assert ("drake_safety[robots]" in line) == of_extra
