@@ -46,6 +46,7 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "calibrate",
         "ask",
         "run",
+        "play",
         "evaluate",
         "plan-study",
         "adapt",

@@ -1,0 +1,77 @@
+"""``drake-safety play``: throw balls, move targets, and watch what Γ makes of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
+from drake_safety.cli.console import console
+from drake_safety.cli.targets import HandOption
+from drake_safety.cli.training_folder import goal_threshold, load_assessment
+
+if TYPE_CHECKING:
+    from drake_safety.simulation.live_session import LiveSession
+
+
+def play(
+    scenario: ScenarioArgument,
+    assessment: AssessmentOption,
+    hand: HandOption = None,
+    variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
+    recovery: Annotated[
+        bool | None,
+        typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = 0,
+    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
+    port: Annotated[
+        int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")
+    ] = None,
+) -> None:
+    """Play with the robot in the browser, in real time, until Stop or Ctrl-C.
+
+    Sliders and buttons throw a ball or move the target; Γ, belief and verdict stand beside it.
+    """
+    from pydrake.geometry import Meshcat, MeshcatParams
+
+    from drake_safety.simulation.live_session import LiveGoals, LiveThrows
+    from drake_safety.simulation.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    gamma = load_assessment(assessment, mode)
+    given = {"hand": hand, "recovery": recovery}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    # What a task offers is asked of its diagram, before a browser is opened for it.
+    has_goals = loaded.make_loop(variation, assessment=gamma, **options).target_box is not None
+    if not has_goals:
+        options["ball"] = True
+    meshcat = Meshcat(MeshcatParams() if port is None else MeshcatParams(port=port))
+    loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
+    session: LiveSession
+    if has_goals:
+        rule = goal_threshold(assessment, mode, gamma)
+        if rule.remark:
+            console.print(rule.remark, highlight=False, soft_wrap=True)
+        session = LiveGoals(
+            loop, meshcat, threshold=rule.threshold, unsafe_below=rule.unsafe_below, seed=seed
+        )
+    else:
+        threshold = loaded.parameters.recovery.threshold
+        session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
+    console.print(f"live at {meshcat.web_url()}", highlight=False, soft_wrap=True)
+    console.print("controls: top right of the page; Stop or Ctrl-C ends", highlight=False)
+    try:
+        session.run()
+    except KeyboardInterrupt:
+        pass
+    pace = session.pace
+    if pace.simulated_s == 0.0:
+        console.print("nothing was simulated", highlight=False)
+        return
+    console.print(
+        f"real-time factor {pace.realtime_factor:.2f} over {pace.simulated_s:.1f} s simulated; "
+        f"this machine could run it at {pace.possible_factor:.2f}",
+        highlight=False,
+    )

@@ -1,0 +1,336 @@
+"""What a live page shows beside the robot: Γ over time, the belief, and the verdict in words.
+
+Meshcat shows geometry, buttons and sliders, but no text and no plots. Words are therefore a picture
+on a board, drawn anew only when they change; the belief is a bar of three boxes, and Γ a line.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import math
+import struct
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import InMemoryMesh, Mesh, Meshcat, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_safety.simulation.view import View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SAFE_RGB = (0.169, 0.424, 0.690)
+UNSAFE_RGB = (0.820, 0.329, 0.106)
+UNKNOWN_RGB = (0.788, 0.800, 0.820)
+RECOVERY_RGB = (0.106, 0.620, 0.467)
+INK_RGB = (0.133, 0.149, 0.169)
+
+_PATH = "/assessment"
+_PARTS = ("safe", "unsafe", "unknown")
+# Lengths on the board, whose width is one, from its lower edge upwards.
+_WIDTH, _MARGIN = 1.0, 0.04
+_WORDS_HEIGHT = 0.17
+_BAR_Z, _BAR_HEIGHT = 0.20, 0.07
+_LEGEND_Z = 0.305
+_PLOT_Z, _PLOT_HEIGHT = 0.37, 0.34
+_TITLE_Z, _HEIGHT = 0.75, 0.79
+_LAYER = 0.004  # Between what lies on top of each other.
+_PIXELS_PER_UNIT = 700
+_TEXT_HEIGHT = 0.034
+_HISTORY_S = 6.0
+_NUM_BOARDS = 12  # That are kept.
+_DPI = 100
+_EMPTY = np.array([0.0, 0.0, 1.0])
+
+
+class LivePanel:
+    """A board in the world that turns to the camera: words, a bar of beliefs, and Γ over time.
+
+    Args:
+        meshcat: Where to draw.
+        view: Where the camera stands.
+        threshold: Γ below this line is what the task reacts to, or refuses.
+        width_m: Width of the board [m].
+    """
+
+    def __init__(self, meshcat: Meshcat, view: View, *, threshold: float, width_m: float):
+        self._meshcat = meshcat
+        self._view = view
+        self._scale = width_m
+        self._history: deque[tuple[float, float]] = deque()
+        self._words: tuple[str, ...] = ()
+        self._boards: list[tuple[object, ...]] = []
+        self._belief = np.full(3, np.nan)
+        meshcat.Delete(_PATH)
+        size = (_WIDTH, _HEIGHT)
+        self._put_picture("ground", ground_picture(threshold), size, z=0.0, forward=0.0)
+        for name, rgb in zip(_PARTS, (SAFE_RGB, UNSAFE_RGB, UNKNOWN_RGB), strict=True):
+            colour = words_picture("", rgb=rgb, ground=rgb, width=0.02, height=0.02)
+            self._put_picture(f"belief/{name}/colour", colour, (1.0, _BAR_HEIGHT), z=_BAR_Z)
+
+    def place(self, p_WP: np.ndarray) -> None:
+        """Puts the middle of the board's lower edge somewhere, turned to the camera.
+
+        Args:
+            p_WP: In the world, (3,) [m].
+        """
+        turn = RotationMatrix.MakeZRotation(self._view.azimuth_rad + 0.5 * math.pi)
+        X_WP = RigidTransform(turn, p_WP).GetAsMatrix4()
+        self._meshcat.SetTransform(_PATH, X_WP @ np.diag([self._scale] * 3 + [1.0]))
+
+    def say(self, *lines: str, rgb: tuple[float, float, float] = INK_RGB) -> None:
+        """Shows words, the first line large; drawn only when they differ from those shown.
+
+        Args:
+            *lines: At most two.
+            rgb: Colour of the board behind them.
+        """
+        key = (lines, rgb)
+        if self._boards and key == self._boards[-1]:
+            return
+        self._words = lines
+        if self._boards:
+            self._show_board(self._boards[-1], False)
+        if key in self._boards:
+            self._boards.remove(key)
+        else:
+            picture = words_picture(
+                *lines, ground=rgb, rgb=(1.0, 1.0, 1.0), width=_WIDTH, height=_WORDS_HEIGHT
+            )
+            self._put_picture(_board_name(key), picture, (_WIDTH, _WORDS_HEIGHT), z=0.0)
+        self._boards.append(key)
+        self._show_board(key, True)
+        # A browser fetches a picture after it was told of it: the last few must stay.
+        if len(self._boards) > _NUM_BOARDS:
+            self._meshcat.Delete(f"{_PATH}/{_board_name(self._boards.pop(0))}")
+
+    def _show_board(self, key: tuple[object, ...], is_visible: bool) -> None:
+        self._meshcat.SetProperty(f"{_PATH}/{_board_name(key)}", "visible", is_visible)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The lines that are shown."""
+        return self._words
+
+    def show_belief(self, belief: np.ndarray) -> None:
+        """Shows a belief as a bar of three parts.
+
+        Args:
+            belief: (safe, unsafe, don't know), (3,), of sum one; what is not finite is shown as
+                "don't know".
+        """
+        belief = belief if np.isfinite(belief).all() else _EMPTY
+        if np.abs(belief - self._belief).max() < 1e-3:
+            return
+        self._belief = np.array(belief)
+        room = _WIDTH - 2 * _MARGIN
+        left = -0.5 * room
+        for name, share in zip(_PARTS, belief.tolist(), strict=True):
+            share = max(share, 1e-4)  # A box of no width has no inverse.
+            X = np.diag([share * room, 1.0, 1.0, 1.0])
+            X[0, 3] = left + 0.5 * share * room
+            self._meshcat.SetTransform(f"{_PATH}/belief/{name}", X)
+            left += share * room
+
+    def forget(self) -> None:
+        """Begins the curve of Γ anew."""
+        self._history.clear()
+
+    def add(self, time_s: float, probability: float) -> None:
+        """Goes on with the curve of Γ.
+
+        Args:
+            time_s: Later than what was added before [s].
+            probability: Γ, in [0, 1].
+        """
+        self._history.append((time_s, min(max(probability, 0.0), 1.0)))
+        while self._history[0][0] < time_s - _HISTORY_S:
+            self._history.popleft()
+        if len(self._history) < 2:
+            return
+        times, values = np.array(self._history).T
+        x = 0.5 * _WIDTH - _MARGIN - (time_s - times) / _HISTORY_S * (_WIDTH - 2 * _MARGIN)
+        points = np.stack([x, np.full_like(x, -2 * _LAYER), _PLOT_Z + values * _PLOT_HEIGHT])
+        self._meshcat.SetLine(f"{_PATH}/curve", points, 4.0, Rgba(*SAFE_RGB))
+
+    def _put_picture(
+        self, name: str, png: bytes, size: tuple[float, float], *, z: float, forward: float = 1.0
+    ) -> None:
+        self._meshcat.SetObject(f"{_PATH}/{name}", Mesh(picture_board(png, *size)))
+        self._meshcat.SetTransform(f"{_PATH}/{name}", RigidTransform([0.0, -forward * _LAYER, z]))
+
+
+def _board_name(key: tuple[object, ...]) -> str:
+    """A name of its own for what a board says, in the scene tree."""
+    return "words/" + hashlib.sha256(repr(key).encode()).hexdigest()[:12]
+
+
+def ground_picture(threshold: float) -> bytes:
+    """What stays on the board, as a PNG: the frame of the curve, its threshold, and a legend.
+
+    Args:
+        threshold: Where the line across the curve is.
+    """
+    from matplotlib.patches import Rectangle
+
+    figure = _figure(_WIDTH, _HEIGHT, (1.0, 1.0, 1.0))
+    points = _TEXT_HEIGHT * _PIXELS_PER_UNIT * 72 / _DPI
+
+    def write(x: float, z: float, words: str, rgb: tuple[float, float, float]) -> None:
+        figure.text(x / _WIDTH, z / _HEIGHT, words, size=points, color=rgb, va="center")
+
+    def fill(
+        x: float, z: float, width: float, height: float, rgb: tuple[float, float, float]
+    ) -> None:
+        corner = (x / _WIDTH, z / _HEIGHT)
+        patch = Rectangle(corner, width / _WIDTH, height / _HEIGHT, facecolor=rgb, edgecolor="none")
+        figure.add_artist(patch)
+
+    room = _WIDTH - 2 * _MARGIN
+    write(_MARGIN, _TITLE_Z, f"Γ of the last {_HISTORY_S:g} s, from 0 to 1", INK_RGB)
+    fill(_MARGIN, _PLOT_Z, room, _PLOT_HEIGHT, (0.94, 0.945, 0.95))
+    level = _PLOT_Z + threshold * _PLOT_HEIGHT
+    fill(_MARGIN, level - 0.002, room, 0.004, UNSAFE_RGB)
+    write(_MARGIN + 0.01, level - 0.025, f"threshold {threshold:.2f}", UNSAFE_RGB)
+    x = _MARGIN
+    write(x, _LEGEND_Z, "belief:", INK_RGB)
+    places = (0.2, 0.4, 0.64)
+    names = ("safe", "unsafe", "don't know")
+    for x, name, rgb in zip(places, names, (SAFE_RGB, UNSAFE_RGB, UNKNOWN_RGB), strict=True):
+        fill(x, _LEGEND_Z - 0.016, 0.03, 0.03, rgb)
+        write(x + 0.045, _LEGEND_Z, name, INK_RGB)
+    return _png(figure)
+
+
+def _figure(width: float, height: float, ground: tuple[float, float, float]) -> Figure:
+    from matplotlib.figure import Figure
+
+    size = (width * _PIXELS_PER_UNIT / _DPI, height * _PIXELS_PER_UNIT / _DPI)
+    return Figure(figsize=size, dpi=_DPI, facecolor=ground)
+
+
+def _png(figure: Figure) -> bytes:
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=_DPI)
+    return png.getvalue()
+
+
+def words_picture(
+    *lines: str,
+    rgb: tuple[float, float, float],
+    ground: tuple[float, float, float],
+    width: float,
+    height: float,
+) -> bytes:
+    """Words as a PNG, the first line bold and larger than the others where there are more.
+
+    Args:
+        *lines: The words; a line that is too wide is made smaller.
+        rgb: Their colour.
+        ground: Colour behind them.
+        width: Of the picture, in the board's units.
+        height: Of the picture, in the board's units.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = _figure(width, height, ground)
+    canvas = FigureCanvasAgg(figure)
+    width_px, height_px = (_DPI * inches for inches in figure.get_size_inches())
+    shares = [1.0] if len(lines) == 1 else [0.56] + [0.44 / (len(lines) - 1)] * (len(lines) - 1)
+    top = 1.0
+    for i, (line, share) in enumerate(zip(lines, shares, strict=True)):
+        points = 0.62 * share * height_px * 72 / _DPI
+        text = figure.text(
+            0.5,
+            top - 0.5 * share,
+            line,
+            size=points,
+            weight="normal" if i else "bold",
+            ha="center",
+            va="center",
+            color=rgb,
+            parse_math=False,
+        )
+        extent_px = text.get_window_extent(canvas.get_renderer()).width
+        if extent_px > 0.96 * width_px:
+            text.set_fontsize(points * 0.96 * width_px / extent_px)
+        top -= share
+    return _png(figure)
+
+
+def picture_board(png: bytes, width: float, height: float) -> InMemoryMesh:
+    """A rectangle that shows a picture as it is, whatever the light: one glTF file in memory.
+
+    The board stands in the x-z plane, centred in x, its lower edge at z = 0, its face towards -y.
+
+    Args:
+        png: The picture.
+        width: Of the board.
+        height: Of the board.
+    """
+    w = 0.5 * width
+    # glTF's y is up: Drake turns (x, y, z) into (x, -z, y).
+    corners = [(-w, 0.0, 0.0), (w, 0.0, 0.0), (w, height, 0.0), (-w, height, 0.0)]
+    in_picture = [(0.0, 1.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.0)]
+    triangles = (0, 1, 2, 0, 2, 3)
+    parts = [
+        b"".join(struct.pack("<3f", *corner) for corner in corners),
+        b"".join(struct.pack("<2f", *place) for place in in_picture),
+        struct.pack("<6H", *triangles),
+    ]
+    starts = [0, len(parts[0]), len(parts[0]) + len(parts[1])]
+    floats, shorts = 5126, 5123  # Component types of glTF.
+    content = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+                ]
+            }
+        ],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+                "alphaMode": "OPAQUE",
+                "doubleSided": True,
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "textures": [{"source": 0}],
+        "images": [{"uri": f"data:image/png;base64,{base64.b64encode(png).decode()}"}],
+        "buffers": [
+            {
+                "byteLength": sum(map(len, parts)),
+                "uri": "data:application/octet-stream;base64,"
+                + base64.b64encode(b"".join(parts)).decode(),
+            }
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(part)}
+            for start, part in zip(starts, parts, strict=True)
+        ],
+        "accessors": [
+            {
+                "bufferView": 0,
+                "componentType": floats,
+                "count": 4,
+                "type": "VEC3",
+                "min": [-w, 0.0, 0.0],
+                "max": [w, height, 0.0],
+            },
+            {"bufferView": 1, "componentType": floats, "count": 4, "type": "VEC2"},
+            {"bufferView": 2, "componentType": shorts, "count": 6, "type": "SCALAR"},
+        ],
+    }
+    return InMemoryMesh(mesh_file=MemoryFile(json.dumps(content), ".gltf", "board"))

@@ -1,0 +1,445 @@
+"""Live sessions: a robot that one plays with in Meshcat, tick by tick, in real time."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.learning.causes import NO_CAUSE, likely_causes
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.live_panel import (
+    INK_RGB,
+    RECOVERY_RGB,
+    SAFE_RGB,
+    UNSAFE_RGB,
+    LivePanel,
+)
+from drake_safety.simulation.planning import (
+    GoalVerdict,
+    assess_goal,
+    nearest_accepted_goal,
+    target_box,
+)
+from drake_safety.simulation.rollouts import episode_rng
+
+TICK_S = 0.04
+"""Simulated time between two looks at the controls [s]."""
+STOP = "Stop"
+PROBABILITY = "Γ, shown"
+"""The slider that shows Γ as a number; moving it has no effect."""
+
+_FLIGHT_S = 0.2  # Of a ball, so that one sees it come.
+_LYING_S = 1.5  # After a fall, before the robot is stood up again.
+_NUM_CANDIDATES = 24  # Judged at a time in the search: somebody waits for its answer.
+_BREAK_S = 0.02  # Real time between two looks at the controls while nothing moves.
+
+
+@dataclass
+class Pace:
+    """How fast a live session ran.
+
+    Attributes:
+        simulated_s: Time that was simulated [s].
+        busy_s: Real time that simulating and drawing it took, waiting left out [s].
+        elapsed_s: Real time that passed while it was simulated [s].
+    """
+
+    simulated_s: float = 0.0
+    busy_s: float = 0.0
+    elapsed_s: float = 0.0
+
+    @property
+    def realtime_factor(self) -> float:
+        """Simulated time by real time, as it was watched; 1 where the simulation kept up."""
+        return self.simulated_s / self.elapsed_s if self.elapsed_s > 0 else math.nan
+
+    @property
+    def possible_factor(self) -> float:
+        """How much faster than the clock it could have run."""
+        return self.simulated_s / self.busy_s if self.busy_s > 0 else math.nan
+
+
+class LiveSession(ABC):
+    """A closed loop with Γ that is shown in Meshcat and reacts to its buttons and sliders.
+
+    Args:
+        loop: A closed loop that was built with this Meshcat and with Γ.
+        meshcat: Where it is shown.
+        threshold: Γ below this is what the task reacts to, or refuses.
+        seed: Of start and noise.
+
+    Raises:
+        ValueError: The loop was built without Γ.
+
+    Attributes:
+        pace: How fast it ran.
+        probability: Γ as it is shown.
+    """
+
+    probability_port = "normalized_safety_probability"
+
+    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+        if loop.assessment is None:
+            raise ValueError("live session: the loop was built without an assessment")
+        self.loop = loop
+        self.assessment = loop.assessment
+        self.meshcat = meshcat
+        self.threshold = threshold
+        self.pace = Pace()
+        self.probability = math.nan
+        self._seed = seed
+        self._num_resets = 0
+        self._clicks: dict[str, int] = {}
+        self._late_s = 0.0
+        self._simulator = Simulator(loop)
+        self.context = self._simulator.get_mutable_context()
+        self._fall_column = loop.constraint_names.index(loop.fall_name)
+        extent_m = self._extent_m()
+        self.panel = LivePanel(meshcat, loop.view, threshold=threshold, width_m=0.9 * extent_m)
+        self._add_button(STOP, "Escape")
+        meshcat.AddSlider(PROBABILITY, 0.0, 1.0, 0.01, 0.0)
+
+    @abstractmethod
+    def tick(self) -> bool:
+        """Reacts to the controls and goes on by one tick.
+
+        Returns:
+            Whether anything was simulated.
+        """
+
+    def run(self, *, is_paced: bool = True) -> None:
+        """Ticks until the button Stop.
+
+        Args:
+            is_paced: Whether to wait for the clock; False simulates as fast as it goes.
+        """
+        while not self._is_clicked(STOP):
+            begin = time.perf_counter()
+            was_simulated = self.tick()
+            busy_s = time.perf_counter() - begin
+            if not was_simulated:
+                time.sleep(_BREAK_S)
+                self._late_s = 0.0
+                continue
+            if is_paced:
+                # What is behind the clock is caught up with, up to a few ticks.
+                spare_s = TICK_S - busy_s - self._late_s
+                time.sleep(max(spare_s, 0.0))
+                self._late_s = min(max(-spare_s, 0.0), 5 * TICK_S)
+            self.pace.simulated_s += TICK_S
+            self.pace.busy_s += busy_s
+            self.pace.elapsed_s += time.perf_counter() - begin
+
+    def _add_button(self, name: str, key: str = "") -> None:
+        self.meshcat.AddButton(name, key)
+        self._clicks[name] = 0
+
+    def _is_clicked(self, name: str) -> bool:
+        clicks = self.meshcat.GetButtonClicks(name)
+        is_new = clicks > self._clicks[name]
+        self._clicks[name] = clicks
+        return is_new
+
+    def _next_rng(self) -> np.random.Generator:
+        self._num_resets += 1
+        return episode_rng(self._seed, self._num_resets - 1)
+
+    def _begin(self) -> None:
+        """Draws what was reset, and goes on from there."""
+        self._simulator.Initialize()
+        self.panel.forget()
+        self._aim_camera()
+
+    def _advance(self) -> None:
+        self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
+        self._show_gamma(
+            self._eval(self.probability_port)[0], self._eval("belief"), self.context.get_time()
+        )
+
+    def _show_gamma(
+        self, probability: float, belief: np.ndarray, time_s: float | None = None
+    ) -> None:
+        self.probability = float(probability)
+        self.panel.show_belief(belief)
+        shown = self.probability if math.isfinite(self.probability) else 0.0
+        self.meshcat.SetSliderValue(PROBABILITY, min(max(shown, 0.0), 1.0))
+        if time_s is not None:
+            self.panel.add(time_s, shown)
+
+    def _eval(self, port: str) -> np.ndarray:
+        return self.loop.GetOutputPort(port).Eval(self.context)
+
+    def _base(self) -> np.ndarray:
+        return self._eval("plant_state")[4:7]
+
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot lies."""
+        return bool(self._eval("margins")[self._fall_column] < 0)
+
+    def _extent_m(self) -> float:
+        """How large the robot is: twice the height of its base, or as long as its feet stand."""
+        kinematics = self.loop.kinematics
+        q = kinematics.standing_positions()
+        contacts = kinematics.contact_positions(q)
+        return float(max(2 * q[6], *np.ptp(contacts, axis=0)))
+
+    def _place_panel(self) -> None:
+        p_WB, extent_m = self._base(), self._extent_m()
+        azimuth = self.loop.view.azimuth_rad
+        rightwards = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        place = np.array([p_WB[0], p_WB[1], 0.1 * extent_m]) + 1.1 * extent_m * rightwards
+        self.panel.place(place)
+
+    def _aim_camera(self) -> None:
+        p_WB, extent_m, view = self._base(), self._extent_m(), self.loop.view
+        azimuth = view.azimuth_rad
+        rightwards = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        target = p_WB * [1.0, 1.0, 0.9] + 0.5 * extent_m * rightwards
+        reach = 1.9 * extent_m
+        away = np.array(
+            [
+                math.cos(azimuth) * math.cos(view.elevation_rad),
+                math.sin(azimuth) * math.cos(view.elevation_rad),
+                math.sin(view.elevation_rad),
+            ]
+        )
+        self.meshcat.SetCameraPose(target + reach * away, target)
+        self._place_panel()
+
+    def _words_of_cause(self, masses: np.ndarray, margins: np.ndarray, unit: float) -> str:
+        (column,) = likely_causes(masses[None], margins[None], unit)
+        if column == NO_CAUSE:
+            return ""
+        name = self.loop.constraint_names[column]
+        return name + _margin_words(margins[column], name in self.loop.angular_constraints)
+
+
+class LiveThrows(LiveSession):
+    """A robot that balances, and balls to throw at it.
+
+    Args:
+        loop: A closed loop with a ball, built with this Meshcat and with Γ.
+        meshcat: Where it is shown.
+        threshold: Below which Γ triggers recovery.
+        seed: Of start and noise.
+    """
+
+    THROW, STAND = "Throw", "Stand up again"
+    MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
+
+    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+        super().__init__(loop, meshcat, threshold=threshold, seed=seed)
+        self.probability_port = loop.trigger_port
+        self._has_recovery = loop.HasOutputPort("recovery_active")
+        self._unit = self.assessment.parameters.margin_unit
+        self._note, self._note_until_s = "", 0.0
+        self._lies_until_s = math.inf
+        self._add_button(self.THROW, "Space")
+        self._add_button(self.STAND, "KeyR")
+        meshcat.AddSlider(self.MASS, 1.0, 5.0, 0.5, 3.0)
+        meshcat.AddSlider(self.SPEED, 1.0, 11.0, 0.5, 8.0)
+        meshcat.AddSlider(self.DIRECTION, -180.0, 180.0, 15.0, -75.0)
+        self._stand()
+
+    def tick(self) -> bool:
+        """Throws if asked to, advances, and shows Γ, belief and verdict."""
+        now = self.context.get_time()
+        if self._is_clicked(self.STAND) or now >= self._lies_until_s:
+            self._stand()
+        if self._is_clicked(self.THROW):
+            self._throw()
+        self._advance()
+        self._place_panel()
+        self._tell()
+        return True
+
+    def _stand(self) -> None:
+        self._lies_until_s, self._note_until_s = math.inf, 0.0
+        self.loop.reset_calm(self.context, self._next_rng())
+        self._begin()
+
+    def _throw(self) -> None:
+        mass, speed, direction = map(
+            self.meshcat.GetSliderValue, (self.MASS, self.SPEED, self.DIRECTION)
+        )
+        throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
+        try:
+            self.loop.throw_ball(self.context, throw, _FLIGHT_S)
+            self._note = f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°"
+        except ValueError:  # The robot lies, or stands so that the line leads past it.
+            self._note = "this ball would miss the robot"
+        self._note_until_s = self.context.get_time() + 3.0
+
+    def _tell(self) -> None:
+        now = self.context.get_time()
+        note = self._note if now < self._note_until_s else "Space throws a ball"
+        if self.has_fallen:
+            self._lies_until_s = min(self._lies_until_s, now + _LYING_S)
+            self.panel.say("fell", note, rgb=UNSAFE_RGB)
+        elif self._has_recovery and self._eval("recovery_active")[0] > 0:
+            self.panel.say("Γ fell: recovery steps", note, rgb=RECOVERY_RGB)
+        elif self.probability >= self.threshold:
+            self.panel.say("safe: balancing", note, rgb=SAFE_RGB)
+        else:
+            name = self._words_of_cause(
+                self._eval("cause_probability"), self._eval("predicted_margins"), self._unit
+            ).split(",")[0]
+            self.panel.say("unsafe" + (f": {name}" if name else ""), note, rgb=UNSAFE_RGB)
+
+
+class LiveGoals(LiveSession):
+    """A robot that goes to targets, if Γ lets it.
+
+    Args:
+        loop: A closed loop whose plans have a goal, built with this Meshcat and with Γ.
+        meshcat: Where it is shown.
+        threshold: From which Γ on a goal is accepted.
+        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
+            default.
+        seed: Of the noise.
+    """
+
+    ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
+    AXES = ("x [m]", "y [m]", "z [m]")
+    _TARGET, _NEAREST = "/target", "/nearest_accepted"
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        meshcat: Meshcat,
+        *,
+        threshold: float,
+        unsafe_below: float | None = None,
+        seed: int = 0,
+    ):
+        super().__init__(loop, meshcat, threshold=threshold, seed=seed)
+        self._unsafe_below = unsafe_below
+        self.verdict: GoalVerdict | None = None
+        self.nearest: GoalVerdict | None = None
+        self._end_s = -math.inf
+        box = target_box(loop)
+        start = next(iter(loop.named_targets.values()), box.mean(axis=0))
+        for name, key in (
+            (self.ASK, "KeyA"),
+            (self.GO, "Space"),
+            (self.FORCE, ""),
+            (self.STAND, "KeyR"),
+        ):
+            self._add_button(name, key)
+        for name, low, high, value in zip(self.AXES, *box.tolist(), start, strict=True):
+            meshcat.AddSlider(name, low, high, 0.01, value)
+        radius_m = 0.03 * self._extent_m()
+        meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*INK_RGB, 0.8))
+        meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*SAFE_RGB, 0.8))
+        self._goal = np.full(3, np.nan)
+        self._stand()
+
+    def tick(self) -> bool:
+        """Judges a target that was moved, goes if asked and allowed to, and shows the verdict."""
+        goal = np.array([self.meshcat.GetSliderValue(name) for name in self.AXES])
+        is_asked = self._is_clicked(self.ASK)
+        is_to_go, is_forced = self._is_clicked(self.GO), self._is_clicked(self.FORCE)
+        if self._is_clicked(self.STAND):
+            self._stand()
+        if is_asked or is_to_go or is_forced or not np.array_equal(goal, self._goal):
+            verdict = self._judge(goal, is_thorough=is_asked or is_to_go)
+            if is_forced or (is_to_go and verdict.is_accepted):
+                self._go(goal)
+        if self.context.get_time() >= self._end_s - 1e-9:
+            return False
+        self._advance()
+        self._tell_motion()
+        return True
+
+    def _judge(self, goal: np.ndarray, *, is_thorough: bool) -> GoalVerdict:
+        self._goal = goal
+        self.meshcat.SetTransform(self._TARGET, RigidTransform(goal))
+        self.meshcat.SetProperty(self._NEAREST, "visible", False)
+        self.verdict = verdict = assess_goal(
+            self.loop,
+            self.assessment,
+            goal,
+            threshold=self.threshold,
+            unsafe_below=self._unsafe_below,
+        )
+        self.nearest = None
+        if is_thorough and not verdict.is_accepted:
+            self.nearest = nearest_accepted_goal(
+                self.loop,
+                self.assessment,
+                goal,
+                threshold=self.threshold,
+                rng=np.random.default_rng(self._seed),
+                num_candidates=_NUM_CANDIDATES,
+            )
+        self._show_gamma(verdict.safety_probability, verdict.belief)
+        self._tell_verdict(verdict, is_thorough=is_thorough)
+        return verdict
+
+    def _go(self, goal: np.ndarray) -> None:
+        self.loop.reset_standing(self.context, goal, self._next_rng())
+        self._begin()
+        self._end_s = self.loop.scenario.episode_duration_s + 1.0
+
+    def _stand(self) -> None:
+        # The posture alone is shown; no motion begins.
+        self.loop.reset_standing(self.context, target_box(self.loop).mean(axis=0))
+        self._begin()
+        self._end_s = -math.inf
+        self._goal = np.full(3, np.nan)
+
+    def _tell_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
+        if verdict.is_accepted:
+            self.panel.say(
+                f"accepted: Γ {verdict.safety_probability:.2f}", "Space goes there", rgb=SAFE_RGB
+            )
+            return
+        first = f"refused: Γ {verdict.safety_probability:.2f}"
+        if verdict.reason:
+            first = "refused: don't know"
+        cause = self._words_of_cause(
+            verdict.cause_probability, verdict.predicted_margins, verdict.margin_unit
+        )
+        second = f"expected: {cause}" if cause else verdict.reason
+        if is_thorough:
+            if self.nearest is None:
+                second += "; nothing near is accepted"
+            else:
+                distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
+                second += f"; accepted {100 * distance_m:.0f} cm away"
+                self.meshcat.SetTransform(self._NEAREST, RigidTransform(self.nearest.goal))
+                self.meshcat.SetProperty(self._NEAREST, "visible", True)
+        self.panel.say(first, second, rgb=UNSAFE_RGB)
+
+    def _tell_motion(self) -> None:
+        margins = self._eval("margins")
+        if self.has_fallen:
+            self._end_s = min(self._end_s, self.context.get_time() + _LYING_S)
+            self.panel.say("fell", "R stands it up again", rgb=UNSAFE_RGB)
+        elif margins.min() < 0:
+            name = self.loop.constraint_names[int(np.argmin(margins))]
+            self.panel.say(f"left the safe set: {name}", "R stands it up again", rgb=UNSAFE_RGB)
+            return
+        else:
+            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
+            if self.context.get_time() >= self._end_s - 1e-9:
+                self.panel.say("there", f"{100 * miss_m:.1f} cm off", rgb=RECOVERY_RGB)
+            else:
+                self.panel.say("on the way", f"the {self.loop.hand} hand reaches", rgb=SAFE_RGB)
+
+
+def _margin_words(margin: float, is_angle: bool) -> str:
+    if not math.isfinite(margin):
+        return ""
+    if is_angle:
+        return f", {math.degrees(margin):+.1f}°"
+    return f", {100 * margin:+.1f} cm"

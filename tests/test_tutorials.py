@@ -1,0 +1,67 @@
+"""The tutorials: clean files that a newcomer can read, and every cell of them runs."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TUTORIALS = sorted((ROOT / "tutorials").glob("*.ipynb"))
+MAX_CELLS = 15
+FAST = "DRAKE_SAFETY_FAST"
+
+
+def cells(path, kind):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+@pytest.fixture(params=TUTORIALS, ids=lambda path: path.stem)
+def tutorial(request):
+    return request.param
+
+
+def test_there_are_six_tutorials_in_order():
+    assert [int(path.stem.split("_")[0]) for path in TUTORIALS] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_tutorial_begins_with_prose_is_short_and_holds_no_outputs(tutorial):
+    notebook = json.loads(tutorial.read_text(encoding="utf-8"))
+    assert notebook["cells"][0]["cell_type"] == "markdown"
+    assert len(notebook["cells"]) <= MAX_CELLS
+    for cell in notebook["cells"]:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+    prose = sum(len(text) for text in cells(tutorial, "markdown"))
+    assert prose > 0.25 * sum(len(text) for text in cells(tutorial, "code"))
+
+
+def test_the_fast_mode_is_set_in_the_first_cell_of_code(tutorial):
+    assert FAST in cells(tutorial, "code")[0]
+    assert all(FAST not in text for text in cells(tutorial, "code")[1:])
+
+
+def test_links_of_a_tutorial_lead_somewhere(tutorial):
+    links = re.findall(r"\]\(([^)#]+)\)", "\n".join(cells(tutorial, "markdown")))
+    assert links
+    missing = [link for link in links if not (tutorial.parent / link).exists()]
+    assert missing == []
+
+
+@pytest.mark.slow
+def test_every_cell_of_a_tutorial_runs(tutorial, tmp_path, monkeypatch):
+    nbclient = pytest.importorskip("nbclient", reason="the extra 'tutorials' is not installed")
+    pytest.importorskip("ipykernel", reason="the extra 'tutorials' is not installed")
+    import nbformat
+
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+    monkeypatch.setenv(FAST, "1")
+    notebook = nbformat.read(tutorial, as_version=4)
+    resources = {"metadata": {"path": str(tmp_path)}}  # What it writes does not end up here.
+    client = nbclient.NotebookClient(notebook, timeout=900, resources=resources)
+    client.execute()
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
+    assert any("image/png" in out.get("data", {}) for out in outputs)  # It shows a picture.
