@@ -42,13 +42,17 @@ def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert list(commands) == [
         "scenarios",
+        "new",
+        "check",
         "train",
         "calibrate",
         "ask",
         "run",
         "evaluate",
+        "compare",
         "plan-study",
         "adapt",
+        "ablate",
         "report",
     ]
     for command in commands.values():
