@@ -42,14 +42,18 @@ def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert list(commands) == [
         "scenarios",
+        "new",
+        "check",
         "train",
         "calibrate",
         "ask",
         "run",
         "play",
         "evaluate",
+        "compare",
         "plan-study",
         "adapt",
+        "ablate",
         "report",
     ]
     for command in commands.values():
