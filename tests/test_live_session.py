@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-import threading
 import time
 
 import numpy as np
@@ -135,11 +134,18 @@ def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
     assert context.get_time() <= 2 * TICK_S
 
 
-def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws):
-    ended = threading.Timer(0.3, click, (throws, STOP))
-    ended.start()
+def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypatch):
+    tick, ticks = throws.tick, []
+
+    def stopped_after_ten():
+        ticks.append(tick())
+        if len(ticks) == 10:
+            click(throws, STOP)
+        return ticks[-1]
+
+    monkeypatch.setattr(throws, "tick", stopped_after_ten)
     throws.run()
-    ended.join()
+    assert len(ticks) == 10
     pace = throws.pace
     assert pace.simulated_s == pytest.approx(throws.context.get_time())
     assert 0 < pace.busy_s <= pace.elapsed_s
