@@ -56,6 +56,10 @@ def test_a_docstring_becomes_markdown_without_its_block():
     assert text == "Adds two numbers.\n\nNot `subtract`, see `total`."
 
 
+def test_a_unit_behind_an_index_is_no_link():
+    assert system_block.to_markdown("The entry q[3] [rad].") == "The entry q[3] \\[rad]."
+
+
 def test_a_block_of_something_else_is_refused():
     with pytest.raises(ValueError, match="got \\['name', 'ports'\\]"):
         system_block.parse_block(".. pydrake_system::\n\n    name: A\n    ports: [x]\n")

@@ -105,6 +105,8 @@ def to_markdown(docstring: str) -> str:
     """
     text = DIRECTIVE.sub("", docstring + "\n").rstrip("\n")
     text = re.sub(r":(?:attr|class|func|meth|mod):`~?([^`]+)`", r"`\1`", text)
+    # What follows a bracket in brackets is a unit, not the target of a link.
+    text = re.sub(r"\]( ?)\[([^\]\n]*)\]", r"]\1\\[\2]", text)
     return re.sub(r"``([^`\n]+)``", r"`\1`", text)
 
 
