@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test lint bench docs clean
 
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,6 +26,9 @@ lint: $(INSTALLED) ## Check style, format and types
 
 bench: $(INSTALLED) ## Measure the costs of rollouts, training and one assessment
 	$(BIN)/python -m pytest benchmarks --benchmark-only
+
+docs: $(INSTALLED) ## Build the reference into build/site; a warning is an error
+	$(BIN)/mkdocs build --strict
 
 clean: ## Remove the environment, the caches and what was built (runs/ stays)
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks

@@ -61,7 +61,9 @@ def test_every_cell_of_a_tutorial_runs(tutorial, tmp_path, monkeypatch):
     monkeypatch.setenv(FAST, "1")
     notebook = nbformat.read(tutorial, as_version=4)
     resources = {"metadata": {"path": str(tmp_path)}}  # What it writes does not end up here.
-    client = nbclient.NotebookClient(notebook, timeout=900, resources=resources)
+    client = nbclient.NotebookClient(
+        notebook, timeout=900, startup_timeout=300, resources=resources
+    )
     client.execute()
     outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
     assert any("image/png" in out.get("data", {}) for out in outputs)  # It shows a picture.

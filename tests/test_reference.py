@@ -1,0 +1,98 @@
+"""The reference documentation: ports as the docstrings say them, and as the systems have them."""
+
+import ast
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SYSTEMS = sorted((ROOT / "drake_safety" / "systems").glob("*.py"))
+
+
+def load(name):
+    path = ROOT / "docs" / "generator" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+system_block = load("system_block")
+DOCSTRING = """Adds two numbers.
+
+.. pydrake_system::
+
+    name: Adder
+    input_ports:
+    - first
+    - second (optional)
+    output_ports:
+    - total
+
+Not :meth:`subtract`, see ``total``.
+"""
+
+
+def test_a_block_says_its_ports_and_their_remarks():
+    block = system_block.parse_block(DOCSTRING)
+    assert block.name == "Adder"
+    assert block.inputs == (("first", ""), ("second", "optional"))
+    assert "| input | `second` | optional |" in block.table
+    assert block.table.count("\n") == 4
+
+
+def test_the_picture_names_the_system_and_has_a_dot_for_every_port():
+    svg = system_block.parse_block(DOCSTRING).svg
+    assert svg.count("<circle") == 3
+    assert all(f">{name}</text>" in svg for name in ("Adder", "first", "second", "total"))
+    assert svg.count("<text") == 4
+
+
+def test_a_docstring_becomes_markdown_without_its_block():
+    text = system_block.to_markdown(DOCSTRING)
+    assert text == "Adds two numbers.\n\nNot `subtract`, see `total`."
+
+
+def test_a_unit_behind_an_index_is_no_link():
+    assert system_block.to_markdown("The entry q[3] [rad].") == "The entry q[3] \\[rad]."
+
+
+def test_a_block_of_something_else_is_refused():
+    with pytest.raises(ValueError, match="got \\['name', 'ports'\\]"):
+        system_block.parse_block(".. pydrake_system::\n\n    name: A\n    ports: [x]\n")
+    assert system_block.parse_block("Says nothing of ports.") is None
+
+
+@pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
+def test_every_port_that_a_docstring_lists_is_declared_in_its_module(path):
+    source = path.read_text(encoding="utf-8")
+    words = {
+        node.value
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    for node in ast.parse(source).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        block = system_block.parse_block(ast.get_docstring(node) or "")
+        if block is not None:
+            ports = {name for name, _ in (*block.inputs, *block.outputs)}
+            assert ports - words == set()
+
+
+@pytest.mark.slow
+def test_the_reference_builds_without_a_warning(tmp_path):
+    commands = pytest.importorskip("mkdocs.commands.build", reason="extra 'docs' not installed")
+    pytest.importorskip("mkdocstrings", reason="extra 'docs' not installed")
+    import subprocess
+
+    del commands
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr[-3000:]
+    page = (tmp_path / "reference" / "systems" / "safety_assessor" / "index.html").read_text()
+    assert "normalized_safety_probability" in page
+    assert "<svg" in page
