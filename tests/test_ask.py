@@ -303,6 +303,6 @@ def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, row):
         leave_time_s=np.inf,
         cause="",
         fall_time_s=np.inf,
-        extra={"normalized_safety_probability": np.array(gamma)[:, None]},
+        extra={"calibrated_safety_probability": np.array(gamma)[:, None]},
     )
     assert alarm_row(motion, 0.5) == row

@@ -42,14 +42,18 @@ def test_every_command_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert list(commands) == [
         "scenarios",
+        "new",
+        "check",
         "train",
         "calibrate",
         "ask",
         "run",
         "play",
         "evaluate",
+        "compare",
         "plan-study",
         "adapt",
+        "ablate",
         "report",
     ]
     for command in commands.values():
@@ -94,7 +98,7 @@ def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simula
 ):
     file = tmp_path / "gliding.yaml"
     file.write_text(SCENARIO)
-    assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path) == 2
+    assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path, "--throws", 5) == 2
     assert "has no recovery to judge: pass --throws 0" in capsys.readouterr().out
 
 

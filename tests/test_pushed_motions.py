@@ -84,7 +84,7 @@ def test_what_one_would_watch_and_what_is_made_of_velocities_is_told_by_name(nam
     q = loop.kinematics.standing_positions()
     v = np.zeros(loop.kinematics.num_velocities)
     pushed = v.copy()
-    pushed[:] = 0.3
+    pushed[:] = np.linspace(0.2, 0.4, len(pushed))
     preview = np.tile([0.0, 0.0, loop.kinematics.standing_height], (5, 1))
     safe_set = getattr(loop, "safe_set", None)
     if safe_set is None:

@@ -12,6 +12,7 @@ _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
 _TOLERANCE_M = 1e-3
 _STOP_RAD = 0.05  # Distance that the posture keeps from a joint's stops.
 _NUM_GUESSES = 10
+_ENOUGH = 5  # Solutions to choose from.
 _FREE_RAD = 2.5  # Of a joint without stops.
 
 
@@ -107,6 +108,7 @@ class _Leg:
         low, high = self._bounds
         rng = np.random.default_rng(0)
         best: tuple[float, np.ndarray] | None = None
+        num_found = 0
         for index in range(_NUM_GUESSES):
             guess = np.clip(np.zeros(len(low)) if index == 0 else rng.uniform(low, high), low, high)
             found = least_squares(residual, guess, bounds=(low, high), max_nfev=40)
@@ -115,6 +117,9 @@ class _Leg:
             score = self._oddness(found.x)
             if best is None or score < best[0]:
                 best = (score, found.x)
+            num_found += 1
+            if num_found == _ENOUGH:
+                break
         return None if best is None else best[1]
 
     def _oddness(self, angles: np.ndarray) -> float:

@@ -217,7 +217,8 @@ def _mend_inertias(copy: UrdfCopy) -> None:
         )
         moments = np.nan_to_num([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         principal = np.linalg.eigvalsh(moments)
-        if principal[0] < 0 or principal[0] + principal[1] < 0.999 * principal[2]:
+        # A flat or a thin body is allowed, one without extent in some direction is not.
+        if principal[0] < 1e-6 * principal[2] and np.any([xy, xz, yz]):
             for key in ("ixy", "ixz", "iyz"):
                 inertia.set(key, "0")
             copy.notes.append(

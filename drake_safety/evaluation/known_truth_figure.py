@@ -34,7 +34,7 @@ def known_truth_figure(
 
     colours = LinearSegmentedColormap.from_list("safety", [UNSAFE_COLOUR, "white", SAFE_COLOUR])
     with drawing_style():
-        fig = new_figure(3.8 * len(panels) + 1.0, 4.6)
+        fig = new_figure(max(3.8 * len(panels) + 1.0, 6.4), 4.6)
         fig.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
         all_axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (truth, probability, found) in zip(all_axes, panels, strict=True):

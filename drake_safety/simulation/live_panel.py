@@ -258,8 +258,10 @@ def words_picture(
             parse_math=False,
         )
         extent_px = text.get_window_extent(canvas.get_renderer()).width
-        if extent_px > 0.96 * width_px:
-            text.set_fontsize(points * 0.96 * width_px / extent_px)
+        while extent_px > 0.96 * width_px:  # Hinting keeps small letters from shrinking in step.
+            points *= min(0.96 * width_px / extent_px, 0.97)
+            text.set_fontsize(points)
+            extent_px = text.get_window_extent(canvas.get_renderer()).width
         top -= share
     return _png(figure)
 
