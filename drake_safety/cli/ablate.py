@@ -226,15 +226,14 @@ def _counting(
 def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
     n = rows[0].figures["k0.auc"].n
     table = new_table(
-        "choice", "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
+        "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
     )
+    # The name is what one looks for: it is not folded, however narrow the figures become.
+    table.columns[0].no_wrap = True
     for i, row in enumerate(rows):
-        is_first = i == 0 or row.group != rows[i - 1].group
-        table.add_row(
-            row.group if is_first else "",
-            row.name,
-            *(interval(row.figures[key]) for key in _COLUMNS),
-        )
+        is_last = i + 1 == len(rows) or rows[i + 1].group != row.group
+        figures = (interval(row.figures[key]) for key in _COLUMNS)
+        table.add_row(row.name, *figures, end_section=is_last)
     table.caption = (
         f"baseline: δ {base.score_weight:g}, H {base.horizon}, perplexity {base.perplexity:g}, "
         f"{base.resolution} × {base.resolution} cells, k_min {base.min_count}, mode '{base.mode}'"
