@@ -48,8 +48,8 @@ def test_an_ablation_writes_a_row_a_variant_and_goes_on_where_it_was_stopped(
     names = [row["name"] for row in report["rows"]]
     assert names[0] == "baseline"
     assert {"score_weight=0.1", "horizon=half", "episodes=half", "paper"} <= set(names)
-    assert "baseline" in printed
-    assert all(row["figures"]["k0.auc"]["n"] == 40 for row in report["rows"])
+    for row in report["rows"]:
+        assert row["name"] in printed and row["figures"]["k0.auc"]["n"] == 40
     # The shuttle's states are not named after what they are, and nobody has adapted.
     assert report["left_out"].keys() >= {"horizon H", "velocities", "n_f"}
     assert "left out, n_f: there are no pairs" in printed

@@ -257,7 +257,10 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
 def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
     monkeypatch, capsys, shuttle_run, tmp_path
 ):
-    file, folder = shuttle_run
+    file, run = shuttle_run
+    folder = tmp_path / "never_judged"  # Others evaluate theirs, which chooses a threshold.
+    folder.mkdir()
+    shutil.copy(run / "sharpened.safetensors", folder)
     options = ("--assessment", folder, "--episodes", 10, "--candidates", 3, "--workers", 1)
     assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path) in (0, None)
     printed = capsys.readouterr().out
@@ -265,7 +268,7 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
     shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
     assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
     assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
-    for name in ("default plan", "chosen by Γ", "best in hindsight"):
+    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
         assert name in printed
     assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
     assert "0 is the training episodes' own seed" in capsys.readouterr().out

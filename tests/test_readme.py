@@ -92,10 +92,10 @@ def test_the_figures_come_from_the_same_training_as_the_demo():
 
 
 @pytest.mark.parametrize("target", re.findall(r"\]\(([^)#\s]+)", README))
-def test_every_relative_link_of_the_readme_leads_somewhere(target):
+def test_every_relative_link_of_the_readme_leads_to_a_file(target):
     if not re.match(r"https?://", target):
         assert not Path(target).is_absolute()
-        assert (ROOT / target).exists()
+        assert (ROOT / target).is_file()
 
 
 def test_every_path_in_code_style_exists_or_is_written_by_a_command():

@@ -45,6 +45,7 @@ def test_the_fast_mode_is_set_in_the_first_cell_of_code(tutorial):
 
 def test_links_of_a_tutorial_lead_somewhere(tutorial):
     links = re.findall(r"\]\(([^)#]+)\)", "\n".join(cells(tutorial, "markdown")))
+    assert links
     missing = [link for link in links if not (tutorial.parent / link).exists()]
     assert missing == []
 
