@@ -352,7 +352,7 @@ class Balancing(ClosedLoop):
         """Begins with a given state and plan; see :meth:`ClosedLoop.reset_to`."""
         start.check(self.kinematics)
         self._enter(context, start)
-        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        self._observers.reseed(context, rng)
         if rng is None:
             self._observers.silence(context)
 

@@ -466,7 +466,7 @@ class Reaching(ClosedLoop):
             ValueError: The goal is not three finite numbers.
         """
         self._set(context, self.kinematics.standing_positions(), goal)
-        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        self._observers.reseed(context, rng)
         self._observers.silence(context)
 
     def reset_to(
@@ -475,7 +475,7 @@ class Reaching(ClosedLoop):
         """Begins with a given state and plan; see :meth:`ClosedLoop.reset_to`."""
         start.check(self.kinematics)
         self._enter(context, start)
-        self._observers.reseed(context, np.random.default_rng(0) if rng is None else rng)
+        self._observers.reseed(context, rng)
         if rng is None:
             self._observers.silence(context)
 

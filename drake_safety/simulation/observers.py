@@ -67,13 +67,14 @@ class Observers:
         self._observers[key] = observer
         return observer
 
-    def reseed(self, context: Context, rng: np.random.Generator) -> None:
+    def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
         """Gives every source a seed of its own, and so new noise.
 
         Args:
             context: The root Context.
-            rng: Source of the seeds.
+            rng: Source of the seeds; None for noise that is always the same.
         """
+        rng = np.random.default_rng(0) if rng is None else rng
         for source in self._sources:
             source.SetRandomContext(
                 source.GetMyMutableContextFromRoot(context),

@@ -100,12 +100,7 @@ class SafetyAssessor(LeafSystem):
         Raises:
             ValueError: Another shape.
         """
-        beliefs = np.asarray(beliefs, dtype=float)
-        if beliefs.shape != self._shape:
-            raise ValueError(
-                f"safety assessor: beliefs must have shape {self._shape}; got {beliefs.shape}"
-            )
-        context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
+        _replace(context, self._belief_index, "beliefs", beliefs, self._shape)
 
     def get_shift(self, context: Context) -> np.ndarray:
         """The shift in a Context, shaped as the assessment's ``shift_``."""
@@ -122,12 +117,7 @@ class SafetyAssessor(LeafSystem):
         Raises:
             ValueError: Another shape.
         """
-        shift = np.asarray(shift, dtype=float)
-        if shift.shape != self._shift_shape:
-            raise ValueError(
-                f"safety assessor: shifts must have shape {self._shift_shape}; got {shift.shape}"
-            )
-        context.get_mutable_numeric_parameter(self._shift_index).SetFromVector(shift.ravel())
+        _replace(context, self._shift_index, "shifts", shift, self._shift_shape)
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over beliefs and shift of an assessment that was adapted from this system's own.
@@ -158,3 +148,12 @@ class SafetyAssessor(LeafSystem):
                 self.get_shift(context),
             )
         )
+
+
+def _replace(
+    context: Context, index: int, what: str, values: np.ndarray, shape: tuple[int, ...]
+) -> None:
+    values = np.asarray(values, dtype=float)
+    if values.shape != shape:
+        raise ValueError(f"safety assessor: {what} must have shape {shape}; got {values.shape}")
+    context.get_mutable_numeric_parameter(index).SetFromVector(values.ravel())
