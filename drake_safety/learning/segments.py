@@ -8,6 +8,16 @@ from typing import overload
 
 import numpy as np
 
+RECORDED = (
+    "state",
+    "true_state",
+    "output",
+    "desired_output",
+    "desired_preview",
+    "features",
+    "margins",
+)
+"""What an episode holds of every row, beside its time."""
 DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; such an episode says nothing about safety."""
 

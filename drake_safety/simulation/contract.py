@@ -7,20 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_safety.learning.segments import RECORDED
+
 if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
     from drake_safety.simulation.closed_loop import ClosedLoop
 
-RECORDED_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
+RECORDED_PORTS = RECORDED
 """Output ports that an episode records, row by row."""
 REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
 """Output ports that every task exports."""

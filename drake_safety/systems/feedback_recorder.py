@@ -9,17 +9,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
-
-_ROW_PORTS = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
-)
+from drake_safety.learning.segments import RECORDED, Episode, Episodes, EpisodesInfo
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,7 +151,7 @@ class FeedbackRecorder(LeafSystem):
 
     def _row(self, context: Context) -> tuple[np.ndarray, ...]:
         row = []
-        for name in _ROW_PORTS:
+        for name in RECORDED:
             source = name
             if name == "true_state" and not self._ports[name].HasValue(context):
                 source = "state"
@@ -209,7 +199,7 @@ class FeedbackRecorder(LeafSystem):
 
     def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
         columns = [np.array(column) for column in zip(*recording.rows, strict=True)]
-        arrays: dict[str, Any] = dict(zip(_ROW_PORTS, columns, strict=True))
+        arrays: dict[str, Any] = dict(zip(RECORDED, columns, strict=True))
         worst = int(np.argmin(arrays["margins"][-1]))
         times_s = np.array(recording.times_s)
         episode = Episode(
