@@ -220,13 +220,17 @@ def task_errors(
     )
     p_com = plant.CalcCenterOfMassPositionInWorld(context)
     tasks.follow(_FIRST, reference.center_of_mass, p_com)
-    _set_orientations(model, reference, tasks)
-    _set_hand(model, reference, tasks)
+    _set_orientations(model, reference, tasks, at_rest=True)
+    _set_hand(model, reference, tasks, at_rest=True)
     return tasks.J, tasks.error
 
 
 def _set_orientations(
-    model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows
+    model: WholeBodyModel,
+    reference: WholeBodyReference,
+    tasks: _TaskRows,
+    *,
+    at_rest: bool = False,
 ) -> None:
     plant, context = model.kinematics.plant, model.kinematics.context
     world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
@@ -239,23 +243,31 @@ def _set_orientations(
         else:
             frame = body.body_frame()
             tasks.J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
-            tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
-                context, kv, frame, _ORIGIN, world, world
-            ).rotational()
+            if not at_rest:
+                tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
+                    context, kv, frame, _ORIGIN, world, world
+                ).rotational()
         R_WB = body.EvalPoseInWorld(context).rotation()
         tasks.error[rows] = rotation_vector(R_WBd.multiply(R_WB.inverse()))
 
 
-def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows) -> None:
+def _set_hand(
+    model: WholeBodyModel,
+    reference: WholeBodyReference,
+    tasks: _TaskRows,
+    *,
+    at_rest: bool = False,
+) -> None:
     if model.hand is None or reference.reaching is None:
         return
     plant, context = model.kinematics.plant, model.kinematics.context
     world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
     body, frame, p = model.hand.body, model.hand.frame, model.hand.point
     tasks.J[-3:] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
-    tasks.Jdot_v[-3:] = plant.CalcBiasTranslationalAcceleration(
-        context, kv, frame, p, world, world
-    )[:, 0]
+    if not at_rest:
+        tasks.Jdot_v[-3:] = plant.CalcBiasTranslationalAcceleration(
+            context, kv, frame, p, world, world
+        )[:, 0]
     tasks.follow(_LAST, reference.reaching, body.EvalPoseInWorld(context).multiply(p))
 
 
