@@ -17,6 +17,7 @@ from drake_safety.evaluation.plan_study import (
     plans_of,
     promised_miss_rate,
     reachability_rule,
+    recall_losses,
     scorer_rule,
 )
 from drake_safety.evaluation.scorers import Scorer
@@ -215,3 +216,23 @@ def test_reachability_answers_for_the_hand_that_reaches_and_for_no_other(plans):
 
 def test_the_promise_leaves_room_above_the_papers_figure():
     assert SAFE_RECALL < UNSAFE_RECALL < PROMISED_UNSAFE_RECALL < 1.0
+
+
+def test_recall_losses_compare_the_pairs_alone(plans):
+    unsafe = plans.is_unsafe
+    none_lost = recall_losses(plans, unsafe, plans, unsafe)
+    assert {figure.value for figure in none_lost.values()} == {0.0}
+    # Twins of the first half, of which one safe plan is refused.
+    half = plans.first.take(plans.first.episode < 20)
+    twins = replace(plans, first=half, goals=plans.goals[: len(half)])
+    refused = half.is_unsafe.copy()
+    num_safe = int((~half.is_unsafe).sum())
+    refused[np.flatnonzero(~half.is_unsafe)[0]] = True
+    found = recall_losses(plans, unsafe, twins, refused)
+    assert found["safe_recall_loss"].value == pytest.approx(1 / num_safe)
+    assert found["safe_recall_loss"].n == len(half)
+    assert found["safe_recall_loss"].low <= 1 / num_safe <= found["safe_recall_loss"].high
+    assert found["unsafe_recall_loss"].value == 0.0
+    # What is refused among plans without a twin does not count.
+    beyond = unsafe | (plans.first.episode >= 20)
+    assert recall_losses(plans, beyond, twins, refused) == found

@@ -60,9 +60,7 @@ def evaluate(
     ] = 200,
     other_hand: Annotated[
         int | None,
-        typer.Option(
-            help="Targets: fresh ones for the other hand; as many as episodes by default.", min=0
-        ),
+        typer.Option(help="Targets: how many to mirror to the other hand; all by default.", min=0),
     ] = None,
     learning_curve: Annotated[
         str,
@@ -141,8 +139,8 @@ def evaluate(
     train_set = load_episodes(episodes_folder(assessment))
     _check_same_simulation(train_set.info, loaded.simulation_hash())
     check_options(loop, options, len(train_set))
-    # Episodes, throws, those that thresholds are chosen on, and the other hand's.
-    used = range(seed, seed + (5 if has_goals else 4))
+    # Episodes, throws or pushes, those that their alarms and other thresholds are chosen on.
+    used = range(seed, seed + 4)
     if train_set.info.seed in used:
         raise ValueError(
             f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and "
@@ -196,7 +194,7 @@ def evaluate(
             ]
         )
         if has_goals:
-            findings.add(evaluate_plans(judged, options, partial(run_set, offset=4)))
+            findings.add(evaluate_plans(judged, options, partial(run_set, offset=0)))
         else:
             findings.add(_evaluate_segments(judged))
         findings.add(evaluate_calibration(judged))

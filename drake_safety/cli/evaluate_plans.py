@@ -117,12 +117,14 @@ def evaluate_plans(
     sets = {"plans": test}
     num_other = len(judged.test_set) if options.other_hand is None else options.other_hand
     if mirror and num_other:
+        # The same draws: what this hand is asked for is the mirror image of what that one was.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
         sets["plans.other_hand"] = plans_of(
             scenario.make_loop(**loop.judging_options, **mirror), episodes
         )
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
-    study = evaluate_plans(rules, sharpened, calibration, sets)
+    twins = [key for key in sets if key != "plans"]
+    study = evaluate_plans(rules, sharpened, calibration, sets, twins)
     figures = dict(study.figures)
     pictures = _pictures(study, test, judged.folder)
     if options.plane_step:
@@ -157,6 +159,7 @@ def evaluate_plans(
         if f"{key}.outcomes.safe" in figures and figures[f"{key}.outcomes.safe"].n
     }
     tables = [_verdict_table(figures, key, [rule.name for rule in rules]) for key in keys]
+    tables += [_loss_table(figures, key, [rule.name for rule in rules]) for key in twins]
     tables.append(_outcome_table(figures, keys, test.constraint_names))
     tables.append(_cause_table(figures, keys, test.constraint_names))
     if curve:
@@ -234,6 +237,17 @@ def _verdict_table(figures: dict[str, Figure], key: str, names: list[str]) -> Ta
             *(interval(figures[prefix + what]) for what in _COLUMNS),
             f"{figures[f'{prefix}threshold'].value:.3f}",
         )
+    return table
+
+
+def _loss_table(figures: dict[str, Figure], key: str, names: list[str]) -> Table:
+    columns = {"safe_recall_loss": "safe recall", "unsafe_recall_loss": "unsafe recall"}
+    n = figures[f"{key}.{names[0]}.safe_recall_loss"].n
+    title = f"Lost on the same {n} targets mirrored, {_SETS[key]} [points]"
+    table = new_table("scorer", *columns.values(), title=title)
+    for name in names:
+        found = [figures[f"{key}.{name}.{what}"] for what in columns]
+        table.add_row(name, *(interval(figure, 100, 1) for figure in found))
     return table
 
 

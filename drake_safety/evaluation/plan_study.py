@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, proportion, segment_figures
+from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion, segment_figures
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
@@ -175,6 +176,7 @@ def evaluate_plans(
     assessment: SafetyAssessment,
     calibration: Plans,
     sets: Mapping[str, Plans],
+    twins: Sequence[str] = (),
 ) -> PlanStudy:
     """Every rule on fresh plans, all of them and the fair ones.
 
@@ -190,6 +192,7 @@ def evaluate_plans(
         assessment: Γ, which names causes.
         calibration: Other fresh plans, for every choice that is to be made.
         sets: Fresh plans by the prefix of their keys, such as "plans".
+        twins: Which of them have the targets of "plans", in the same order, for another hand.
 
     Raises:
         ValueError: There is no threshold to choose: no calibration plan is unsafe.
@@ -229,6 +232,15 @@ def evaluate_plans(
         figures[f"{prefix}.share_fair"] = proportion(
             int(plans.is_outcome_fair.sum()), len(plans.outcomes)
         )
+    for prefix in twins:
+        for name, threshold in thresholds.items():
+            found = recall_losses(
+                sets["plans"],
+                _is_refused(scores["plans"][name], threshold),
+                sets[prefix],
+                _is_refused(scores[prefix][name], threshold),
+            )
+            figures |= {f"{prefix}.{name}.{what}": figure for what, figure in found.items()}
     return PlanStudy(figures=figures, thresholds=thresholds, unsafe_score=scores)
 
 
@@ -267,6 +279,46 @@ def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) ->
         the recalls have Clopper-Pearson's interval.
     """
     return segment_figures(plans.first, unsafe_score, threshold=threshold)
+
+
+def recall_losses(
+    plans: Plans, is_refused: np.ndarray, twins: Plans, is_twin_refused: np.ndarray
+) -> dict[str, Figure]:
+    """What recalls lose from plans to their twins: the same targets, in the same order.
+
+    Args:
+        plans: Plans, maybe more than there are twins.
+        is_refused: Which of them are refused, (N,).
+        twins: Their twins.
+        is_twin_refused: Which of those are refused, (M,).
+
+    Returns:
+        `safe_recall_loss` and `unsafe_recall_loss`: the recall of the plans that have a twin, less
+        that of the twins. Intervals are found by drawing pairs again.
+    """
+    _, rows, twin_rows = np.intersect1d(
+        plans.first.episode, twins.first.episode, return_indices=True
+    )
+    pair = np.arange(len(rows))
+    unsafe, refused = plans.is_unsafe[rows], is_refused[rows]
+    twin_unsafe, twin_refused = twins.is_unsafe[twin_rows], is_twin_refused[twin_rows]
+
+    def loss(
+        relevant: np.ndarray, right: np.ndarray, twin_relevant: np.ndarray, twin_right: np.ndarray
+    ) -> Figure:
+        def statistic(weight: np.ndarray) -> float:
+            total, twin_total = weight @ relevant, weight @ twin_relevant
+            if not (total and twin_total):
+                return math.nan
+            recall = weight @ (relevant & right) / total
+            return float(recall - weight @ (twin_relevant & twin_right) / twin_total)
+
+        return Bootstrap().over_episodes(statistic, pair)
+
+    return {
+        "safe_recall_loss": loss(~unsafe, ~refused, ~twin_unsafe, ~twin_refused),
+        "unsafe_recall_loss": loss(unsafe, refused, twin_unsafe, twin_refused),
+    }
 
 
 def outcome_figures(plans: Plans) -> dict[str, Figure]:
