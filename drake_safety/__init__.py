@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from drake_safety.assessments import load_assessment
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.contract import check_contract
     from drake_safety.simulation.rollouts import run_episode, run_episodes
@@ -15,12 +16,14 @@ __all__ = [
     "Scenario",
     "__version__",
     "check_contract",
+    "load_assessment",
     "load_scenario",
     "run_episode",
     "run_episodes",
 ]
 
-# In a checkout `models` and `diagrams` stand beside this package, in a wheel inside it.
+# In a checkout `models`, `diagrams` and `assessments` stand beside this package, in a wheel inside
+# it.
 if not (Path(__file__).parent / "models").is_dir():
     __path__.append(str(Path(__file__).resolve().parents[1]))
 
@@ -29,6 +32,7 @@ _HOMES = {
     "SafetyAssessment": "drake_safety.learning.assessment",
     "Scenario": "drake_safety.simulation.scenario",
     "check_contract": "drake_safety.simulation.contract",
+    "load_assessment": "drake_safety.assessments",
     "load_scenario": "drake_safety.simulation.scenario",
     "run_episode": "drake_safety.simulation.rollouts",
     "run_episodes": "drake_safety.simulation.rollouts",

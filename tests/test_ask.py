@@ -2,7 +2,10 @@
 
 import json
 import re
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +22,7 @@ from drake_safety.simulation.planning import assess_goal, goal_inputs
 from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import load_scenario
 
+ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = "atlas_reaching"
 BOUNDARY_M = 0.75
 CAUSE = "collision"
@@ -134,6 +138,7 @@ def test_the_answer_as_json_is_the_library_s_own(call, folder, trained, loop, ta
     code, told = call("ask", SCENARIO, *options)
     answer = json.loads(told)
     assert answer.pop("hand") == "left"
+    assert answer.pop("assessment") == str(folder)
     assert "is not calibrated" in answer.pop("remark")
     assert answer.pop("nearest_accepted") == (None if verdict.is_accepted else list(target))
     assert answer == json.loads(json.dumps(verdict.to_json()))
@@ -156,6 +161,75 @@ def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(call, fol
     # The number that may follow is of another target, which may be suggested.
     assert "Γ" not in told.partition("nearest accepted")[0]
     assert "belief" not in told
+
+
+@pytest.fixture
+def shipped(trained, monkeypatch, tmp_path):
+    """The package seems to come with that assessment; the working folder is an empty one."""
+    package = tmp_path / "package"
+    (package / SCENARIO).mkdir(parents=True)
+    file = assessment_file(package / SCENARIO, "sharpened")
+    shutil.copyfile(assessment_file(trained[0], "sharpened"), file)
+    monkeypatch.setattr("drake_safety.assessments._FOLDER", package)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return package / SCENARIO
+
+
+def test_without_a_training_the_shipped_assessment_answers_and_is_named(call, shipped, folder):
+    code, told = call("ask", SCENARIO, "--target", *NEAR)
+    assert code == 0
+    first, *answer = told.splitlines()
+    assert first.split() == ["assessment", *"comes with the package,".split(), str(shipped)]
+    # It is the same assessment as that of the folder, which is not announced when it is asked for.
+    assert [line.replace(str(shipped), str(folder)) for line in answer] == call(
+        "ask", SCENARIO, "--assessment", folder, "--target", *NEAR
+    )[1].splitlines()
+    code, told = call("ask", SCENARIO, "--target", *NEAR, "--json")
+    assert json.loads(told)["assessment"] == str(shipped)
+
+
+def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
+    call, shipped, nothing_near, tmp_path, monkeypatch
+):
+    folders = []
+    monkeypatch.setattr(
+        "drake_safety.cli.run.run_to_target",
+        lambda settings, *arguments, **options: folders.append(settings.folder) or True,
+    )
+    assert call("run", SCENARIO, "--target", "blue_box")[0] == 0
+    assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run"]
+    assert call("run", SCENARIO, "--target", "blue_box", "--out", tmp_path)[0] == 0
+    assert folders[1:] == [tmp_path / "run"]
+
+
+def test_what_was_never_shipped_is_answered_with_what_was_and_with_train(call, shipped):
+    code, told = call("ask", "talos_reaching", "--target", *NEAR)
+    assert code == 2
+    assert f"which has those of ['{SCENARIO}']: `drake-safety train` learns one" in told
+
+
+def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
+    code = (
+        "import sys\n"
+        "from drake_safety.cli import main\n"
+        "sys.argv = ['drake-safety', *sys.argv[1:]]\n"
+        "try:\n    main()\n"
+        "finally:\n    print(*{name.partition('.')[0] for name in sys.modules})\n"
+    )
+    options = ["--assessment", folder, "--target", *NEAR]
+    done = subprocess.run(
+        [sys.executable, "-c", code, "ask", SCENARIO, *map(str, options)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert "pydrake" in loaded
+    heavy = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib", "numba"}
+    heavy |= {"pandas", "pyarrow", "joblib", "tensorboard"}
+    assert loaded & heavy == set()
 
 
 def test_the_region_of_the_other_hand_is_the_mirrored_one(call, folder):

@@ -11,19 +11,31 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Each room and the rooms it may import besides itself. `models` and `diagrams` are the folders
-# beside the library. A scenario names its task by import path, so no room imports `diagrams`.
+# Each room and the rooms it may import besides itself. `models`, `diagrams` and
+# `assessments` are the folders beside the library. A scenario names its task by import path, so no
+# room imports `diagrams`.
 ALLOWED = {
     "learning": set(),
     "control": set(),
+    "assessments": {"learning"},
     "models": {"control"},
     "systems": {"learning", "control"},
     "simulation": {"systems", "learning", "control", "models"},
     "logs": {"simulation", "systems", "learning", "control"},
     "evaluation": {"simulation", "systems", "learning", "control", "models"},
     "diagrams": {"simulation", "systems", "control", "learning", "models"},
-    "cli": {"logs", "evaluation", "simulation", "systems", "learning", "control", "models"},
+    "cli": {
+        "logs",
+        "evaluation",
+        "simulation",
+        "systems",
+        "learning",
+        "control",
+        "models",
+        "assessments",
+    },
 }
+BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
 HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
@@ -58,14 +70,14 @@ def relative(path):
     return path.relative_to(ROOT).as_posix()
 
 
-LIBRARY = source_files("drake_safety", "models", "diagrams")
+LIBRARY = source_files("drake_safety", *BESIDE)
 PYTHON = LIBRARY + source_files("tests", "benchmarks", "tutorials")
 
 
 def module_of(name):
     """`drake_safety/learning/grid.py` → `drake_safety.learning.grid`; `models/x.py` likewise."""
     parts = name.removesuffix(".py").split("/")
-    if parts[0] in ("models", "diagrams"):
+    if parts[0] in BESIDE:
         parts.insert(0, "drake_safety")
     return ".".join(parts)
 
@@ -153,7 +165,7 @@ def forbidden_anywhere(source, name):
             offences.append(f"{name}:{line} imports {dotted}")
         if dotted.startswith("pydrake.all"):
             offences.append(f"{name}:{line} imports pydrake.all")
-        if top in ("models", "diagrams"):
+        if top in BESIDE:
             offences.append(f"{name}:{line} imports {dotted}: it is drake_safety.{dotted}")
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call):
@@ -263,7 +275,7 @@ def test_no_robot_is_named_in_the_library_or_in_a_task():
         for path in (ROOT / "drake_safety").rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     ]
-    files += source_files("diagrams")
+    files += source_files("diagrams", "assessments")
     assert offences_in(lambda text, name: named_robots(text, name, robots), files) == []
     assert [path for path in files if named_robots(path.name, path.name, robots)] == []
 

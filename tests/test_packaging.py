@@ -1,6 +1,8 @@
 """What a stranger gets: sdist → wheel → a clean environment, used from `/`."""
 
+import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -18,6 +20,12 @@ INSTALLED_AT = {
     "drake_safety": "drake_safety",
     "models": "drake_safety/models",
     "diagrams": "drake_safety/diagrams",
+    "assessments": "drake_safety/assessments",
+}
+# Shipped assessments come and go; this one is always there, so that the way is.
+SHIPPED = {
+    "assessments/pendulum/sharpened.safetensors",
+    "assessments/pendulum/evaluation.json",
 }
 
 pytestmark = pytest.mark.slow
@@ -59,6 +67,9 @@ def sdist(tmp_path_factory):
     # A copy: building in place would leave egg-info and build folders in the checkout.
     kept_out = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs")
     shutil.copytree(ROOT, checkout, ignore=kept_out)
+    for name in SHIPPED:
+        (checkout / name).parent.mkdir(exist_ok=True)
+        (checkout / name).write_text("not really one")
     return call_backend("build_sdist", checkout, work / "sdist")
 
 
@@ -92,10 +103,12 @@ def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "LICENSE", "README.md", "constraints.txt", "Makefile"} <= names
-    assert {f"tests/{name}" for name in files_under(ROOT / "tests")} <= names
+    for folder in ("tests", "assessments"):
+        assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
+    assert names >= SHIPPED
 
 
-def test_every_file_of_the_library_models_and_diagrams_is_in_the_wheel_and_no_other(wheel):
+def test_every_file_of_the_library_and_of_the_folders_beside_it_is_in_the_wheel_and_no_other(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
     metadata = {name for name in names if ".dist-info/" in name}
@@ -104,6 +117,7 @@ def test_every_file_of_the_library_models_and_diagrams_is_in_the_wheel_and_no_ot
         for folder, installed in INSTALLED_AT.items()
         for name in files_under(ROOT / folder)
     }
+    expected |= {f"drake_safety/{name}" for name in SHIPPED}
     assert names - metadata == expected
     assert any(name.endswith("/licenses/LICENSE") for name in metadata)
 
@@ -128,8 +142,9 @@ def test_no_dependency_names_an_index_or_an_address():
 
 def test_the_installed_package_imports_from_the_root_folder(clean_environment):
     code = (
-        "import drake_safety, drake_safety.models, drake_safety.diagrams as d\n"
-        "print(drake_safety.__file__, drake_safety.models.__file__, d.__file__, sep='\\n')\n"
+        "import drake_safety, drake_safety.models as m, drake_safety.diagrams as d\n"
+        "import drake_safety.assessments as a\n"
+        "print(drake_safety.__file__, m.__file__, d.__file__, a.__file__, sep='\\n')\n"
         "print(*drake_safety.__path__, drake_safety.__version__, sep='\\n')"
     )
     printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").splitlines()
@@ -152,6 +167,31 @@ def test_the_installed_command_lists_every_scenario(clean_environment):
     assert scenarios
     printed = run(clean_environment / "bin" / "drake-safety", "scenarios", cwd="/")
     assert [name for name in scenarios if name not in printed] == []
+
+
+def test_the_installed_assessments_are_the_checkouts_and_are_found(clean_environment):
+    code = "from drake_safety.assessments import *; print(*assessed_scenarios())"
+    printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").split()
+    kept = {path.parent.name for path in (ROOT / "assessments").glob("*/*.safetensors")}
+    assert printed == sorted({*kept, "pendulum"})
+
+
+@pytest.mark.skipif(
+    not (ROOT / "assessments" / "atlas_reaching").is_dir(), reason="it is not shipped"
+)
+def test_an_installed_assessment_answers_at_once(clean_environment):
+    def cpu_s():
+        spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return spent.ru_utime + spent.ru_stime
+
+    started = cpu_s()
+    options = ["--target", "0.7", "0.3", "1.0", "--json"]
+    command = [clean_environment / "bin" / "drake-safety", "ask", "atlas_reaching", *options]
+    answer = json.loads(run(*command, cwd="/"))
+    assert answer["verdict"] == "safe"
+    assert Path(answer["assessment"]).is_relative_to(clean_environment)
+    # Of the processor, as other tests may run beside; on an idle machine the clock shows no more.
+    assert cpu_s() - started < 5.0
 
 
 def test_the_installed_robots_are_the_checkouts(clean_environment):

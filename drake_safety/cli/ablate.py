@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.arguments import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.console import Stages, console, interval, new_table, open_stages, print_path
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
@@ -43,7 +43,7 @@ _QUICK_EPISODES, _QUICK_TEST, _QUICK_CALIBRATION, _QUICK_EPOCHS = 256, 200, 100,
 
 def ablate(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: TrainingOption,
     quick: Annotated[
         bool,
         typer.Option(

@@ -18,12 +18,14 @@ from drake_safety.cli.console import (
     new_table,
     open_stages,
     print_path,
+    print_shipped,
 )
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
     adapted_folder,
     assessment_file,
+    assessment_folder,
     feedback_folder,
     load_assessment,
 )
@@ -40,7 +42,7 @@ _SCRATCH_SIZES = (40, 160, 400)
 
 def adapt(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: AssessmentOption = None,
     feedback: Annotated[
         int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
     ] = 160,
@@ -72,14 +74,16 @@ def adapt(
 
     Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
     --log it is named after the log. Episodes are kept in ASSESSMENT: an adaptation that was stopped
-    goes on when it is called again.
+    goes on when it is called again. For an assessment that came with the package, ASSESSMENT is
+    runs/SCENARIO-shipped.
     """
     from drake_safety.evaluation.adaptation_figure import adaptation_figure
     from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    priors = {mode: load_assessment(assessment, mode) for mode in MODES}
+    learned = assessment_folder(loaded, assessment)
+    priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
     used = range(seed, seed + 3)
     if priors[MODES[0]].info_.seed in used:
         raise ValueError(
@@ -91,12 +95,13 @@ def adapt(
     if log is not None and evaluate:
         raise ValueError("adapt: there is nothing fresh in a log to judge by; leave out --evaluate")
     name = variation if log is None else log.stem
-    folder = adapted_folder(assessment, name)
+    print_shipped(learned)
+    folder = adapted_folder(learned.out, name)
     with open_stages() as stages:
         if log is not None and log_map is not None:
             pairs = _logged_pairs(loaded, log, log_map, seed)
         else:
-            pairs = _run_pairs(loaded, feedback, variation, seed, assessment, workers, stages)
+            pairs = _run_pairs(loaded, feedback, variation, seed, learned.out, workers, stages)
         sets = pairs.feedback()
         adapted = {}
         for mode, prior in priors.items():
@@ -113,7 +118,7 @@ def adapt(
                 pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
         studies: dict[str, AdaptationStudy] = {}
         if evaluate:
-            judge = _Judge(loaded, variation, seed, assessment, workers, stages)
+            judge = _Judge(loaded, variation, seed, learned.out, workers, stages)
             studies = judge.studies(priors, pairs, evaluate, orders, oracle, scratch)
             from drake_safety.evaluation.adaptation_figure import study_figure
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import console
+from drake_safety.cli.console import console, print_shipped
 from drake_safety.cli.targets import (
     TARGET,
     TARGET_HELP,
@@ -17,13 +17,13 @@ from drake_safety.cli.targets import (
     parse_target,
     print_verdict,
 )
-from drake_safety.cli.training_folder import goal_threshold, load_assessment
+from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 
 
 def ask(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
     target: Annotated[str, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)],
+    assessment: AssessmentOption = None,
     hand: HandOption = None,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -37,21 +37,24 @@ def ask(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    gamma = load_assessment(assessment, mode)
+    folder = assessment_folder(loaded, assessment)
+    gamma = load_assessment(folder.path, mode)
     options: dict[str, Any] = {} if hand is None else {"hand": hand}
     loop = loaded.make_loop(assessment=gamma, **options)
     goal = parse_target(loop, target)
-    threshold, unsafe_below, remark = goal_threshold(assessment, mode, gamma)
+    threshold, unsafe_below, remark = goal_threshold(folder.path, mode, gamma)
     verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=unsafe_below)
     nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
     if as_json:
         answer = verdict.to_json() | {
+            "assessment": str(folder.path),
             "hand": loop.hand,
             "nearest_accepted": None if nearest is None else nearest.goal.tolist(),
             "remark": remark,
         }
         console.print(json.dumps(answer), soft_wrap=True, highlight=False)
     else:
+        print_shipped(folder)
         print_verdict(loop, verdict, nearest, remark)
     if not verdict.is_accepted:
         raise typer.Exit(1)

@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
-from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.console import (
+    console,
+    interval,
+    new_table,
+    open_stages,
+    print_path,
+    print_shipped,
+)
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
+    assessment_folder,
     fresh_episodes_folder,
     load_assessment,
 )
@@ -28,7 +36,7 @@ SEED = 2_000_000
 
 def calibrate(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: AssessmentOption = None,
     miss_rate: Annotated[
         float, typer.Option(help="Promised share of unsafe episodes that are called safe.")
     ] = 0.01,
@@ -50,7 +58,8 @@ def calibrate(
     """Choose thresholds that keep a promised miss rate, on fresh episodes.
 
     `ask`, `run` and `evaluate` use what is stored. The episodes are kept in ASSESSMENT: a
-    calibration that was stopped goes on, and another promise costs nothing more.
+    calibration that was stopped goes on, and another promise costs nothing more. An assessment that
+    came with the package stays as it is; what is calibrated goes to runs/SCENARIO-shipped.
     """
     from drake_safety.evaluation.calibration_study import repeated_splits
     from drake_safety.evaluation.scorers import assessment_scorer
@@ -61,10 +70,12 @@ def calibrate(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
+    folder = assessment_folder(loaded, assessment)
+    print_shipped(folder)
     learned = {
-        mode: load_assessment(assessment, mode)
+        mode: load_assessment(folder.path, mode)
         for mode in MODES
-        if mode == MODES[0] or assessment_file(assessment, mode).is_file()
+        if mode == MODES[0] or assessment_file(folder.path, mode).is_file()
     }
     scenario_hash = loaded.simulation_hash()
     for gamma in learned.values():
@@ -85,7 +96,7 @@ def calibrate(
             episodes,
             seed=seed,
             num_workers=workers,
-            path=fresh_episodes_folder(assessment, scenario_hash, seed, judging),
+            path=fresh_episodes_folder(folder.out, scenario_hash, seed, judging),
             progress=partial(stages, "calibration episodes"),
             **judging,
         )
@@ -113,12 +124,12 @@ def calibrate(
                 )
     for mode, gamma in learned.items():
         gamma.calibrations_ = {one.kind: one for one in found[mode]}
-        gamma.save(assessment_file(assessment, mode))
+        gamma.save(assessment_file(folder.out, mode))
     console.print(_table(found))
     for kind, promises in kept.items():
         console.print(_splits_table(kind, promises, splits))
     for mode in learned:
-        print_path("calibrated", assessment_file(assessment, mode))
+        print_path("calibrated", assessment_file(folder.out, mode))
 
 
 def _table(found: dict[str, list[Calibration]]) -> Table:

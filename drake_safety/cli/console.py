@@ -24,6 +24,7 @@ from rich.table import Column, Table
 if TYPE_CHECKING:
     import numpy as np
 
+    from drake_safety.cli.training_folder import AssessmentFolder
     from drake_safety.evaluation.metrics import Figure
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
@@ -82,6 +83,12 @@ def cause_words(
 def print_path(what: str, path: Path) -> None:
     """Prints a path whole on one line, so that it can be copied."""
     console.print(what, str(path), soft_wrap=True, highlight=False)
+
+
+def print_shipped(folder: AssessmentFolder) -> None:
+    """Says which assessment is used where none was asked for."""
+    if folder.is_shipped:
+        print_path("assessment        comes with the package,", folder.path)
 
 
 class Stages:

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
+from drake_safety.cli.arguments import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
 from drake_safety.cli.evaluate_calibration import evaluate_calibration
 from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
@@ -26,6 +26,7 @@ from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
+    assessment_file,
     episodes_folder,
     fresh_episodes_folder,
     load_assessment,
@@ -43,7 +44,7 @@ _DEFAULT_THROWS = 600
 
 def evaluate(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: TrainingOption,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     throws: Annotated[
         int | None,
@@ -107,6 +108,7 @@ def evaluate(
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.scorers import classifier_scorers
+    from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
@@ -213,6 +215,7 @@ def evaluate(
         "seed": seed,
         "training_seed": train_set.info.seed,
         "training_episodes": len(train_set),
+        "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
         **findings.entries,
         **{key: figure.to_json() for key, figure in findings.figures.items()},

@@ -10,9 +10,16 @@ from typing import Annotated
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
-from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
+from drake_safety.cli.console import (
+    console,
+    interval,
+    new_table,
+    open_stages,
+    print_path,
+    print_shipped,
+)
 from drake_safety.cli.provenance import command_line, versions
-from drake_safety.cli.training_folder import goal_threshold, load_assessment
+from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 
 _ROWS = {
     "default": "default plan",
@@ -25,7 +32,7 @@ _ROWS = {
 
 def plan_study(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: AssessmentOption = None,
     episodes: Annotated[int, typer.Option(help="Fresh starts to plan from.", min=1)] = 200,
     candidates: Annotated[
         int, typer.Option(help="Plans of each start, all of them simulated.", min=2)
@@ -33,7 +40,10 @@ def plan_study(
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 3_000_000,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the figures; ASSESSMENT's by default.")
+        Path | None,
+        typer.Option(
+            help="Folder for the figures; by default ASSESSMENT, or else runs/SCENARIO-shipped."
+        ),
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
@@ -45,7 +55,8 @@ def plan_study(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    gamma = load_assessment(assessment, mode)
+    learned = assessment_folder(loaded, assessment)
+    gamma = load_assessment(learned.path, mode)
     if gamma.info_.scenario_hash != loaded.simulation_hash():
         raise ValueError(
             f"plan-study: the assessment was learned from scenario '{gamma.info_.scenario}' with "
@@ -54,7 +65,8 @@ def plan_study(
         )
     if seed == gamma.info_.seed:
         raise ValueError(f"plan-study: {seed} is the training episodes' own seed; choose another")
-    rule = goal_threshold(assessment, mode, gamma)
+    rule = goal_threshold(learned.path, mode, gamma)
+    print_shipped(learned)
     with open_stages() as stages:
         trials = run_trials(
             loaded,
@@ -86,7 +98,7 @@ def plan_study(
         "versions": versions(),
         **{f"planning.{key}": figure.to_json() for key, figure in study.figures.items()},
     }
-    folder = out or assessment
+    folder = out or learned.out
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "planning.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import console
+from drake_safety.cli.console import console, print_shipped
 from drake_safety.cli.targets import HandOption
-from drake_safety.cli.training_folder import goal_threshold, load_assessment
+from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 
 if TYPE_CHECKING:
     from drake_safety.simulation.live_session import LiveSession
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def play(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: AssessmentOption = None,
     hand: HandOption = None,
     variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
     recovery: Annotated[
@@ -40,18 +40,20 @@ def play(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    gamma = load_assessment(assessment, mode)
+    folder = assessment_folder(loaded, assessment)
+    gamma = load_assessment(folder.path, mode)
     given = {"hand": hand, "recovery": recovery}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     # What a task offers is asked of its diagram, before a browser is opened for it.
     has_goals = loaded.make_loop(variation, assessment=gamma, **options).target_box is not None
     if not has_goals:
         options["ball"] = True
+    print_shipped(folder)
     meshcat = Meshcat(MeshcatParams() if port is None else MeshcatParams(port=port))
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session: LiveSession
     if has_goals:
-        rule = goal_threshold(assessment, mode, gamma)
+        rule = goal_threshold(folder.path, mode, gamma)
         if rule.remark:
             console.print(rule.remark, highlight=False, soft_wrap=True)
         session = LiveGoals(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_safety.cli.console import console, print_path
+from drake_safety.cli.console import console, open_stages, print_path
 from drake_safety.cli.provenance import versions
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 
@@ -23,6 +24,13 @@ def report(
         Path | None,
         typer.Option(help="Also keep the evaluation here, compactly: docs/results/NAME.json."),
     ] = None,
+    ship: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also put the assessments here, with their evaluation and first verdicts, in a "
+            "folder named after the scenario: `assessments` of a checkout goes into the package."
+        ),
+    ] = None,
     readme: Annotated[
         Path | None,
         typer.Option(
@@ -35,10 +43,10 @@ def report(
 
     A run that is not finished gets a page, too: it says what is missing.
     """
-    if run is None and (readme is None or store is not None):
+    if run is None and (readme is None or store is not None or ship is not None):
         raise ValueError("report: name the folder of a run; without one only --readme has a sense")
     if run is not None:
-        _report(run, store)
+        _report(run, store, ship)
     if readme is not None:
         from drake_safety.evaluation.report.readme import rewrite_readme
 
@@ -46,7 +54,7 @@ def report(
             print_path(f"results of {name} in", readme)
 
 
-def _report(folder: Path, store: Path | None) -> None:
+def _report(folder: Path, store: Path | None, ship: Path | None) -> None:
     from drake_safety.evaluation.report.page import write_report
     from drake_safety.evaluation.report.results import store_results
     from drake_safety.evaluation.report.run_folder import read_run
@@ -56,8 +64,12 @@ def _report(folder: Path, store: Path | None) -> None:
         episodes=episodes_folder(folder),
         assessments={mode: assessment_file(folder, mode) for mode in MODES},
     )
-    if store is not None and not run.results.figures:
-        raise ValueError(f"report: {folder} holds no evaluation to store")
+    if not (store is None and ship is None) and not run.results.figures:
+        raise ValueError(
+            f"report: {folder} holds no evaluation to store: `drake-safety evaluate` makes one"
+        )
+    if ship is not None:
+        print_path("shipped", _ship(run, ship))
     page = write_report(run, versions=versions(), angular_constraints=_angular_constraints(run))
     for missing in run.missing:
         console.print("missing", f"{missing.what}. {missing.why}", soft_wrap=True, highlight=False)
@@ -65,6 +77,26 @@ def _report(folder: Path, store: Path | None) -> None:
     if store is not None:
         store_results(run.results, store, train_command=run.extra.get("command"))
         print_path("stored ", store)
+
+
+def _ship(run: Run, into: Path) -> Path:
+    from drake_safety.evaluation.shipping import ship
+    from drake_safety.simulation.scenario import load_scenario
+
+    if "command" not in run.extra:
+        raise ValueError(
+            f"report: {run.folder} does not tell what its assessments were trained with: there is "
+            f"no command in {episodes_folder(run.folder)}"
+        )
+    with open_stages() as stages:
+        return ship(
+            run.results,
+            {mode: assessment_file(run.folder, mode) for mode in MODES},
+            into,
+            load_scenario(run.scenario_name),
+            train_command=str(run.extra["command"]),
+            progress=partial(stages, "first fresh episodes"),
+        )
 
 
 def _angular_constraints(run: Run) -> tuple[str, ...]:

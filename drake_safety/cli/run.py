@@ -10,11 +10,11 @@ import numpy as np
 import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import cause_words, new_table
+from drake_safety.cli.console import cause_words, new_table, print_shipped
 from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
-from drake_safety.cli.training_folder import goal_threshold, load_assessment
+from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +48,7 @@ _THROW_FIELDS = {
 
 def run(
     scenario: ScenarioArgument,
-    assessment: AssessmentOption,
+    assessment: AssessmentOption = None,
     target: Annotated[
         str | None, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)
     ] = None,
@@ -79,7 +79,10 @@ def run(
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for recording and pictures; ASSESSMENT's by default."),
+        typer.Option(
+            help="Folder for recording and pictures; by default ASSESSMENT, or else "
+            "runs/SCENARIO-shipped."
+        ),
     ] = None,
     meshcat: Annotated[
         bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
@@ -92,19 +95,22 @@ def run(
     from drake_safety.simulation.scenario import load_scenario
 
     given = {"hand": hand, "recovery": recovery}
+    loaded = load_scenario(scenario)
+    learned = assessment_folder(loaded, assessment)
     settings = RunSettings(
-        scenario=load_scenario(scenario),
-        assessment=load_assessment(assessment, mode),
+        scenario=loaded,
+        assessment=load_assessment(learned.path, mode),
         variation=variation,
         options={name: value for name, value in given.items() if value is not None},
         pushes=push or [],
         seed=seed,
         duration_s=duration,
-        folder=(out or assessment) / "run",
+        folder=(out or learned.out) / "run",
         is_live=meshcat,
     )
+    print_shipped(learned)
     if target is not None:
-        rule = goal_threshold(assessment, mode, settings.assessment)
+        rule = goal_threshold(learned.path, mode, settings.assessment)
         if not run_to_target(settings, target, rule, is_forced=force):
             raise typer.Exit(1)
         return

@@ -8,6 +8,24 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.scenario import Scenario
+
+
+class AssessmentFolder(NamedTuple):
+    """Where a command finds the assessments of a scenario, and where it writes.
+
+    Attributes:
+        path: Holds an assessment a mode.
+        out: Where what is made of them goes: the same folder, unless they came with the package.
+    """
+
+    path: Path
+    out: Path
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether the assessments came with the package."""
+        return self.path != self.out
 
 
 class GoalThreshold(NamedTuple):
@@ -74,6 +92,39 @@ def adapted_folder(folder: Path, variation: str) -> Path:
 def assessment_file(folder: Path, mode: str) -> Path:
     """Where ``train`` keeps the assessment of a mode."""
     return folder / f"{mode}.safetensors"
+
+
+def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolder:
+    """The folder that was asked for; else the one that comes with the package, which is told.
+
+    Args:
+        scenario: The scenario.
+        given: What ``--assessment`` says.
+
+    Raises:
+        ValueError: Nothing is given, and no assessment of this scenario comes with the package, or
+            one of another scenario of this name.
+    """
+    if given is not None:
+        return AssessmentFolder(given, given)
+    from drake_safety.assessments import assessed_scenarios, shipped_folder
+
+    advice = "`drake-safety train` learns one, in a folder to be passed as --assessment"
+    if scenario.name not in assessed_scenarios():
+        raise ValueError(
+            f"no assessment of scenario '{scenario.name}' comes with the package, which has those "
+            f"of {assessed_scenarios()}: {advice}"
+        )
+    shipped = shipped_folder(scenario.name)
+    learned = load_assessment(shipped, MODES[0]).info_.scenario_hash
+    if learned != scenario.simulation_hash():
+        raise ValueError(
+            f"the assessment of '{scenario.name}' that comes with the package was learned from a "
+            f"scenario with hash {learned[:12]}, this one has {scenario.simulation_hash()[:12]}: "
+            f"{advice}"
+        )
+    # A folder of its own: nobody's training is written over.
+    return AssessmentFolder(shipped, Path("runs") / f"{scenario.name}-shipped")
 
 
 def load_assessment(folder: Path, mode: str) -> SafetyAssessment:

@@ -118,14 +118,14 @@ class SafetyAssessment:
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
-        self.training_score_ = segments.score
+        self.training_score_ = _single(segments.score)
         self.training_cause_ = segments.cause
         self.base_logit_: BaseLogit | None = None
         self.training_logit_ = self.training_nearest_ = None
         if self.embedding_.has_heads:
             margins = output.margins.mean(axis=0)
             self.base_logit_ = fitted_base_logit(margins, segments, parameters)
-            self.training_logit_ = self.base_logit_.of_output(output)
+            self.training_logit_ = _single(self.base_logit_.of_output(output))
             self.training_nearest_ = (
                 margins.argmin(axis=1)
                 if margins.shape[1]
@@ -384,12 +384,12 @@ class SafetyAssessment:
             "beliefs": self.beliefs_,
             "shift": self.shift_,
             "training_points": self.training_points_,
-            "training_score": self.training_score_,
-            "training_cause": self.training_cause_.astype(np.int64),
+            "training_score": self.training_score_.astype(np.float32),
+            "training_cause": self.training_cause_.astype(np.int16),
         }
         if self.training_logit_ is not None and self.training_nearest_ is not None:
-            tensors["training_logit"] = self.training_logit_
-            tensors["training_nearest"] = self.training_nearest_.astype(np.int64)
+            tensors["training_logit"] = self.training_logit_.astype(np.float32)
+            tensors["training_nearest"] = self.training_nearest_.astype(np.int16)
         assessment_file.write(
             Path(path),
             parameters=self.parameters,
@@ -442,10 +442,11 @@ class SafetyAssessment:
                 f"its names amount to {num_inputs}"
             )
         self.training_points_ = tensors["training_points"]
-        self.training_score_ = tensors["training_score"]
-        self.training_cause_ = tensors["training_cause"]
-        self.training_logit_ = tensors.get("training_logit")
-        self.training_nearest_ = tensors.get("training_nearest")
+        self.training_score_ = _single(tensors["training_score"])
+        self.training_cause_ = tensors["training_cause"].astype(np.int64)
+        logit, nearest = tensors.get("training_logit"), tensors.get("training_nearest")
+        self.training_logit_ = None if logit is None else _single(logit)
+        self.training_nearest_ = None if nearest is None else nearest.astype(np.int64)
         self.base_logit_ = None
         if base_logit is not None:
             low, high = base_logit["margin_range"]
@@ -463,3 +464,8 @@ class SafetyAssessment:
             raise ValueError(f"its beliefs have shape {self.beliefs_.shape}, expected {expected}")
         if self.shift_.shape != expected[:2]:
             raise ValueError(f"its shifts have shape {self.shift_.shape}, expected {expected[:2]}")
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    """Values that single precision holds, as doubles: files keep one number for every segment."""
+    return values.astype(np.float32).astype(float)

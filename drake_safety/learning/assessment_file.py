@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
@@ -96,6 +97,12 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         }, tensors
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _open(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:

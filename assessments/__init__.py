@@ -1,0 +1,61 @@
+"""Trained assessments that come with the package, a folder a scenario, and their loader.
+
+A folder holds `MODE.safetensors`, and in `evaluation.json` what is known of them: the figures of an
+evaluation on fresh episodes, the files' hashes, and the verdicts on the first of these episodes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
+
+__all__ = ["assessed_scenarios", "load_assessment", "shipped_folder"]
+
+_FOLDER = Path(__file__).parent
+
+
+def assessed_scenarios() -> list[str]:
+    """Names of the scenarios whose trained assessments come with the package."""
+    return sorted({path.parent.name for path in _FOLDER.glob("*/*.safetensors")})
+
+
+def shipped_folder(scenario: str) -> Path:
+    """The folder with the trained assessments of a scenario.
+
+    Args:
+        scenario: The scenario's name.
+
+    Raises:
+        ValueError: None come with the package; says for which scenarios there are some.
+    """
+    if scenario not in assessed_scenarios():
+        raise ValueError(
+            f"no trained assessment of scenario '{scenario}' comes with the package, which has "
+            f"some of {assessed_scenarios()}: `drake-safety train` makes one"
+        )
+    return _FOLDER / scenario
+
+
+def load_assessment(scenario: str, mode: str = "sharpened") -> SafetyAssessment:
+    """Loads a trained assessment that comes with the package.
+
+    Args:
+        scenario: The scenario's name.
+        mode: "sharpened" or "paper".
+
+    Raises:
+        ValueError: There is none of this scenario or mode; says which there are.
+    """
+    from drake_safety.learning.assessment import SafetyAssessment
+
+    folder = shipped_folder(scenario)
+    modes = sorted(path.stem for path in folder.glob("*.safetensors"))
+    if mode not in modes:
+        raise ValueError(
+            f"the trained assessments of scenario '{scenario}' that come with the package are "
+            f"{modes}; got '{mode}'"
+        )
+    return SafetyAssessment.load(folder / f"{mode}.safetensors")

@@ -1,0 +1,227 @@
+"""Trained assessments that are handed on: their files, with what is known of them beside them.
+
+A shipped folder holds the files of a run as they are, and `evaluation.json`: figures, commands,
+seeds and versions of the evaluation, the SHA-256 of every file that it judged, and the verdicts on
+the first fresh episodes of its seed. Whoever has the folder can simulate these anew and compare.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_safety.evaluation.report.results import Results, read_results, store_results
+from drake_safety.evaluation.scorers import assessment_scorer
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.calibration import PLAN
+from drake_safety.learning.segments import split
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario
+
+EVALUATION_FILE = "evaluation.json"
+NUM_EPISODES = 6
+"""Fresh episodes whose verdicts are stored."""
+_HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
+_TOLERANCE = 1e-3  # Of Γ: another processor rounds otherwise, another assessment thinks otherwise.
+
+
+def ship(
+    results: Results,
+    files: Mapping[str, Path],
+    into: Path,
+    scenario: Scenario,
+    *,
+    train_command: str,
+    num_workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Copies trained assessments into a folder, with what is known of them.
+
+    Args:
+        results: What their evaluation found.
+        files: The assessments, by mode.
+        into: Where folders of shipped assessments stand; this one is named after the scenario.
+        scenario: What they were learned from.
+        train_command: What they were trained with.
+        num_workers: Processes that simulate the first episodes; one a core by default.
+        progress: Called with the number of episodes done and the number wanted.
+
+    Returns:
+        The folder. What an earlier shipment left there is gone.
+
+    Raises:
+        ValueError: A file is not there, is not what was evaluated, was not calibrated, or was
+            learned from what the scenario no longer is. Nothing was written then.
+    """
+    assessments = {}
+    for mode, file in files.items():
+        if not file.is_file():
+            raise ValueError(f"ship: there is no '{mode}' assessment at {file}: train both modes")
+        assessments[mode] = SafetyAssessment.load(file)
+        if PLAN not in assessments[mode].calibrations_:
+            raise ValueError(
+                f"ship: {file} holds no calibrated threshold: `drake-safety calibrate` chooses one;"
+                " evaluate after that"
+            )
+    hashes = {mode: file_hash(file) for mode, file in files.items()}
+    judged = results.entries.get(_HASHES)
+    if judged != hashes:
+        raise ValueError(
+            f"ship: the evaluation judged assessments with the SHA-256 {judged}, the files have "
+            f"{hashes}: `drake-safety evaluate` them as they are now"
+        )
+    _check_simulation(results, assessments, scenario)
+    stored = {
+        "calibrations": {
+            mode: [one.to_json() for one in assessment.calibrations_.values()]
+            for mode, assessment in assessments.items()
+        },
+        _VERDICTS: first_verdicts(
+            scenario,
+            assessments,
+            seed=int(results.entries["seed"]),
+            num_workers=num_workers,
+            progress=progress,
+        ),
+    }
+    folder = into / scenario.name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for file in files.values():
+        shutil.copyfile(file, folder / file.name)
+    store_results(
+        replace(results, entries=results.entries | stored),
+        folder / EVALUATION_FILE,
+        train_command=train_command,
+    )
+    return folder
+
+
+def check_shipped(folder: Path, scenario: Scenario, *, num_workers: int | None = None) -> Results:
+    """Checks that shipped assessments are those whose evaluation lies beside them.
+
+    Simulates the first fresh episodes of the evaluation anew.
+
+    Args:
+        folder: What `ship` wrote.
+        scenario: The scenario as it is now.
+        num_workers: Processes that simulate; one a core by default.
+
+    Returns:
+        What the evaluation found.
+
+    Raises:
+        ValueError: A file is another one, the scenario has changed, or the first episodes end or
+            are judged otherwise than is stored; says what differs.
+    """
+    results = read_results(folder / EVALUATION_FILE)
+    stored = results.entries
+    missing = [key for key in (_HASHES, _VERDICTS, "seed", "scenario_hash") if key not in stored]
+    if missing:
+        raise ValueError(f"{folder / EVALUATION_FILE} is of no shipped assessment: no {missing}")
+    files = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    hashes = {mode: file_hash(file) for mode, file in files.items()}
+    if hashes != stored[_HASHES]:
+        raise ValueError(
+            f"{folder}: the files have the SHA-256 {hashes}, what was evaluated had "
+            f"{stored[_HASHES]}"
+        )
+    assessments = {mode: SafetyAssessment.load(file) for mode, file in files.items()}
+    _check_simulation(results, assessments, scenario)
+    again = first_verdicts(
+        scenario,
+        assessments,
+        seed=int(stored["seed"]),
+        num_episodes=len(stored[_VERDICTS]),
+        num_workers=num_workers,
+    )
+    for before, now in zip(stored[_VERDICTS], again, strict=True):
+        if not _agree(before, now):
+            raise ValueError(
+                f"{folder}: fresh episode {now['episode']} of seed {stored['seed']} was "
+                f"{before}, and is now {now}"
+            )
+    return results
+
+
+def first_verdicts(
+    scenario: Scenario,
+    assessments: Mapping[str, SafetyAssessment],
+    *,
+    seed: int,
+    num_episodes: int = NUM_EPISODES,
+    num_workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Simulates the first fresh episodes of a seed, and asks what they were judged at k = 0.
+
+    Args:
+        scenario: The scenario.
+        assessments: Calibrated assessments, by mode.
+        seed: Of the episodes.
+        num_episodes: How many.
+        num_workers: Processes; one a core by default.
+        progress: Called with the number done and the number wanted.
+
+    Returns:
+        An entry an episode, of plain values: "episode", its index; "cause" of its end, "" if it
+        stayed safe; and by mode "verdict" and "safety_probability", Γ at k = 0. Without modes, if
+        it diverged and so has nothing to be judged.
+    """
+    episodes = run_episodes(
+        scenario,
+        num_episodes,
+        seed=seed,
+        num_workers=num_workers,
+        progress=progress,
+        **dict(scenario.task_class().judging_options),
+    )
+    entries: list[dict[str, Any]] = [
+        {"episode": episode.index, "cause": episode.cause} for episode in episodes
+    ]
+    segments = split(episodes, stride=1, discount=1.0, shortest=1)
+    first = segments.take(np.flatnonzero(segments.is_first))
+    for mode, assessment in assessments.items():
+        scorer = assessment_scorer(mode, assessment, "calibrated")
+        gamma = 1.0 - scorer.unsafe_score(first)
+        verdicts = assessment.calibrations_[PLAN].verdicts(gamma)
+        for position, verdict, value in zip(first.episode, verdicts, gamma, strict=True):
+            entries[position][mode] = {
+                "verdict": str(verdict),
+                "safety_probability": round(float(value), 6),
+            }
+    return entries
+
+
+def _check_simulation(
+    results: Results, assessments: Mapping[str, SafetyAssessment], scenario: Scenario
+) -> None:
+    now = scenario.simulation_hash()
+    hashes = {mode: one.info_.scenario_hash for mode, one in assessments.items()}
+    hashes["evaluation"] = str(results.entries.get("scenario_hash"))
+    for what, hash_ in hashes.items():
+        if hash_ != now:
+            raise ValueError(
+                f"scenario '{scenario.name}' has the hash {now[:12]}, '{what}' is of "
+                f"{hash_[:12]}: train, calibrate and evaluate again"
+            )
+
+
+def _agree(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    if before.keys() != now.keys():
+        return False
+    for key, value in now.items():
+        if not isinstance(value, Mapping):
+            if before[key] != value:
+                return False
+        elif before[key]["verdict"] != value["verdict"]:
+            return False
+        elif abs(before[key]["safety_probability"] - value["safety_probability"]) > _TOLERANCE:
+            return False
+    return True

@@ -1,0 +1,270 @@
+"""Trained assessments that come with the package are those whose evaluation lies beside them."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+import drake_safety
+from drake_safety import assessments
+from drake_safety.assessments import assessed_scenarios, load_assessment, shipped_folder
+from drake_safety.cli import main
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.evaluation.report.results import read_results
+from drake_safety.evaluation.shipping import NUM_EPISODES, check_shipped
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import file_hash
+from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import load_scenario
+from shuttle_task import SCENARIO
+
+NAME = "shuttling"
+MEGABYTE = 1e6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", assessed_scenarios())
+def test_what_is_shipped_is_what_was_evaluated(name):
+    folder = shipped_folder(name)
+    results = check_shipped(folder, load_scenario(name))
+    assert set(results.entries["assessment_sha256"]) == set(MODES)
+    assert len(results.entries["first_episodes"]) == NUM_EPISODES
+    assert {"command", "train_command", "seed", "versions"} <= set(results.entries)
+    assert any(key.endswith(".sharpened.unsafe_recall") for key in results.figures)
+    assert load_assessment(name).info_.scenario == name
+
+
+@pytest.mark.parametrize("name", assessed_scenarios())
+def test_what_is_shipped_is_small(name):
+    files = [path for path in shipped_folder(name).iterdir() if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 10 * MEGABYTE
+
+
+def call(patch, *arguments):
+    """Runs the command as a shell would; returns its exit code."""
+    patch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A scenario that seems to come with the package, and a whole run of it; for all to read."""
+    scenarios, folder = (tmp_path_factory.mktemp(name) for name in ("scenarios", "run"))
+    (scenarios / f"{NAME}.yaml").write_text(SCENARIO)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: scenarios)
+        scenario = load_scenario(NAME)
+        episodes = run_episodes(
+            scenario,
+            60,
+            num_workers=1,
+            path=episodes_folder(folder),
+            extra={"command": f"drake-safety train {NAME} --out /somebodys/own"},
+        )
+        for mode in MODES:
+            scenario.assessment.mode = mode
+            learned = SafetyAssessment(scenario.assessment).fit(episodes)
+            learned.save(assessment_file(folder, mode))
+        options = ("--assessment", folder, "--workers", 1)
+        calibrated = ("--episodes", 120, "--splits", 0, "--miss-rate", 0.1)
+        assert call(patch, "calibrate", NAME, *options, *calibrated) == 0
+        patch.setattr("drake_safety.evaluation.figure_style.save", lambda figure, path: [])
+        judged = ("--episodes", 30, "--calibration-episodes", 20, "--plane-step", 0)
+        assert call(patch, "evaluate", NAME, *options, *judged, "--other-hand", 0) == 0
+    return scenarios, folder
+
+
+@pytest.fixture(scope="module")
+def shipped(run, tmp_path_factory):
+    """Where the run's assessments were shipped to; for all to read."""
+    scenarios, folder = run
+    into = tmp_path_factory.mktemp("shipped")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: scenarios)
+        assert call(patch, "report", folder, "--ship", into) == 0
+    return into
+
+
+@pytest.fixture
+def scenario(run, monkeypatch):
+    monkeypatch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: run[0])
+    return load_scenario(NAME)
+
+
+@pytest.fixture
+def package(shipped, scenario, monkeypatch, tmp_path):
+    """The package seems to hold a copy of what was shipped; the working folder is an empty one."""
+    shutil.copytree(shipped, tmp_path / "package")
+    monkeypatch.setattr(assessments, "_FOLDER", tmp_path / "package")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "package"
+
+
+def other_assessment(run, like):
+    """Learned from the same episodes for a shorter time, with the thresholds of another."""
+    parameters = SafetyAssessment.load(like).parameters
+    parameters.epochs = 1
+    other = SafetyAssessment(parameters).fit(load_episodes(episodes_folder(run[1])))
+    other.calibrations_ = SafetyAssessment.load(like).calibrations_
+    return other
+
+
+@pytest.mark.slow
+def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped, scenario):
+    results = check_shipped(shipped / NAME, scenario, num_workers=1)
+    written = {path.name for path in (shipped / NAME).iterdir()}
+    assert written == {"sharpened.safetensors", "paper.safetensors", "evaluation.json"}
+    entries = results.entries
+    for mode in MODES:
+        files = [assessment_file(folder, mode) for folder in (run[1], shipped / NAME)]
+        assert {file_hash(file) for file in files} == {entries["assessment_sha256"][mode]}
+        assert {one["kind"] for one in entries["calibrations"][mode]} == {"plan", "motion"}
+    assert entries["train_command"] == f"drake-safety train {NAME} --out runs/own"
+    assert entries["seed"] == 1_000_000
+    assert results.figures["plans.sharpened.unsafe_recall"].n > 0
+
+
+@pytest.mark.slow
+def test_the_first_verdicts_are_those_of_the_first_fresh_episodes(run, shipped, scenario):
+    stored = read_results(shipped / NAME / "evaluation.json").entries["first_episodes"]
+    assert [entry["episode"] for entry in stored] == list(range(NUM_EPISODES))
+    # Those that `evaluate` kept, and the numbers as a user would get them.
+    (fresh,) = (run[1] / "fresh").glob("*-1000000")
+    for entry, episode in zip(stored, load_episodes(fresh), strict=False):
+        assert entry["cause"] == episode.cause
+        for mode in MODES:
+            assessment = SafetyAssessment.load(assessment_file(run[1], mode))
+            shown = episode.state if mode == "sharpened" else episode.true_state
+            said = assessment.predict_one(
+                shown[0],
+                episode.desired_preview[0],
+                episode.features[0] if mode == "sharpened" else None,
+            )
+            is_known = said.belief[2] <= 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
+            gamma = said.calibrated if is_known else 0.0
+            assert entry[mode]["safety_probability"] == pytest.approx(gamma, abs=1e-5)
+            (verdict,) = assessment.calibrations_["plan"].verdicts(np.array([gamma]))
+            assert entry[mode]["verdict"] == verdict
+
+
+@pytest.mark.slow
+def test_another_file_in_its_place_is_noticed(run, package, scenario):
+    file = assessment_file(package / NAME, "sharpened")
+    other_assessment(run, file).save(file)
+    with pytest.raises(ValueError, match=r"the files have the SHA-256 .* what was evaluated had"):
+        check_shipped(package / NAME, scenario, num_workers=1)
+    # Even under its own hash it does not say what was said.
+    evaluation = package / NAME / "evaluation.json"
+    content = json.loads(evaluation.read_text())
+    content["entries"]["assessment_sha256"]["sharpened"] = file_hash(file)
+    evaluation.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"fresh episode \d of seed 1000000 was .* and is now"):
+        check_shipped(package / NAME, scenario, num_workers=1)
+
+
+@pytest.mark.slow
+def test_a_file_too_few_and_a_scenario_that_changed_are_noticed(package, scenario):
+    scenario.episode_duration_s = 1.2
+    with pytest.raises(ValueError, match=r"has the hash .* train, calibrate and evaluate again"):
+        check_shipped(package / NAME, scenario, num_workers=1)
+    assessment_file(package / NAME, "paper").unlink()
+    with pytest.raises(ValueError, match="the files have the SHA-256"):
+        check_shipped(package / NAME, scenario, num_workers=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("gone", "there is no 'paper' assessment"),
+        ("uncalibrated", "holds no calibrated threshold: `drake-safety calibrate` chooses one"),
+        ("changed", "`drake-safety evaluate` them as they are now"),
+        ("untold", "does not tell what its assessments were trained with"),
+        ("unjudged", "holds no evaluation to store: `drake-safety evaluate` makes one"),
+    ],
+)
+def test_what_was_not_evaluated_as_it_is_is_not_shipped(
+    run, scenario, monkeypatch, capsys, tmp_path, change, message
+):
+    folder, into = tmp_path / "run", tmp_path / "into"
+    shutil.copytree(run[1], folder, ignore=shutil.ignore_patterns("fresh"))
+    file = assessment_file(folder, "paper")
+    learned = SafetyAssessment.load(file)
+    if change == "gone":
+        file.unlink()
+    elif change == "uncalibrated":
+        learned.calibrations_ = {}
+        learned.save(file)
+    elif change == "changed":
+        learned.beliefs_ = learned.beliefs_[:, ::-1]
+        learned.save(file)
+    elif change == "untold":
+        shutil.rmtree(episodes_folder(folder))
+    else:
+        (folder / "evaluation.json").unlink()
+    assert call(monkeypatch, "report", folder, "--ship", into) == 2
+    assert message in capsys.readouterr().out
+    assert not into.exists()
+
+
+@pytest.mark.slow
+def test_in_python_a_shipped_assessment_is_loaded_by_the_scenario_s_name(package, shipped):
+    assert assessed_scenarios() == [NAME]
+    for mode in MODES:
+        loaded = drake_safety.load_assessment(NAME, mode)
+        assert loaded.parameters.mode == mode
+        original = SafetyAssessment.load(assessment_file(shipped / NAME, mode))
+        np.testing.assert_array_equal(loaded.beliefs_, original.beliefs_)
+    with pytest.raises(ValueError, match=r"are \['paper', 'sharpened'\]; got 'blunt'"):
+        load_assessment(NAME, "blunt")
+    with pytest.raises(ValueError, match=r"of scenario 'pendulum' .* \['shuttling'\]: .*train"):
+        load_assessment("pendulum")
+
+
+PLANS = ("--episodes", 4, "--candidates", 2, "--workers", 1)
+
+
+@pytest.mark.slow
+def test_a_command_takes_the_shipped_assessment_and_says_so(package, monkeypatch, capsys, tmp_path):
+    before = {path: path.read_bytes() for path in package.rglob("*") if path.is_file()}
+    assert call(monkeypatch, "plan-study", NAME, *PLANS) == 0
+    told = capsys.readouterr().out
+    assert f"comes with the package, {package / NAME}" in told
+    assert "at most 10 % of unsafe episodes called safe" in told
+    calibrated = ("--episodes", 60, "--splits", 0, "--miss-rate", 0.2, "--workers", 1)
+    assert call(monkeypatch, "calibrate", NAME, *calibrated) == 0
+    # What is written goes to the working folder, never into the package.
+    assert {path: path.read_bytes() for path in package.rglob("*") if path.is_file()} == before
+    own = tmp_path / "work" / "runs" / f"{NAME}-shipped"
+    assert {"planning.json", "sharpened.safetensors", "paper.safetensors"} <= {
+        path.name for path in own.iterdir()
+    }
+    capsys.readouterr()
+    # One's own, given, wins.
+    assert call(monkeypatch, "plan-study", NAME, "--assessment", own, *PLANS) == 0
+    told = capsys.readouterr().out
+    assert "comes with the package" not in told
+    assert "at most 20 % of unsafe episodes called safe" in told
+
+
+@pytest.mark.slow
+def test_where_none_is_shipped_or_the_scenario_is_another_one_train_is_named(
+    package, monkeypatch, capsys, tmp_path
+):
+    for name, message in (
+        (tmp_path / "carrying.yaml", "no assessment of scenario 'carrying' comes with the package"),
+        (tmp_path / f"{NAME}.yaml", "was learned from a scenario with hash"),
+    ):
+        name.write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
+        for command in ("run", "play", "plan-study", "adapt", "calibrate"):
+            assert call(monkeypatch, command, name) == 2
+            (line,) = capsys.readouterr().out.splitlines()
+            assert message in line
+            assert "`drake-safety train` learns one, in a folder to be passed as --asse" in line
+    assert list((tmp_path / "work").iterdir()) == []
