@@ -9,7 +9,7 @@ from drake_safety import cli
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation import ablation_study
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.simulation import rollouts
+from drake_safety.simulation import pushed_motions, rollouts
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
@@ -89,6 +89,12 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, run):
     assert pushed["n"] == 30 and 0 < pushed["value"] < 1
     assert "Watching while it moves: pushes" in printed
     assert (folder / "monitoring.png").is_file()
+    # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
+    monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
+    monkeypatch.setattr(rollouts, "run_episode", None)
+    assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
+    again = json.loads((folder / "evaluation.json").read_text())
+    assert all(again[key] == report[key] for key in report if key.startswith("monitoring."))
 
 
 def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, run, tmp_path):

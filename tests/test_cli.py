@@ -20,7 +20,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
-from drake_safety.evaluation import figure_style
+from drake_safety.evaluation import figure_style, planning_study
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.balls import Throw
@@ -270,6 +270,12 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
     assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
     for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
         assert name in printed
+    # The motions are kept with the assessment: a second study simulates nothing.
+    monkeypatch.setattr(planning_study, "run_episode", None)
+    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path / "b") in (0, None)
+    again = json.loads((tmp_path / "b" / "planning.json").read_text())
+    assert all(again[key] == report[key] for key in report if key.startswith("planning."))
+    monkeypatch.undo()
     assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
     assert "0 is the training episodes' own seed" in capsys.readouterr().out
 

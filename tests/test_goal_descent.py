@@ -5,7 +5,7 @@ import pytest
 
 from drake_safety.learning.embedding import Embedding
 from drake_safety.learning.gradients import logit_gradient
-from drake_safety.simulation.goal_descent import descend_to_accepted
+from drake_safety.simulation.goal_descent import descend_to_accepted, suggest_goal
 from drake_safety.simulation.planning import nearest_accepted_goal
 from goal_field import BOX, FieldAssessment, GoalTask
 
@@ -99,3 +99,86 @@ def test_what_is_found_lies_in_the_region_and_a_flat_field_leads_nowhere():
     weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
     flat.embedding_ = Embedding(weights, num_margins=0)
     assert descend_to_accepted(GoalTask(), flat, GOAL, threshold=0.5).verdict is None
+
+
+def suggest(task, assessment, goal=GOAL, **options):
+    return suggest_goal(
+        task, assessment, goal, threshold=0.5, rng=np.random.default_rng(0), **options
+    )
+
+
+def search(task, assessment, goal=GOAL):
+    return nearest_accepted_goal(
+        task, assessment, goal, threshold=0.5, rng=np.random.default_rng(0)
+    )
+
+
+def distance(verdict, goal=GOAL):
+    return np.linalg.norm(verdict.goal - goal)
+
+
+def test_a_suggestion_is_as_near_as_that_of_the_search_with_fewer_goals_judged():
+    task, whole = GoalTask(), GoalTask()
+    found, searched = suggest(task, PlaneAssessment()), search(whole, PlaneAssessment())
+    assert distance(found) <= distance(searched) + 0.002
+    assert found.safety_probability >= 0.9
+    assert found.threshold == 0.5
+    assert task.num_resets < 0.6 * whole.num_resets
+
+
+def test_a_nearer_goal_than_the_gradient_leads_to_is_found():
+    class Pocketed(PlaneAssessment):
+        """The maps do not know of a ball of accepted goals, in another direction than down."""
+
+        def __init__(self):
+            super().__init__()
+            beyond = self._gamma
+            centre = GOAL + 0.2 * np.array([0.0, -0.6, 0.8])
+            self._gamma = lambda goals: np.where(
+                np.linalg.norm(goals - centre, axis=1) < 0.12, 1.0, beyond(goals)
+            )
+
+    led = descend_to_accepted(GoalTask(), Pocketed(), GOAL, threshold=0.5).verdict
+    found = suggest(GoalTask(), Pocketed())
+    assert distance(led) > 0.5
+    assert distance(found) == pytest.approx(0.08, abs=0.02)
+
+
+def test_without_a_gradient_a_suggestion_is_that_of_the_search():
+    headless, flat = PlaneAssessment(), PlaneAssessment()
+    weights = {k: v for k, v in headless.embedding_.weights.items() if "safety" not in k}
+    headless.embedding_ = Embedding(weights, num_margins=0)
+    weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
+    flat.embedding_ = Embedding(weights, num_margins=0)
+    expected = search(GoalTask(), PlaneAssessment()).goal
+    for assessment in (headless, flat):
+        np.testing.assert_array_equal(suggest(GoalTask(), assessment).goal, expected)
+
+
+def test_what_cannot_be_suggested_for_is_none_or_an_error():
+    task = GoalTask()
+    assert suggest(task, PlaneAssessment(), np.array([0.5, np.nan, 1.0])) is None
+    with pytest.raises(ValueError, match=r"three numbers \[m\]; got \[0.5, 0.0\]"):
+        suggest(task, PlaneAssessment(), GOAL[:2] * 0.0 + [0.5, 0.0])
+    with pytest.raises(ValueError, match=r"reserve is -0\.1, expected a value in \[0, 1\]"):
+        suggest(task, PlaneAssessment(), reserve=-0.1)
+    with pytest.raises(ValueError, match="three finite numbers"):
+        descend_to_accepted(task, PlaneAssessment(), GOAL * np.nan, threshold=0.5)
+    assert task.num_resets == 0
+
+
+def test_what_is_known_is_where_the_search_begins():
+    task, whole = GoalTask(), GoalTask()
+    known = search(whole, PlaneAssessment())
+    found = nearest_accepted_goal(
+        task,
+        PlaneAssessment(),
+        GOAL,
+        threshold=0.5,
+        rng=np.random.default_rng(1),
+        known=known,
+        num_rounds=1,
+        num_candidates=8,
+    )
+    assert distance(found) <= distance(known)
+    assert task.num_resets < 0.15 * whole.num_resets

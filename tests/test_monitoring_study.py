@@ -17,7 +17,7 @@ from drake_safety.evaluation.monitoring_study import (
 )
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.verdicts import alarm_table
-from drake_safety.simulation.pushed_motions import WatchedMotion
+from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
 

@@ -3,7 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drake_safety.evaluation import planning_study as planning_study_module
 from drake_safety.evaluation.planning_study import planning_study, run_trials
+from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.plan_choice import plan_inputs
+from drake_safety.simulation.rollouts import episode_rng
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING
 from goal_field import FieldAssessment
@@ -33,6 +37,60 @@ def test_every_candidate_of_every_start_is_executed(trials):
         # A slower one along the same line is safe where a faster one is.
         order = np.argsort(np.abs(trial.state[:, 3]))
         assert not np.any(np.diff(trial.is_safe[order].astype(int)) > 0)
+
+
+def test_what_gamma_sees_of_a_plan_is_what_it_would_see_when_it_chooses(trials):
+    loop = shuttling().make_loop()
+    context = loop.CreateDefaultContext()
+    loop.reset(context, episode_rng(9, 3))
+    rng = np.random.default_rng(np.random.SeedSequence(9, spawn_key=(3, 1)))
+    seen = plan_inputs(loop, context, loop.candidate_plans(context, rng, 5))
+    trial = trials[3]
+    for expected, found in zip(
+        seen, (trial.state, trial.desired_preview, trial.features), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_stopped_study_goes_on_with_the_motions_it_has(trials, tmp_path, monkeypatch):
+    num_run = 0
+    run_episode = planning_study_module.run_episode
+
+    def counted(*arguments, **options):
+        nonlocal num_run
+        num_run += 1
+        return run_episode(*arguments, **options)
+
+    def stop(done, total):
+        assert total == 200
+        if done >= 23:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(planning_study_module, "run_episode", counted)
+    options = {"num_plans": 5, "seed": 9, "num_workers": 1, "path": tmp_path}
+    with pytest.raises(KeyboardInterrupt):
+        run_trials(shuttling(), 40, **options, progress=stop)
+    assert 23 <= num_run < 30
+    # Starts 0 to 3 are whole, and the next one is not: it has its first candidates alone.
+    kept = [completed(tmp_path / f"plan-{i}") for i in range(5)]
+    assert sum(map(len, kept)) == num_run
+    assert kept[0] > kept[4]
+    calls = []
+    again = run_trials(shuttling(), 40, **options, progress=lambda *call: calls.append(call))
+    assert calls[0] == (sum(map(len, kept)), 200) and calls[-1] == (200, 200)
+    assert num_run == 200
+    for one, other in zip(again, trials, strict=True):
+        assert one.index == other.index
+        for name in ("state", "desired_preview", "features", "is_safe"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    # All are there, and fewer starts are the first of them.
+    fewer = run_trials(shuttling(), 7, **options)
+    assert num_run == 200
+    assert [trial.index for trial in fewer] == list(range(7))
+    defaults = load_episodes(tmp_path / "plan-0")
+    assert [e.is_safe for e in defaults] == [trial.is_safe[0] for trial in trials]
+    with pytest.raises(ValueError, match="holds episodes of another set"):
+        run_trials(shuttling(), 7, **{**options, "seed": 10})
 
 
 def test_who_knows_comes_all_the_way_to_hindsight_and_who_errs_does_not(trials):

@@ -258,7 +258,7 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
     """Everyone as a trigger of recovery."""
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
-    from drake_safety.simulation.pushed_motions import WatchedMotion
+    from drake_safety.simulation.watched_motion import WatchedMotion
 
     recovery = judged.scenario.parameters.recovery
     rules = trigger_rules(

@@ -10,16 +10,21 @@ from rich.table import Table
 
 from drake_safety.cli.console import new_table
 from drake_safety.cli.findings import Findings, Judged
+from drake_safety.cli.training_folder import fresh_episodes_folder
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.metrics import Figure
-    from drake_safety.simulation.pushed_motions import WatchedMotion
+    from drake_safety.simulation.watched_motion import WatchedMotion
+
+_PLANT = "actual"  # Which is pushed.
 
 
 def evaluate_pushes(
     judged: Judged, num_motions: int, num_calibration: int, *, seed: int, calibration_seed: int
 ) -> Findings:
     """Pushes a robot on its way to goals that it reaches safely by itself.
+
+    The motions are kept with the run, as other fresh sets are.
 
     Args:
         judged: What is judged.
@@ -30,12 +35,24 @@ def evaluate_pushes(
     """
     from drake_safety.simulation.pushed_motions import run_pushed_motions
 
-    run = partial(run_pushed_motions, judged.scenario, num_workers=judged.workers)
-    stages = judged.stages
-    test = run(num_motions, seed=seed, progress=partial(stages, "pushes"))
-    calibration = run(
-        num_calibration, seed=calibration_seed, progress=partial(stages, "calibration pushes")
-    )
+    scenario = judged.scenario
+    options = {**scenario.task_class().judging_options, "pushed": _PLANT}
+
+    def run(what: str, count: int, own_seed: int) -> list[WatchedMotion]:
+        return run_pushed_motions(
+            scenario,
+            count,
+            seed=own_seed,
+            variation=_PLANT,
+            num_workers=judged.workers,
+            path=fresh_episodes_folder(
+                judged.run_folder, scenario.simulation_hash(_PLANT), own_seed, options
+            ),
+            progress=partial(judged.stages, what),
+        )
+
+    test = run("pushes", num_motions, seed)
+    calibration = run("calibration pushes", num_calibration, calibration_seed)
     return evaluate_monitoring(judged, calibration, test)
 
 

@@ -19,15 +19,12 @@ from drake_safety.cli.console import (
     print_shipped,
 )
 from drake_safety.cli.provenance import command_line, versions
-from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
-
-_ROWS = {
-    "default": "default plan",
-    "any_candidate": "any candidate",
-    "chosen": "chosen by Γ",
-    "chosen_if_accepted": "chosen by Γ, if Γ accepts it",
-    "best_in_hindsight": "best in hindsight",
-}
+from drake_safety.cli.training_folder import (
+    assessment_folder,
+    goal_threshold,
+    load_assessment,
+    planning_folder,
+)
 
 
 def plan_study(
@@ -49,9 +46,12 @@ def plan_study(
 ) -> None:
     """Compare the default plan, the one with the highest Γ, and the best in hindsight.
 
-    Simulates every candidate plan of every start: EPISODES times CANDIDATES motions.
+    Simulates every candidate plan of every start: EPISODES times CANDIDATES motions. They are kept
+    in ASSESSMENT as they finish: a study that was stopped goes on when it is called again.
     """
-    from drake_safety.evaluation.planning_study import planning_study, run_trials
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.planning_figure import planning_figure
+    from drake_safety.evaluation.planning_study import PLANS, planning_study, run_trials
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -74,7 +74,8 @@ def plan_study(
             num_plans=candidates,
             seed=seed,
             num_workers=workers,
-            progress=partial(stages, "starts"),
+            path=planning_folder(learned.out, loaded.simulation_hash(), seed, candidates),
+            progress=partial(stages, "candidate motions"),
         )
     study = planning_study(gamma, trials, threshold=rule.threshold)
     table = new_table(
@@ -84,7 +85,7 @@ def plan_study(
         title=f"{episodes} fresh starts, {candidates} plans each; Γ accepts a plan of "
         f"{interval(study.figures['accepted'], 100, 1)} %",
     )
-    for key, name in _ROWS.items():
+    for key, name in PLANS.items():
         figure = study.figures[key]
         table.add_row(name, f"{figure.n}", interval(figure, 100, 1))
     report = {
@@ -108,3 +109,5 @@ def plan_study(
     if rule.remark:
         console.print(rule.remark, highlight=False, soft_wrap=True)
     print_path("figures", file)
+    for picture in save(planning_figure(study.figures), folder / "planning"):
+        print_path("picture", picture)

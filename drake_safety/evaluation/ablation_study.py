@@ -63,24 +63,42 @@ class AblationFile:
 
     @classmethod
     def open(cls, path: Path, entries: Mapping[str, Any]) -> AblationFile:
-        """Reads what an earlier run has left, if anything.
+        """Goes on with what an earlier run has left, if anything.
+
+        Args:
+            path: The file.
+            entries: What it shall say besides, in place of what it said.
 
         Raises:
             ValueError: The file is another's.
         """
-        opened = cls(path=path, entries=dict(entries))
-        if not path.is_file():
-            return opened
+        rows = cls.read(path).rows if path.is_file() else {}
+        return cls(path=path, entries=dict(entries), rows=rows)
+
+    @classmethod
+    def read(cls, path: Path) -> AblationFile:
+        """Reads a file as it is.
+
+        Raises:
+            ValueError: It is another's.
+            OSError: It is not there.
+        """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if content["schema"] != _SCHEMA:
-                raise ValueError(f"its schema is {content['schema']!r}")
-            for row in content["rows"]:
+            if content.pop("schema") != _SCHEMA:
+                raise ValueError(f"its schema is not '{_SCHEMA}'")
+            rows = {}
+            for row in content.pop("rows"):
                 figures = {key: _figure(value) for key, value in row.pop("figures").items()}
-                opened.rows[row["name"]] = AblationRow(**row, figures=figures)
+                rows[row["name"]] = AblationRow(**row, figures=figures)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} holds no ablation: {error!r}") from error
-        return opened
+        return cls(path=path, entries=content, rows=rows)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the ablation came to its end; one that was stopped has some of the rows."""
+        return "left_out" in self.entries
 
     def keep(self, row: AblationRow) -> None:
         """Adds a row and writes the file, first under a temporary name."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.simulation.pushed_motions import WatchedMotion
+from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUBLISHED = {"": "normalized", "_literal": "safety_probability", "_calibrated": "calibrated"}
 """What an assessment publishes, by what is appended to its name."""

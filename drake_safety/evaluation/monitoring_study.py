@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Figure, auc, median, proportion
-from drake_safety.simulation.pushed_motions import WatchedMotion
+from drake_safety.simulation.watched_motion import WatchedMotion
 
 FALSE_ALARM_SHARE = 0.05
 """Share of the calibration motions that stay safe in which everyone may give a false alarm."""

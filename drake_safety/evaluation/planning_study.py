@@ -4,24 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.simulation.plan_choice import plan_inputs
+from drake_safety.learning.segments import Episode
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import (
     batches,
     episode_rng,
+    episodes_info,
     parallel_map,
     run_episode,
     worker_loop,
 )
 from drake_safety.simulation.scenario import Scenario
 
+PLANS = {
+    "default": "default plan",
+    "any_candidate": "any candidate",
+    "chosen": "chosen by Γ",
+    "chosen_if_accepted": "chosen by Γ, if Γ accepts it",
+    "best_in_hindsight": "best in hindsight",
+}
+"""Who takes the plan, by the key of the share of safe motions."""
+
 _MAX_TRIES = 100
+_FLUSH_S = 30.0
 _CANDIDATES = 1  # Spawn key beside an episode's own: its candidates have a generator of their own.
 
 
@@ -31,7 +47,7 @@ class PlanTrial:
 
     Attributes:
         index: Number of the episode that begins so.
-        state: What Γ sees of the start, (M, n_s), the same M times.
+        state: What Γ sees of the start, (M, n_s).
         desired_preview: And of each plan, (M, H n_z).
         features: (M, n_f).
         is_safe: What came of each, (M,); the first is the default plan.
@@ -69,6 +85,7 @@ def run_trials(
     num_plans: int,
     seed: int,
     num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[PlanTrial]:
     """Simulates every candidate plan from fresh starts.
@@ -81,13 +98,17 @@ def run_trials(
         num_plans: Candidates of each, the default plan among them.
         seed: Seed of the starts.
         num_workers: Processes; as many as there are cores by default.
-        progress: Called with the number done and the number wanted.
+        path: Folder where motions are kept as they finish, as episodes by their start's number, a
+            folder a candidate: ``plan-0`` holds the default plans. Those that it already holds are
+            not simulated again. No Γ takes part in them: they serve any assessment.
+        progress: Called with the number of motions done and wanted.
 
     Raises:
-        ValueError: The task's plans cannot be chosen, there is but one, or hardly any start is
-            undisturbed.
+        ValueError: The task's plans cannot be chosen, there is but one, hardly any start is
+            undisturbed, or the folder holds other motions.
     """
-    loop = scenario.make_loop(**_judging_options(scenario))
+    options = _judging_options(scenario)
+    loop = scenario.make_loop(**options)
     context = loop.CreateDefaultContext()
     indices: list[int] = []
     index = 0
@@ -100,46 +121,102 @@ def run_trials(
                 f"planning: of {index} starts of scenario '{scenario.name}' {len(indices)} begin "
                 f"undisturbed; it takes {num_trials}"
             )
-    if len(loop.candidate_plans(context, np.random.default_rng(0), num_plans)) < 2:
+    if len(_candidates(loop, context, seed, indices[-1], num_plans)) < 2:
         raise ValueError(
             f"planning: scenario '{scenario.name}' has one plan from a start, and none to choose; "
             f"{loop.plan_variety}"
         )
-    trials: list[PlanTrial] = []
-    arguments = [(scenario, seed, num_plans, batch) for batch in batches(indices)]
-    for batch in parallel_map(_trial_batch, arguments, num_workers):
-        trials += batch
+    # What Γ sees of each start and candidate, and what came of it.
+    found: dict[tuple[int, int], _Motion] = {}
+    with ExitStack() as stack:
+        writers: list[EpisodeWriter] = []
+        if path is not None:
+            for i in range(num_plans):
+                folder = Path(path) / f"plan-{i}"
+                info = episodes_info(loop, seed, {**options, "plan": f"{i} of {num_plans}"})
+                # There is a writer a candidate: each makes shards the more rarely.
+                writer = EpisodeWriter(folder, info, flush_seconds=_FLUSH_S)
+                writers.append(stack.enter_context(writer))
+                kept = load_episodes(folder)
+                found |= {(one.index, i): _Motion.of(one) for one in kept if one.index in indices}
+        missing = {
+            index: [i for i in range(num_plans) if (index, i) not in found] for index in indices
+        }
+        done, total = len(found), num_trials * num_plans
         if progress is not None:
-            progress(len(trials), num_trials)
-    return sorted(trials, key=lambda trial: trial.index)
+            progress(done, total)
+        results = parallel_map(
+            _motion_batch,
+            [
+                (scenario, seed, num_plans, index, batch)
+                for index, candidates in missing.items()
+                for batch in batches(candidates)
+            ],
+            num_workers,
+        )
+        stack.callback(results.close)
+        for num_asked, episodes in results:
+            for candidate, episode in episodes:
+                found[episode.index, candidate] = _Motion.of(episode)
+                if writers:
+                    writers[candidate].append(episode)
+            done += num_asked
+            if progress is not None:
+                progress(done, total)
+    return [
+        _trial(index, [found[index, i] for i in range(num_plans) if (index, i) in found])
+        for index in indices
+    ]
 
 
 def _judging_options(scenario: Scenario) -> dict[str, Any]:
     return dict(scenario.task_class().judging_options)
 
 
-def _trial_batch(
-    scenario: Scenario, seed: int, num_plans: int, indices: list[int]
-) -> list[PlanTrial]:
-    loop = worker_loop(scenario, "nominal", _judging_options(scenario))
-    trials = []
-    for index in indices:
-        context = loop.CreateDefaultContext()
-        loop.reset(context, episode_rng(seed, index))
-        sequence = np.random.SeedSequence(seed, spawn_key=(index, _CANDIDATES))
-        plans = loop.candidate_plans(context, np.random.default_rng(sequence), num_plans)
-        state, preview, features = plan_inputs(loop, context, plans)
-        episodes = [run_episode(loop, index, seed=seed, plan=plan) for plan in plans]
-        trials.append(
-            PlanTrial(
-                index=index,
-                state=state,
-                desired_preview=preview,
-                features=features,
-                is_safe=np.array([episode.is_safe for episode in episodes]),
-            )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Motion:
+    """What a study takes from an executed plan: its first instant, and how it ended."""
+
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    is_safe: bool
+
+    @classmethod
+    def of(cls, episode: Episode) -> _Motion:
+        return cls(
+            state=episode.state[0].copy(),
+            desired_preview=episode.desired_preview[0].copy(),
+            features=episode.features[0].copy(),
+            is_safe=episode.is_safe,
         )
-    return trials
+
+
+def _trial(index: int, motions: list[_Motion]) -> PlanTrial:
+    return PlanTrial(
+        index=index,
+        state=np.array([motion.state for motion in motions]),
+        desired_preview=np.array([motion.desired_preview for motion in motions]),
+        features=np.array([motion.features for motion in motions]),
+        is_safe=np.array([motion.is_safe for motion in motions]),
+    )
+
+
+def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans: int) -> list[Any]:
+    """The plans of a start; its Context is reset to it."""
+    loop.reset(context, episode_rng(seed, index))
+    sequence = np.random.SeedSequence(seed, spawn_key=(index, _CANDIDATES))
+    return loop.candidate_plans(context, np.random.default_rng(sequence), num_plans)
+
+
+def _motion_batch(
+    scenario: Scenario, seed: int, num_plans: int, index: int, candidates: list[int]
+) -> tuple[int, list[tuple[int, Episode]]]:
+    """Executes some candidates of a start, as far as it has so many; and how many were asked."""
+    loop = worker_loop(scenario, "nominal", _judging_options(scenario))
+    plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
+    there = [i for i in candidates if i < len(plans)]
+    return len(candidates), [(i, run_episode(loop, index, seed=seed, plan=plans[i])) for i in there]
 
 
 def planning_study(

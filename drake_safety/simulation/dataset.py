@@ -27,7 +27,14 @@ from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["EpisodeWriter", "completed", "load_episodes", "read_info"]
+__all__ = [
+    "EpisodeWriter",
+    "completed",
+    "load_episodes",
+    "open_folder",
+    "read_info",
+    "replacing",
+]
 
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
@@ -76,14 +83,9 @@ class EpisodeWriter:
         self._pending: list[Episode] = []
         self._pending_since_s = 0.0
         self._is_closed = False
-        self.path.mkdir(parents=True, exist_ok=True)
         # Before info.json is written: a folder with shards but no info.json is refused.
         self._indices = completed(self.path)
-        if (self.path / _INFO_NAME).exists():
-            stored, _ = read_info(self.path)
-            _check_same_set(self.path, stored, info)
-        else:
-            _write_info(self.path, info, extra or {})
+        open_folder(self.path, info, extra)
         self._next_shard = 1 + max(
             (_shard_number(shard) for shard in _shards(self.path)), default=-1
         )
@@ -119,7 +121,7 @@ class EpisodeWriter:
         table = _to_table(self._pending, self.info)
         columns = [f"{name}.list.element" for name, width in _widths(self.info).items() if width]
         final = self.path / f"episodes-{self._next_shard:05d}.parquet"
-        with _replacing(final) as temporary:
+        with replacing(final) as temporary:
             # Byte streams of float64 compress better split by significance; checksums tell a
             # damaged page from a whole one.
             pq.write_table(
@@ -148,6 +150,28 @@ class EpisodeWriter:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def open_folder(
+    path: str | os.PathLike[str], info: EpisodesInfo, extra: Mapping[str, Any] | None = None
+) -> None:
+    """Makes the folder of a set, or checks that the one that is there is of the same set.
+
+    Args:
+        path: The folder.
+        info: What the set shares.
+        extra: What else a new folder's ``info.json`` holds, as JSON types.
+
+    Raises:
+        ValueError: The folder holds another set, or is not such a folder.
+    """
+    path = Path(path)
+    path.mkdir(parents=True, exist_ok=True)
+    if (path / _INFO_NAME).exists():
+        stored, _ = read_info(path)
+        _check_same_set(path, stored, info)
+    else:
+        _write_info(path, info, extra or {})
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
@@ -217,8 +241,12 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
 
 
 @contextlib.contextmanager
-def _replacing(final: Path) -> Iterator[Path]:
-    """A temporary file beside `final`, renamed to it on success and removed on any exception."""
+def replacing(final: Path) -> Iterator[Path]:
+    """A temporary file beside a final one, renamed to it on success and removed on any exception.
+
+    Args:
+        final: The file that is to be there, whole, or not at all.
+    """
     # Readers of whole folders (pyarrow, pandas) skip names that start with a dot.
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     try:
@@ -241,7 +269,7 @@ def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> Non
         text = json.dumps(content, indent=2, ensure_ascii=False)
     except TypeError as error:
         raise ValueError(f"{path}: info and extra must be made of JSON types: {error}") from error
-    with _replacing(path / _INFO_NAME) as temporary:
+    with replacing(path / _INFO_NAME) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +15,18 @@ from drake_safety.simulation.planning import (
     RESERVE,
     GoalVerdict,
     assess_goals,
+    checked_goal,
     goal_inputs,
+    nearest_accepted_goal,
     target_box,
+    threshold_with_reserve,
 )
 
 _DIFFERENCE_M = 1e-3  # Between the goals that tell how inputs change with them.
 _LONGEST_STEP_M = 0.15  # The logit is nearly straight over that much.
 _MARGIN = 0.5  # By how much the logit that is aimed at falls where Γ does not follow.
 _LARGEST_LOGIT = 8.0
+_ROUNDS_FROM_KNOWN = 4  # Of the search, once the gradient has found an accepted goal.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,7 +60,8 @@ def descend_to_accepted(
     falls as long as Γ, which decides, does not accept.
 
     It finds the nearest accepted goal of one basin, where
-    :func:`~drake_safety.simulation.planning.nearest_accepted_goal` searches everywhere.
+    :func:`~drake_safety.simulation.planning.nearest_accepted_goal` searches everywhere;
+    :func:`suggest_goal` does both.
 
     Args:
         loop: A closed loop whose plans have a goal.
@@ -67,10 +73,13 @@ def descend_to_accepted(
         resolution_m: Spacing of the grid that the goal found lies on [m].
 
     Raises:
-        ValueError: The loop's plans have no goal, or the maps no safety head.
+        ValueError: The loop's plans have no goal, the maps no safety head, the goal is not three
+            finite numbers, or the reserve is not in [0, 1].
     """
-    goal, box = np.asarray(goal, dtype=float), target_box(loop)
-    stricter = threshold + reserve * max(1.0 - threshold, 0.0)
+    stricter = threshold_with_reserve(threshold, reserve)
+    goal, box = checked_goal(goal), target_box(loop)
+    if not np.isfinite(goal).all():
+        raise ValueError(f"descent: a goal is three finite numbers [m]; got {goal.tolist()}")
     bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
     share = min(max(stricter, 1.0 - bound), bound)
     aim = math.log((1.0 - share) / share)
@@ -119,6 +128,59 @@ def descend_to_accepted(
                 refused = between
         best = replace(best, threshold=threshold)
     return Descent(verdict=best, num_judged=num_judged)
+
+
+def suggest_goal(
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    *,
+    threshold: float,
+    rng: np.random.Generator,
+    reserve: float = RESERVE,
+    num_candidates: int = 64,
+    resolution_m: float = 1e-3,
+) -> GoalVerdict | None:
+    """The goal nearest to a given one that is accepted with reserve: by gradient, then by search.
+
+    The gradient finds an accepted goal with few goals judged, often not the nearest one: it follows
+    one basin, and Γ, which decides, not exactly. A search no farther than that, in all directions,
+    takes fewer goals than one that knows none yet. Where the gradient finds nothing, or the maps
+    have none to follow, the search is the whole one.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        assessment: What was learned from its episodes.
+        goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
+        threshold: From which Γ, calibrated, on a goal is safe.
+        rng: Source of the candidates.
+        reserve: Share of the way from the threshold to certainty, in [0, 1].
+        num_candidates: That the search judges at a time, half as many where the gradient has found
+            an accepted goal.
+        resolution_m: Spacing of the grid that the goal found lies on [m].
+
+    Returns:
+        The verdict on it, by the threshold itself; None when the goal is not finite, or nothing in
+        the region is accepted with reserve.
+
+    Raises:
+        ValueError: The loop's plans have no goal, the goal is not three numbers, or the reserve is
+            not in [0, 1].
+    """
+    options: dict[str, Any] = {
+        "threshold": threshold,
+        "reserve": reserve,
+        "resolution_m": resolution_m,
+    }
+    known = None
+    if np.isfinite(checked_goal(goal)).all() and assessment.embedding_.has_safety_head:
+        known = descend_to_accepted(loop, assessment, goal, **options).verdict
+    if known is not None:
+        options |= {"known": known, "num_rounds": _ROUNDS_FROM_KNOWN}
+        num_candidates = max(num_candidates // 2, 2)
+    return nearest_accepted_goal(
+        loop, assessment, goal, rng=rng, num_candidates=num_candidates, **options
+    )
 
 
 def _far(verdict: GoalVerdict, goal: np.ndarray) -> float:

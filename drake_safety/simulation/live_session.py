@@ -15,6 +15,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.goal_descent import suggest_goal
 from drake_safety.simulation.live_panel import (
     INK_RGB,
     RECOVERY_RGB,
@@ -25,7 +26,6 @@ from drake_safety.simulation.live_panel import (
 from drake_safety.simulation.planning import (
     GoalVerdict,
     assess_goal,
-    nearest_accepted_goal,
     target_box,
 )
 from drake_safety.simulation.rollouts import episode_rng
@@ -373,7 +373,7 @@ class LiveGoals(LiveSession):
         )
         self.nearest = None
         if is_thorough and not verdict.is_accepted:
-            self.nearest = nearest_accepted_goal(
+            self.nearest = suggest_goal(
                 self.loop,
                 self.assessment,
                 goal,

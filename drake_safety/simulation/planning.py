@@ -25,7 +25,6 @@ _GROWTH = 1.6  # From one ball of candidates to the next.
 _LAST_CHANCE = (
     16  # Times as many candidates, all over the region, when no ball had an accepted one.
 )
-_ROUNDS = 6  # Of candidates about the best one that was found.
 _SPREAD = 0.25  # How far these lie from it, as a share of its distance to the goal.
 
 
@@ -119,7 +118,7 @@ def assess_goal(
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
     """
-    goal = _checked(goal)
+    goal = checked_goal(goal)
     box = target_box(loop)
     if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
         (verdict,) = assess_goals(
@@ -224,7 +223,9 @@ def nearest_accepted_goal(
     rng: np.random.Generator,
     reserve: float = RESERVE,
     num_candidates: int = 64,
+    num_rounds: int = 6,
     resolution_m: float = 1e-3,
+    known: GoalVerdict | None = None,
 ) -> GoalVerdict | None:
     """The goal nearest to a given one that is accepted with reserve, as far as a search finds it.
 
@@ -245,7 +246,10 @@ def nearest_accepted_goal(
         reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
             is accepted.
         num_candidates: That are judged at a time.
+        num_rounds: How often candidates are drawn about the best one that was found.
         resolution_m: Spacing of the grid of candidates [m].
+        known: What is accepted with reserve already: balls grow only as far as that lies, with half
+            as many candidates, and the whole region is not searched.
 
     Returns:
         The verdict on it, by the threshold itself; None when the goal is not finite, or nothing in
@@ -254,14 +258,12 @@ def nearest_accepted_goal(
     Raises:
         ValueError: The reserve is not in [0, 1], or the goal is not three numbers.
     """
-    if not 0.0 <= reserve <= 1.0:
-        raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
-    goal = _checked(goal)
+    stricter = threshold_with_reserve(threshold, reserve)
+    goal = checked_goal(goal)
     if not np.isfinite(goal).all():
         return None
     box = target_box(loop)
     centre = np.clip(goal, *box)
-    stricter = threshold + reserve * max(1.0 - threshold, 0.0)
 
     def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
         on_grid = np.unique(np.round(candidates / resolution_m), axis=0) * resolution_m
@@ -273,16 +275,21 @@ def nearest_accepted_goal(
         return min(accepted, key=lambda one: _distance(one.goal, goal), default=None)
 
     best = nearest_of(centre[None])
-    radius, diagonal = _FIRST_RADIUS_M, _distance(*box)
-    while best is None and radius < diagonal:
-        best = nearest_of(centre + radius * _in_unit_ball(rng, num_candidates))
+    radius, farthest = _FIRST_RADIUS_M, _distance(*box)
+    num_in_ball = num_candidates
+    if known is not None:
+        farthest, num_in_ball = _distance(known.goal, goal), max(num_candidates // 2, 1)
+    while best is None and radius < farthest:
+        best = nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
         radius *= _GROWTH
+    if known is not None and (best is None or _distance(best.goal, goal) > farthest):
+        best = known
     if best is None:
         best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
     if best is None:
         return None
 
-    for _ in range(_ROUNDS):
+    for _ in range(num_rounds):
         best = _bisected(best, centre, nearest_of, resolution_m)
         distance = _distance(best.goal, goal)
         if distance < resolution_m:
@@ -295,6 +302,21 @@ def nearest_accepted_goal(
         if found is not None and _distance(found.goal, goal) < distance:
             best = found
     return replace(best, threshold=threshold)
+
+
+def threshold_with_reserve(threshold: float, reserve: float) -> float:
+    """What Γ has to reach for a goal to be suggested.
+
+    Args:
+        threshold: From which Γ, calibrated, on a goal is safe.
+        reserve: Share of the way from the threshold to certainty, in [0, 1].
+
+    Raises:
+        ValueError: The reserve is not in [0, 1].
+    """
+    if not 0.0 <= reserve <= 1.0:
+        raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
+    return threshold + reserve * max(1.0 - threshold, 0.0)
 
 
 def _bisected(
@@ -326,7 +348,12 @@ def target_box(loop: ClosedLoop) -> np.ndarray:
     return box
 
 
-def _checked(goal: np.ndarray) -> np.ndarray:
+def checked_goal(goal: np.ndarray) -> np.ndarray:
+    """A goal as an array, (3,) [m]; it need not be finite.
+
+    Raises:
+        ValueError: It is not three numbers.
+    """
     goal = np.asarray(goal, dtype=float)
     if goal.shape != (3,):
         raise ValueError(f"a target is three numbers [m]; got {goal.tolist()}")

@@ -1,96 +1,28 @@
-"""Pushed motions: what somebody who watches a robot sees of a motion, and when it went wrong."""
+"""Pushed motions: motions that are safe by themselves, carried out undisturbed and pushed."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
-import numpy as np
+from os import PathLike
+from typing import Any
 
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
+from drake_safety.simulation.goal_motion import run_to_goal
+from drake_safety.simulation.motion_files import MotionFolder, Pair
 from drake_safety.simulation.rollouts import (
     Progress,
     batches,
     episode_rng,
+    episodes_info,
     parallel_map,
     worker_loop,
 )
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.throws import ThrowLog
+from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 
-_SEEN = ("state", "desired_preview", "features")
 _MAX_TRIES = 50
 
 
-@dataclass(kw_only=True, eq=False)
-class WatchedMotion:
-    """One motion, pushed or not: rows of what a monitor sees, and what came of it.
-
-    Attributes:
-        index: Number of the motion in its set; what begins alike has the same.
-        push_time_s: When the push begins [s]; infinite if nobody pushes.
-        time_s: [s], (N,).
-        state: (N, n_s), as the assessor sees it.
-        desired_preview: (N, H n_z).
-        features: (N, n_f).
-        margins: (N, n_c), of the true state.
-        leave_time_s: When the robot left its safe set [s]; infinite if it did not.
-        fall_time_s: When it fell [s]; infinite if it did not.
-    """
-
-    index: int
-    push_time_s: float
-    time_s: np.ndarray
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    margins: np.ndarray
-    leave_time_s: float
-    fall_time_s: float
-
-    @property
-    def has_left(self) -> bool:
-        """Whether the robot left its safe set."""
-        return math.isfinite(self.leave_time_s)
-
-    @property
-    def has_fallen(self) -> bool:
-        """Whether the robot fell."""
-        return math.isfinite(self.fall_time_s)
-
-    @classmethod
-    def of_throw(cls, log: ThrowLog) -> WatchedMotion:
-        """A throw without recovery; the push is the ball's touch."""
-        return cls(
-            index=log.index,
-            push_time_s=log.throw.time_s,
-            time_s=log.time_s,
-            state=log.state,
-            desired_preview=log.desired_preview,
-            features=log.features,
-            margins=log.margins,
-            leave_time_s=log.leave_time_s,
-            fall_time_s=log.fall_time_s,
-        )
-
-    @classmethod
-    def of_goal_motion(cls, index: int, motion: GoalMotion) -> WatchedMotion:
-        """A motion to a goal that was run with the ports that a monitor sees."""
-        return cls(
-            index=index,
-            push_time_s=math.inf if motion.push is None else motion.push.time_s,
-            time_s=motion.time_s,
-            margins=motion.margins,
-            leave_time_s=motion.leave_time_s,
-            fall_time_s=motion.fall_time_s,
-            **{name: motion.extra[name] for name in _SEEN},
-        )
-
-
-def run_pushed_motion(
-    loop: ClosedLoop, index: int, *, seed: int
-) -> tuple[WatchedMotion, WatchedMotion]:
+def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> Pair:
     """Carries out a random motion that is safe by itself, and once more with a random push.
 
     A goal that is not safe by itself is drawn again: who pushes a robot on its way has let it
@@ -117,11 +49,11 @@ def run_pushed_motion(
     for _ in range(_MAX_TRIES):
         goal = rng.uniform(*box)
         calm = run_to_goal(
-            loop, goal, duration_s=duration_s, seed=noise_seed, ports=_SEEN, until_unsafe=True
+            loop, goal, duration_s=duration_s, seed=noise_seed, ports=SEEN, until_unsafe=True
         )
         if not calm.has_left:
             pushed = run_to_goal(
-                loop, goal, push=push, duration_s=duration_s, seed=noise_seed, ports=_SEEN
+                loop, goal, push=push, duration_s=duration_s, seed=noise_seed, ports=SEEN
             )
             return (
                 WatchedMotion.of_goal_motion(index, calm),
@@ -140,6 +72,7 @@ def run_pushed_motions(
     seed: int,
     variation: str = "actual",
     num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> list[WatchedMotion]:
     """Carries out random safe motions, each undisturbed and pushed, in worker processes.
@@ -150,22 +83,46 @@ def run_pushed_motions(
         seed: Seed of the set.
         variation: Which plant.
         num_workers: Processes; as many as there are cores by default.
+        path: Folder where pairs are kept as they finish; those of the same set that it already
+            holds are not simulated again.
         progress: Called with the number done and the number wanted.
+
+    Raises:
+        ValueError: The folder holds another set or a damaged pair, the task has no goals or
+            pushes, or hardly any goal is safe.
     """
-    arguments = [(scenario, variation, seed, batch) for batch in batches(list(range(num_motions)))]
-    pairs: dict[int, tuple[WatchedMotion, WatchedMotion]] = {}
+    pairs: dict[int, Pair] = {}
+    folder = None
+    if path is not None:
+        options = _judging_options(scenario)
+        loop = scenario.make_loop(variation, **options)
+        folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
+        pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
+    remaining = [index for index in range(num_motions) if index not in pairs]
     if progress is not None:
-        progress(0, num_motions)
-    for batch in parallel_map(_motion_batch, arguments, num_workers):
-        pairs |= batch
-        if progress is not None:
-            progress(len(pairs), num_motions)
+        progress(len(pairs), num_motions)
+    results = parallel_map(
+        _motion_batch,
+        [(scenario, variation, seed, batch) for batch in batches(remaining)],
+        num_workers,
+    )
+    try:
+        for batch in results:
+            for pair in batch:
+                pairs[pair[0].index] = pair
+                if folder is not None:
+                    folder.save(pair)
+            if progress is not None:
+                progress(len(pairs), num_motions)
+    finally:
+        results.close()
     return [motion for index in sorted(pairs) for motion in pairs[index]]
 
 
-def _motion_batch(
-    scenario: Scenario, variation: str, seed: int, indices: list[int]
-) -> dict[int, tuple[WatchedMotion, WatchedMotion]]:
-    options = dict(scenario.task_class().judging_options)
-    loop = worker_loop(scenario, variation, options)
-    return {index: run_pushed_motion(loop, index, seed=seed) for index in indices}
+def _judging_options(scenario: Scenario) -> dict[str, Any]:
+    return dict(scenario.task_class().judging_options)
+
+
+def _motion_batch(scenario: Scenario, variation: str, seed: int, indices: list[int]) -> list[Pair]:
+    loop = worker_loop(scenario, variation, _judging_options(scenario))
+    return [run_pushed_motion(loop, index, seed=seed) for index in indices]

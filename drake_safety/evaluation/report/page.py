@@ -6,7 +6,7 @@ import base64
 import gzip
 import json
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
@@ -24,6 +24,7 @@ from drake_safety.evaluation.report.cell_map import (
     safe_share,
 )
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
+from drake_safety.evaluation.report.studies import Study, ablation_section, planning_section
 from drake_safety.evaluation.report.tables import Column, Table
 from drake_safety.evaluation.report.verdicts import other_figures, verdict_tables
 from drake_safety.learning.assessment import SafetyAssessment
@@ -62,8 +63,15 @@ def write_report(
         mode: _map(run, assessment, folder, angular_constraints)
         for mode, assessment in run.assessments.items()
     }
+    studies = _studies(run)
+    # Drawn from what the section tells, they cannot be older than its table.
+    drawn = {key: save(study.picture, folder / "figures" / key) for key, study in studies.items()}
+    for key in drawn:
+        run.pictures.pop(key, None)
+        run.pictures.pop(f"{key}_quick", None)
     pictures = _pictures(run, folder)
-    for table in [*tables, *(table for group in others.values() for table in group)]:
+    groups = [*others.values(), *(study.tables for study in studies.values())]
+    for table in [*tables, *(table for group in groups for table in group)]:
         _save_table(table, folder / "tables")
     page = (
         _environment()
@@ -81,6 +89,10 @@ def write_report(
             calibration=others.pop("calibration", []),
             others=others,
             pictures=pictures,
+            studies=[
+                {"study": study, "picture": _shown(key, {p.suffix: p for p in drawn[key]})}
+                for key, study in studies.items()
+            ],
             motions=_motions(run, pictures),
             maps=maps,
             all_figures=[
@@ -216,6 +228,15 @@ def _digits(unit: str) -> int:
     return {"%": 1, "=": 2}.get(unit, 3)
 
 
+def _studies(run: Run) -> dict[str, Study]:
+    found = []
+    if run.planning is not None:
+        found.append(planning_section(run.planning))
+    if run.ablation is not None:
+        found.append(ablation_section(run.ablation))
+    return {study.key: study for study in found}
+
+
 def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
     """Copies every picture, and gives what the page shows of each, by name."""
     known = _words("words.yaml")["pictures"]
@@ -224,29 +245,32 @@ def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
     order = {stem: i for i, stem in enumerate(known)}
     names = sorted(run.pictures, key=lambda name: (order.get(Path(name).name, len(order)), name))
     for name in names:
-        paths, stem = run.pictures[name], Path(name).name
         flat = name.replace("/", "_")
-        for suffix, path in paths.items():
+        for suffix, path in run.pictures[name].items():
             shutil.copyfile(path, folder / "figures" / f"{flat}{suffix}")
-        svg, png = paths.get(".svg"), paths.get(".png")
-        is_light = svg is not None and (png is None or svg.stat().st_size <= _MAX_SVG_BYTES)
-        chosen = svg if is_light else png
-        if chosen is None:
-            continue
-        kind = "svg+xml" if chosen.suffix == ".svg" else "png"
-        content = base64.b64encode(chosen.read_bytes()).decode("ascii")
-        words = known.get(stem, {})
-        is_calibration = any(word in stem for word in ("calibration", "reliability"))
-        shown[name] = {
-            "name": name,
-            "stem": stem,
-            "title": words.get("title", spoken(stem).capitalize()),
-            "caption": words.get("caption", ""),
-            "source": f"data:image/{kind};base64,{content}",
-            "files": [f"figures/{flat}{suffix}" for suffix in paths],
-            "section": "calibration" if is_calibration else "verdicts",
-        }
+        shown[name] = _shown(name, run.pictures[name])
     return shown
+
+
+def _shown(name: str, paths: Mapping[str, Path]) -> dict[str, Any]:
+    """What the page shows of a picture, whose files by suffix lie among the report's figures."""
+    stem, flat = Path(name).name, name.replace("/", "_")
+    svg, png = paths.get(".svg"), paths.get(".png")
+    is_light = svg is not None and (png is None or svg.stat().st_size <= _MAX_SVG_BYTES)
+    chosen = svg if svg is not None and is_light else paths[".png"]
+    kind = "svg+xml" if chosen.suffix == ".svg" else "png"
+    content = base64.b64encode(chosen.read_bytes()).decode("ascii")
+    words = _words("words.yaml")["pictures"].get(stem, {})
+    is_calibration = any(word in stem for word in ("calibration", "reliability"))
+    return {
+        "name": name,
+        "stem": stem,
+        "title": words.get("title", spoken(stem).capitalize()),
+        "caption": words.get("caption", ""),
+        "source": f"data:image/{kind};base64,{content}",
+        "files": [f"figures/{flat}{suffix}" for suffix in paths],
+        "section": "calibration" if is_calibration else "verdicts",
+    }
 
 
 def _motions(run: Run, pictures: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:

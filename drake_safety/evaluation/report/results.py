@@ -42,7 +42,7 @@ def read_evaluation(path: Path) -> Results:
         ValueError: It is none.
     """
     content = _read(path)
-    figures = {key: _figure(value) for key, value in content.items() if _is_figure(value)}
+    figures = {key: as_figure(value) for key, value in content.items() if is_figure(value)}
     if not figures:
         raise ValueError(f"{path} is no evaluation: no key of it holds a figure")
     return Results(
@@ -66,7 +66,7 @@ def read_results(path: Path) -> Results:
     try:
         return Results(
             figures={
-                key: _figure(dict(zip(("value", "low", "high", "n"), row, strict=True)))
+                key: as_figure(dict(zip(("value", "low", "high", "n"), row, strict=True)))
                 for key, row in content["figures"].items()
             },
             entries=dict(content["entries"]),
@@ -118,11 +118,13 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _is_figure(value: Any) -> bool:
+def is_figure(value: Any) -> bool:
+    """Whether it is what :meth:`Figure.to_json` makes of a figure."""
     return isinstance(value, Mapping) and set(value) == {"value", "low", "high", "n"}
 
 
-def _figure(fields: Mapping[str, Any]) -> Figure:
+def as_figure(fields: Mapping[str, Any]) -> Figure:
+    """A figure from what :meth:`Figure.to_json` made of it."""
     value, low, high = (
         math.nan if fields[name] is None else float(fields[name])
         for name in ("value", "low", "high")

@@ -25,8 +25,8 @@ class Column:
         key: The last part of a figure's key.
         title: Its heading.
         meaning: A sentence for somebody who has not read the paper.
-        unit: "", "%", "ms", "s", "of" for counts out of n, "/h" for a rate, or "=" for what has no
-            interval.
+        unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
+            rate, or "=" for what has no interval.
         better: 1 where more is better, -1 where less is, 0 where neither.
         digits: After the decimal point.
     """
@@ -52,6 +52,8 @@ class Column:
             return f"{count} of {figure.n}"
         if math.isinf(figure.value):
             return "never"
+        if self.unit == "n":
+            return f"{figure.value:.0f}"
         space = "" if self.unit in ("", "=", "/h") else f" {self.unit}"
         return f"{self._scale * figure.value:.{self.digits}f}{space}"
 
