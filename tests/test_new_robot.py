@@ -1,6 +1,8 @@
 """`new` and `check`: from a URDF alone to a robot that stands, and mistakes told one by one."""
 
+import re
 import shutil
+import xml.etree.ElementTree as ElementTree
 
 import pytest
 import yaml
@@ -10,6 +12,7 @@ from drake_safety.cli import app
 from drake_safety.simulation.robot_template import write_robot
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
+from urdf_files import stl
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +57,15 @@ def test_numbers_scale_with_the_robot(spider):
     assert spider.sizes.mass_kg == pytest.approx(6.0 + 6 * 0.7)
 
 
+def test_the_balls_of_a_demonstration_are_as_heavy_as_those_it_learns_from(spider):
+    parameters = yaml.safe_load((spider.folder / "balancing.yaml").read_text())["parameters"]
+    weak, strong = parameters["demonstration"]
+    assert weak["mass_kg"] * weak["speed_m_s"] < 0.5 * strong["mass_kg"] * strong["speed_m_s"]
+    for key in ("mass_kg", "speed_m_s"):
+        low, high = parameters["push"][key]
+        assert low <= weak[key] < strong[key] < high
+
+
 def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
     write_porter(tmp_path)
     written = write_robot("carrier", tmp_path / "porter.urdf", "reaching", tmp_path / "carrier")
@@ -76,6 +88,7 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
         ({"joint_gains": {"lift_.*": {"stiffness": 50.0}}}, "servo gains", "'swing_0'"),
         ({"effort_limits": {".*": 0.01}}, "effort against gravity", "of 0.0 N·m"),
         ({"effort_limits": {}}, "motors", "have none"),
+        ({"effort_limits": {}}, "diagram", "have no motor: 'spider.urdf' has no transmission"),
     ],
 )
 def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(own, change, item, message):
@@ -83,6 +96,90 @@ def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(own, change
     found = problems(own / "balancing.yaml")
     assert message in found[item].message
     assert found[item].remedy
+
+
+def test_a_base_that_no_ball_can_hit_is_found_before_one_is_thrown(own):
+    urdf = own / "spider.urdf"
+    root = ElementTree.parse(urdf).getroot()
+    body = root.find("link[@name='body']")
+    body.remove(body.find("collision"))
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    found = problems(own / "balancing.yaml")
+    assert list(found) == ["shape of the base"]
+    assert "base 'body' has no collision geometry" in found["shape of the base"].message
+    assert "to link 'body' in spider.urdf" in found["shape of the base"].remedy
+
+
+def test_a_motor_without_a_limit_is_found(own):
+    robot = yaml.safe_load((own / "robot.yaml").read_text())
+    limits = {name: limit for name, limit in robot["effort_limits"].items() if name != "knee_2"}
+    urdf = own / "spider.urdf"
+    root = ElementTree.parse(urdf).getroot()
+    limit = root.find("joint[@name='knee_2']/limit")
+    limit.attrib.pop("effort")
+    motor = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type>"
+        '<joint name="knee_2"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>'
+        '<actuator name="knee_2"/></transmission>'
+    )
+    root.append(ElementTree.fromstring(motor))
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    edited(own / "robot.yaml", effort_limits=limits)
+    found = problems(own / "balancing.yaml")
+    assert list(found) == ["effort limits"]
+    assert "['knee_2'] have none" in found["effort limits"].message
+
+
+def urdf_of_spider(folder, change):
+    """The spider's URDF, changed as text."""
+    write_hexapod(folder)
+    urdf = folder / "hexapod.urdf"
+    text = urdf.read_text()
+    urdf.write_text(change(text))
+    assert urdf.read_text() != text
+    return urdf
+
+
+def test_a_urdf_without_effort_limits_gets_estimates_to_be_asked_for(tmp_path):
+    urdf = urdf_of_spider(tmp_path, lambda text: text.replace('effort="40"', ""))
+    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
+    limits = yaml.safe_load((written.folder / "robot.yaml").read_text())["effort_limits"]
+    assert len(limits) == 18 and min(limits.values()) > 0
+    assert sum("the largest torque of joint" in what for what in written.asked) == 18
+    assert problems(written.folder / "balancing.yaml") == {}
+
+
+def test_a_base_whose_shape_is_a_mesh_collides_as_its_box(tmp_path):
+    stl(tmp_path / "trunk.stl", [[-0.2, -0.2, -0.04], [0.2, 0.2, 0.04], [0.2, -0.2, 0.04]])
+    sphere = '<geometry><sphere radius="0.05"/></geometry>'
+    urdf = urdf_of_spider(
+        tmp_path,
+        lambda text: text.replace(sphere, '<geometry><mesh filename="trunk.stl"/></geometry>', 1),
+    )
+    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
+    box = ElementTree.parse(written.files[0]).find("link[@name='body']/collision/geometry/box")
+    assert box.get("size") == "0.4 0.4 0.08"
+    assert not any("no ball can hit it" in what for what in written.asked)
+    assert problems(written.folder / "balancing.yaml") == {}
+
+
+def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
+    urdf = urdf_of_spider(
+        tmp_path, lambda text: re.sub("<collision>.*?</collision>", "", text, count=1)
+    )
+    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
+    assert any("shape of the base 'body', in spider.urdf" in what for what in written.asked)
+    assert list(problems(written.folder / "balancing.yaml")) == ["shape of the base"]
+
+
+def test_new_says_which_visuals_it_left_out(tmp_path):
+    visual = '<visual><geometry><mesh filename="gone.stl"/></geometry></visual></link>'
+    urdf = urdf_of_spider(tmp_path, lambda text: text.replace("</link>", visual, 1))
+    out = tmp_path / "spider"
+    result = CliRunner().invoke(app, ["new", "spider", "--urdf", str(urdf), "--out", str(out)])
+    assert result.exit_code == 0
+    assert "not where the URDF says are left out: gone.stl" in result.output
+    assert "left out: gone.stl" in (out / "README.md").read_text()
 
 
 def test_a_contact_point_without_its_sphere_is_found(own):

@@ -18,6 +18,7 @@ from drake_safety.control.robot import (
     model_file,
     models_package_xml,
     posture_positions,
+    require_motors,
     servo_joints,
 )
 from drake_safety.control.robot_model import by_pattern, load_robot_file
@@ -44,6 +45,43 @@ def test_names_that_the_model_lacks_are_answered_with_those_it_has(tmp_path, cha
     robot = load_robot_file(edited(write_biped(tmp_path), **change))
     with pytest.raises(ValueError, match=message):
         plant_of(robot)
+
+
+def test_legs_without_motors_are_refused_with_what_to_write(tmp_path):
+    path = write_biped(tmp_path)
+    without = plant_of(robot := load_robot_file(edited(path, effort_limits={".*knee": 40.0})))
+    message = (
+        r"robot 'biped': joints \['left_hip_z', .*\] have no motor: 'biped.urdf' has no "
+        r"transmission .* effort_limits in robot.yaml is {'\.\*knee': 40.0}; write there the "
+        r"largest torque of each \[N·m\]"
+    )
+    with pytest.raises(ValueError, match=message) as refused:
+        require_motors(without, robot)
+    assert "knee', " not in str(refused.value)
+    robot = load_robot_file(edited(path, effort_limits={".*": 40.0}))
+    require_motors(plant_of(robot), robot)
+
+
+def test_a_motor_without_a_limit_takes_that_of_the_yaml(tmp_path):
+    path = write_biped(tmp_path)
+    urdf = tmp_path / "biped.urdf"
+    motor = (
+        '<transmission><type>transmission_interface/SimpleTransmission</type><joint name="{0}">'
+        "<hardwareInterface>EffortJointInterface</hardwareInterface></joint>"
+        '<actuator name="{0}"/></transmission>'
+    )
+    motors = "".join(motor.format(name) for name in ("left_knee", "right_knee"))
+    text = urdf.read_text().replace("</robot>", f"{motors}</robot>")
+    # Of one knee the file knows the limit, of the other it does not.
+    head, tail = text.split('name="left_knee"', 1)
+    tail = tail.replace('effort="40" ', "", 1)
+    urdf.write_text(f'{head}name="left_knee"{tail}')
+    plant = plant_of(load_robot_file(edited(path, effort_limits={".*": 30.0})))
+    limits = {
+        name: plant.GetJointActuatorByName(name).effort_limit()
+        for name in ("left_knee", "right_knee")
+    }
+    assert limits == {"left_knee": 30.0, "right_knee": 40.0}
 
 
 @pytest.mark.parametrize(("key", "what"), [("body", "body"), ("joints", "joint")])

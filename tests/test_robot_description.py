@@ -1,5 +1,6 @@
 """A model file enters a plant with what robot.yaml says instead of it."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -12,7 +13,6 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_safety.control import model_files
 from drake_safety.control.model_files import MissingExtraError, model_file
 from drake_safety.control.robot import add_robot
-from drake_safety.control.robot_description import adapted_urdf
 from drake_safety.control.robot_model import load_robot_file
 
 URDF = """<robot name="stool">
@@ -66,33 +66,22 @@ def built(robot):
     return plant, scene_graph, builder.Build()
 
 
-def test_meshes_are_replaced_with_their_colour_and_collisions_dropped():
-    asked = []
-
-    def convert(name, rgba):
-        asked.append((name, rgba))
-        return "file:///cache/seat.gltf"
-
-    text, is_changed = adapted_urdf(URDF, keep_collisions=False, convert=convert)
-    root = ElementTree.fromstring(text)
-    assert asked == [("seat.stl", "1 0 0 1")]
-    assert is_changed and list(root.iter("collision")) == []
-    (visual,) = root.iter("visual")
-    assert visual.find("geometry/mesh").get("filename") == "file:///cache/seat.gltf"
-    # Its colour is in the mesh: Drake warns of a second one.
-    assert visual.find("material") is None
+def test_a_fixed_joint_that_mimics_another_is_no_reason_to_refuse_a_robot(tmp_path):
+    robot = write(tmp_path)
+    mimic = '<origin xyz="0 0 -0.5"/><mimic joint="hip"/>'
+    file = tmp_path / "stool.urdf"
+    text = file.read_text()
+    file.write_text(re.sub('<origin xyz="0 0 -0.5" ?/>', mimic, text))
+    assert file.read_text() != text
+    plant, _, _ = built(robot)
+    assert plant.num_velocities(plant.GetModelInstanceByName("stool")) == 7
 
 
-def test_a_file_that_needs_no_change_is_said_to_be_the_same():
-    _, is_changed = adapted_urdf(URDF, keep_collisions=True, convert=lambda name, rgba: name)
-    assert not is_changed
-
-
-def test_a_fixed_joint_mimics_nothing():
-    mimic = '<mimic joint="hip"/>'
-    text = URDF.replace('<origin xyz="0 0 -0.5"/>', f'<origin xyz="0 0 -0.5"/>{mimic}')
-    adapted, is_changed = adapted_urdf(text, keep_collisions=True, convert=lambda name, rgba: name)
-    assert is_changed and "mimic" not in adapted
+def test_a_file_is_named_when_it_is_no_urdf(tmp_path):
+    robot = write(tmp_path)
+    (tmp_path / "stool.urdf").write_text("<sdf/>")
+    with pytest.raises(ValueError, match="its outermost element is <sdf>"):
+        built(robot)
 
 
 def test_stated_shapes_and_contact_points_are_all_that_collides(tmp_path):

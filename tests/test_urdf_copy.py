@@ -1,80 +1,103 @@
-"""UrdfCopy: what Drake cannot read is taken out, written down, and nothing else is."""
+"""UrdfCopy: a URDF is changed where Drake needs it, and nowhere else."""
 
-import xml.etree.ElementTree as ET
-
-import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.control.urdf_copy import read_urdf
+from urdf_files import GOOD, LINK, mesh, stl, written
 
-LINK = '<link name="{}"><inertial><mass value="1"/>{}</inertial>{}</link>'
-GOOD = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-
-
-def written(folder, *parts, name="r.urdf"):
-    path = folder / name
-    path.write_text(f'<robot name="r">{"".join(parts)}</robot>')
-    return path
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
 
 
-def stl(path, corners):
-    facets = np.zeros(1, [("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")])
-    facets["c"] = corners
-    path.write_bytes(bytes(80) + (1).to_bytes(4, "little") + facets.tobytes())
+def red_seat(url):
+    """A link to be seen, whose material is only mentioned there."""
+    shape = mesh("visual", url).replace("</visual>", '<material name="red"/></visual>')
+    return RED + LINK.format("seat", GOOD, shape)
 
 
-def mesh(kind, url):
-    return f'<{kind}><geometry><mesh filename="{url}"/></geometry></{kind}>'
+def test_a_file_that_needs_no_change_is_said_to_be_the_same(tmp_path):
+    copy = read_urdf(written(tmp_path, red_seat("seat.obj")))
+    copy.free_fixed_joints()
+    copy.drop_collisions()
+    copy.convert_visual_meshes()
+    assert not copy.is_changed
 
 
-def test_a_mesh_that_drake_reads_goes_along_and_others_do_not(tmp_path):
-    source = tmp_path / "bot_description" / "urdf"
-    source.mkdir(parents=True)
-    (source.parent / "hull.obj").write_text("v 0 0 0\n")
-    shapes = mesh("visual", "package://bot_description/hull.obj") + mesh("visual", "skin.dae")
-    copy = read_urdf(written(source, LINK.format("a", GOOD, shapes)))
-    copy.write(tmp_path / "copy.urdf")
-    (left,) = ET.parse(tmp_path / "copy.urdf").getroot().iter("mesh")
-    assert left.get("filename") == "meshes/hull.obj"
-    assert (tmp_path / "meshes" / "hull.obj").read_text() == "v 0 0 0\n"
-    assert copy.notes == [
-        "1 visual meshes that Drake cannot read, or that do not exist, are left out"
-    ]
+def test_a_mesh_is_replaced_with_its_colour_in_it(tmp_path):
+    asked = []
+
+    def shown(url, rgba):
+        asked.append((url, rgba))
+        return "file:///cache/seat.gltf"
+
+    copy = read_urdf(written(tmp_path, red_seat("seat.stl")))
+    copy.replace_visual_meshes(shown)
+    assert asked == [("seat.stl", "1 0 0 1")]
+    assert copy.is_changed
+    (visual,) = copy.root.iter("visual")
+    assert visual.find("geometry/mesh").get("filename") == "file:///cache/seat.gltf"
+    # Its colour is in the mesh: Drake warns of a second one.
+    assert visual.find("material") is None
 
 
-def test_a_lost_collision_mesh_leaves_its_box_behind_turned_as_it_was(tmp_path):
-    stl(tmp_path / "foot.stl", [[0, 0, 0], [2, 0, 0], [0, 1, 4]])
-    shape = mesh("collision", "foot.stl").replace(
-        "<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>'
-    )
-    copy = read_urdf(written(tmp_path, LINK.format("foot", GOOD, shape)))
-    (box,) = copy.lost_shapes["foot"]
-    # A quarter turn about z: x becomes y, and y becomes -x.
-    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 5]], atol=1e-12)
-    assert list(copy.root.iter("collision")) == []
+def test_a_visual_for_which_there_is_no_mesh_is_taken_out(tmp_path):
+    copy = read_urdf(written(tmp_path, red_seat("seat.stl")))
+    copy.replace_visual_meshes(lambda url, rgba: "")
+    assert list(copy.root.iter("visual")) == []
 
 
-def test_friction_and_impossible_inertias_are_mended_and_told(tmp_path):
-    odd = GOOD.replace('ixy="0"', 'ixy="3"')
+def test_collisions_go_and_visuals_stay(tmp_path):
+    shapes = mesh("collision", "a.obj") + mesh("visual", "b.obj")
+    copy = read_urdf(written(tmp_path, LINK.format("a", GOOD, shapes)))
+    copy.drop_collisions()
+    assert [element.get("filename") for element in copy.root.iter("mesh")] == ["b.obj"]
+
+
+def test_a_mesh_in_the_cache_does_not_hide_another_beside_the_urdf(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh")
+    monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "cache"))
+    stl(tmp_path / "seat.stl", [[0, 0, 0], [2, 0, 0], [0, 1, 4]])
+    corners = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+    faces = ["1 3 2", "1 2 4", "1 4 3", "2 3 4"]
+    lines = [f"v {corner}" for corner in corners] + [f"f {face}" for face in faces]
+    (tmp_path / "hull.obj").write_text("\n".join(lines))
+    shapes = mesh("visual", "seat.stl") + mesh("collision", "hull.obj")
+    copy = read_urdf(written(tmp_path, LINK.format("a", GOOD, shapes)))
+    copy.convert_visual_meshes()
+    copy.anchor_meshes()
+    seat, hull = (element.get("filename") for element in copy.root.iter("mesh"))
+    assert (tmp_path / "cache").as_uri() in seat
+    assert hull == (tmp_path / "hull.obj").as_uri()
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModelsFromString(copy.text(), "urdf")
+    assert len(plant.GetCollisionGeometriesForBody(plant.GetBodyByName("a"))) == 1
+
+
+def test_what_drake_knows_by_its_prefix_keeps_it_whatever_address_the_file_gives(tmp_path):
+    path = written(tmp_path, LINK.format("a", GOOD, ""), LINK.format("b", GOOD, ""))
     joint = (
-        '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
-        '<limit effort="5" velocity="2" lower="-1" upper="1"/>'
-        '<dynamics damping="0.1" friction="0.2"/></joint>'
+        '<joint name="j" type="continuous"><parent link="a"/><child link="b"/>'
+        '<drake:controller_gains p="3" d="1"/></joint>'
+        '<transmission><type>SimpleTransmission</type><joint name="j"/><actuator name="j">'
+        '<drake:controller_gains p="3" d="1"/></actuator></transmission>'
     )
-    copy = read_urdf(
-        written(tmp_path, LINK.format("a", GOOD, ""), LINK.format("b", odd, ""), joint)
-    )
-    assert copy.joint_friction == {"j": 0.2}
-    assert [element.get("ixy") for element in copy.root.iter("inertia")] == ["0", "0"]
-    assert copy.joint_limits()["j"].effort == 5.0
-    (dynamics,) = copy.root.iter("dynamics")
-    assert dynamics.attrib == {"damping": "0.1"}
-    assert len(copy.notes) == 2
+    text = path.read_text().replace('name="r"', 'name="r" xmlns:drake="drake.mit.edu"')
+    path.write_text(text.replace("</robot>", f"{joint}</robot>"))
+    copy = read_urdf(path)
+    copy.ignore_collisions([("a", "b")])
+    assert "<drake:controller_gains" in copy.text()
+    assert "<drake:collision_filter_group" in copy.text()
+    plant = MultibodyPlant(0.001)
+    Parser(plant).AddModelsFromString(copy.text(), "urdf")
+    assert plant.GetJointActuatorByName("j").get_controller_gains().p == 3.0
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("", "is not XML"),
         ("<robot", "is not XML"),
         ("<sdf/>", "its outermost element is <sdf>"),
         ("<robot name='r'/>", "has no links"),

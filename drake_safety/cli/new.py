@@ -42,6 +42,8 @@ def new(
     )
     for path in written.files:
         print_path("wrote", path)
+    for what in written.left_out:
+        console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     for what in written.asked:
         console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     print_path("next: drake-safety check", written.files[-1])

@@ -7,10 +7,14 @@ import os
 import tempfile
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drake_safety.control.model_files import MissingExtraError
+
+if TYPE_CHECKING:
+    import trimesh
 
 SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
 """Formats that Drake shows as they are."""
@@ -69,7 +73,23 @@ def _write(target: Path, content: bytes) -> None:
         raise
 
 
-def _to_gltf(path: Path, rgba: str) -> bytes:
+def mesh_box(path: Path) -> np.ndarray:
+    """Lowest and highest corner of the box around a mesh, (2, 3), in the mesh's units.
+
+    Args:
+        path: The mesh.
+
+    Raises:
+        MissingExtraError: There is nothing to read it with.
+        ValueError: The file cannot be read, or is empty.
+    """
+    bounds = _scene(path).bounds
+    if bounds is None:
+        raise ValueError(f"mesh '{path}' is empty")
+    return np.array(bounds, dtype=float)
+
+
+def _scene(path: Path) -> trimesh.Scene:
     try:
         import trimesh
 
@@ -81,9 +101,15 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
             "would convert it, is not installed: pip install 'drake_safety[robots]'"
         ) from error
     try:
-        scene = trimesh.load_scene(path)
+        return trimesh.load_scene(path)
     except Exception as error:  # trimesh's readers raise whatever they stumble on.
         raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
+
+
+def _to_gltf(path: Path, rgba: str) -> bytes:
+    scene = _scene(path)
+    import trimesh
+
     if path.suffix.lower() == ".stl":
         colour = [float(value) for value in rgba.split()] or _GREY
         for mesh in scene.geometry.values():

@@ -198,12 +198,14 @@ def add_robot(
         if joint.num_velocities() != 1:
             continue
         actuator: JointActuator | None = actuated.get(joint.name())
+        limit = by_pattern(robot.effort_limits, joint.name(), "effort limit", robot.name)
         if actuator is None:
-            limit = by_pattern(robot.effort_limits, joint.name(), "effort limit", robot.name)
             if limit is None:
                 continue
             actuator = plant.AddJointActuator(f"{joint.name()}_actuator", joint, limit)
             actuated[joint.name()] = actuator
+        elif limit is not None and np.isinf(actuator.effort_limit()):
+            actuator.set_effort_limit(limit)
         gains = by_pattern(robot.joint_gains, joint.name(), "gains", robot.name)
         if gains is not None and servos:
             actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
@@ -227,6 +229,35 @@ def add_robot(
     for joint_name, position in posture_positions(plant, robot).items():
         plant.GetJointByName(joint_name, instance).set_default_positions([position])
     return instance
+
+
+def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
+    """Refuses a robot that could not carry itself: every joint of legs and arms has a motor.
+
+    Args:
+        plant: The finalised plant, with the robot in it.
+        robot: The robot.
+
+    Raises:
+        ValueError: Joints have none. Drake gives a joint one if the model file has a transmission
+            and an effort limit for it, and :func:`add_robot` if ``effort_limits`` names it.
+    """
+    instance = plant.GetModelInstanceByName(robot.name)
+    driven = {
+        plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(instance)
+    }
+    limbs = [foot.joints for foot in robot.feet.values()]
+    limbs += [frame.joints for frame in robot.reaching_frames.values()]
+    names = dict.fromkeys(name for joints in limbs for name in joints)
+    # A foot need not say what moves it.
+    without = [name for name in names or servo_joints(plant, robot) if name not in driven]
+    if without:
+        raise ValueError(
+            f"robot '{robot.name}': joints {without} have no motor: '{robot.urdf}' has no "
+            "transmission with an effort limit for them, and effort_limits in robot.yaml is "
+            f"{robot.effort_limits}; write there the largest torque of each [N·m], such as "
+            f"effort_limits: {{{without[0]}: 40.0}}"
+        )
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import logging
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import (
@@ -25,67 +22,12 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from drake_safety.control.mesh_cache import SHOWN_FORMATS, shown_mesh
 from drake_safety.control.model_files import add_to_package_map, model_file
 from drake_safety.control.robot_model import CollisionShape, RobotModel, by_pattern
+from drake_safety.control.urdf_copy import read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.
-
-
-def adapted_urdf(
-    text: str, *, keep_collisions: bool, convert: Callable[[str, str], str]
-) -> tuple[str, bool]:
-    """A URDF that Drake can take: its geometry, and no fixed joint that mimics another.
-
-    Args:
-        text: The URDF.
-        keep_collisions: Whether its own collision geometry stays.
-        convert: From a mesh's file name, as the URDF has it, and its colour ("r g b a" or "") to
-            the file name of one which Drake shows.
-
-    Returns:
-        The URDF, and whether it differs.
-    """
-    for _, (prefix, uri) in ElementTree.iterparse(io.StringIO(text), events=("start-ns",)):
-        ElementTree.register_namespace(prefix, uri)
-    root = ElementTree.fromstring(text)
-    is_changed = False
-    colours = {one.get("name", ""): one for one in root.findall("material")}
-    for link in root.findall("link"):
-        if not keep_collisions:
-            for element in link.findall("collision"):
-                link.remove(element)
-                is_changed = True
-        for visual in link.findall("visual"):
-            mesh = visual.find("geometry/mesh")
-            if mesh is None:
-                continue
-            material = visual.find("material")
-            name = mesh.get("filename", "")
-            converted = convert(name, _colour(material, colours))
-            if converted == name:
-                continue
-            is_changed = True
-            mesh.set("filename", converted)
-            if material is not None and converted.endswith(".gltf"):
-                visual.remove(material)  # The mesh has its own, or this colour by now.
-    for joint in root.findall("joint"):
-        for mimic in joint.findall("mimic"):
-            if joint.get("type") == "fixed":
-                joint.remove(mimic)
-                is_changed = True
-    return ElementTree.tostring(root, encoding="unicode"), is_changed
-
-
-def _colour(material: ElementTree.Element | None, colours: dict[str, ElementTree.Element]) -> str:
-    if material is None:
-        return ""
-    for one in (material, colours.get(material.get("name", ""))):
-        colour = None if one is None else one.find("color")
-        if colour is not None:
-            return colour.get("rgba", "")
-    return ""
 
 
 def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
@@ -99,23 +41,25 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
         The model instance, named as the robot.
 
     Raises:
-        ValueError: The file's package is not installed, or a mesh cannot be converted.
+        ValueError: The file is no URDF though its name says so, its package is not installed, or
+            a mesh cannot be converted.
     """
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     add_to_package_map(parser.package_map(), robot.urdf)
     path = model_file(robot.urdf, robot.source_dir)
-    text, is_changed = "", False
+    urdf = None
     if path.suffix == ".urdf":
-        has_geometry = plant.geometry_source_is_registered()
-        text, is_changed = adapted_urdf(
-            path.read_text(encoding="utf-8"),
-            keep_collisions=robot.collision == "model_file",
-            convert=lambda name, rgba: _shown(name, rgba, path.parent) if has_geometry else name,
-        )
+        urdf = read_urdf(path)
+        urdf.free_fixed_joints()
+        if robot.collision == "stated":
+            urdf.drop_collisions()
+        if plant.geometry_source_is_registered():
+            urdf.convert_visual_meshes()
     with _quiet_about(robot):
-        if is_changed:
-            (instance,) = parser.AddModelsFromString(text, "urdf")
+        if urdf is not None and urdf.is_changed:
+            urdf.anchor_meshes()
+            (instance,) = parser.AddModelsFromString(urdf.text(), "urdf")
         elif robot.urdf.startswith("package://"):
             (instance,) = parser.AddModels(url=robot.urdf)
         else:
@@ -144,13 +88,6 @@ def _quiet_about(robot: RobotModel) -> Iterator[None]:
         yield
     finally:
         drake.removeFilter(pass_on)
-
-
-def _shown(name: str, rgba: str, folder: Path) -> str:
-    # What is given to a parser as text has no folder that a relative name could start in.
-    if Path(name).suffix.lower() in SHOWN_FORMATS:
-        return name if "://" in name else (folder / name).resolve().as_uri()
-    return shown_mesh(model_file(name, str(folder)), rgba).resolve().as_uri()
 
 
 def add_stated_shapes(

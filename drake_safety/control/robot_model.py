@@ -169,7 +169,8 @@ class RobotModel:
     joint_gains: dict[str, JointGains] = field(default_factory=dict)
     """Position servo gains, by regular expression over joint names."""
     effort_limits: dict[str, float] = field(default_factory=dict)
-    """Effort limits [N·m] of actuators that the model file lacks, by regular expression."""
+    """Effort limits [N·m] of actuators that the model file lacks, or that have none there, by
+    regular expression."""
     velocity_limits: dict[str, float] = field(default_factory=dict)
     """Joint speed limits [rad/s] in place of the model file's, by regular expression."""
     collision: str = "model_file"

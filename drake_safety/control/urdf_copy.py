@@ -1,19 +1,21 @@
-"""A URDF as Drake can simulate it: what Drake cannot read is taken out, and written down."""
+"""A URDF as Drake can take it: what it cannot is changed or taken out, and written down."""
 
 from __future__ import annotations
 
+import io
 import math
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-_READABLE = (".obj", ".gltf", ".glb", ".vtk")  # Meshes that Drake reads.
+from drake_safety.control.mesh_cache import SHOWN_FORMATS, shown_mesh
+from drake_safety.control.model_files import model_file
+
 _DRAKE = "http://drake.mit.edu"
-ET.register_namespace("drake", _DRAKE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,24 +33,38 @@ class JointLimits:
 
 @dataclass(kw_only=True)
 class UrdfCopy:
-    """A URDF that is being made fit for simulation.
+    """A URDF that is being made fit for simulation; the file that it was read from stays as it is.
 
     Attributes:
         source: The file that it was read from.
         root: Its outermost element, which is changed.
         notes: What was changed, one sentence each.
+        left_out: Those of the notes that tell of shapes which can no longer be seen.
         lost_shapes: Boxes around collision meshes that were taken out, by link: lowest and highest
             corner in the link's frame, (2, 3) [m] each.
         joint_friction: Dry friction that was taken out, by joint [N·m].
-        meshes: Meshes that stay: file name in the copy, and the file.
+        meshes: Meshes that go along: file name in the copy, and the file.
     """
 
     source: Path
     root: ET.Element
     notes: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
     lost_shapes: dict[str, list[np.ndarray]] = field(default_factory=dict)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._as_read = self.text()
+
+    def text(self) -> str:
+        """The URDF as it is now."""
+        return ET.tostring(self.root, encoding="unicode")
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether it differs from the file."""
+        return self.text() != self._as_read
 
     def link(self, name: str) -> ET.Element:
         """A link's element."""
@@ -61,9 +77,70 @@ class UrdfCopy:
             if joint.get("type") in ("revolute", "continuous", "prismatic"):
                 limit = joint.find("limit")
                 found[joint.get("name", "")] = JointLimits(
-                    effort=_number(limit, "effort"), velocity=_number(limit, "velocity")
+                    effort=number(limit, "effort"), velocity=number(limit, "velocity")
                 )
         return found
+
+    def free_fixed_joints(self) -> None:
+        """A fixed joint mimics no other: Drake refuses one that says it does."""
+        for joint in self.root.findall("joint"):
+            for mimic in joint.findall("mimic"):
+                if joint.get("type") == "fixed":
+                    joint.remove(mimic)
+
+    def drop_collisions(self) -> None:
+        """Takes out all collision shapes."""
+        for link in self.root.findall("link"):
+            for collision in link.findall("collision"):
+                link.remove(collision)
+
+    def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
+        """Puts meshes that Drake shows in the place of those to be seen.
+
+        A mesh whose colours are its own by then needs no material: Drake warns of two.
+
+        Args:
+            shown: From a mesh's URL, as the URDF has it, and its colour ("r g b a" or "") to the
+                URL of one that Drake shows, or the same; "" takes the visual out.
+        """
+        colours = {one.get("name", ""): one for one in self.root.findall("material")}
+        for link in self.root.findall("link"):
+            for visual in link.findall("visual"):
+                mesh = visual.find("geometry/mesh")
+                if mesh is None:
+                    continue
+                material = visual.find("material")
+                url = mesh.get("filename", "")
+                replacement = shown(url, _colour(material, colours))
+                if not replacement:
+                    link.remove(visual)
+                    continue
+                mesh.set("filename", replacement)
+                is_converted = Path(url).suffix.lower() not in SHOWN_FORMATS
+                if material is not None and is_converted:
+                    visual.remove(material)
+
+    def convert_visual_meshes(self) -> None:
+        """Puts glTF files of the user's cache in the place of visual meshes Drake does not show.
+
+        Raises:
+            ValueError: A mesh does not exist, or cannot be converted.
+        """
+        folder = str(self.source.parent)
+
+        def shown(url: str, rgba: str) -> str:
+            if Path(url).suffix.lower() in SHOWN_FORMATS:
+                return url
+            return shown_mesh(model_file(url, folder), rgba).resolve().as_uri()
+
+        self.replace_visual_meshes(shown)
+
+    def anchor_meshes(self) -> None:
+        """Makes relative names of meshes absolute: text has no folder that they could start in."""
+        for mesh in self.root.iter("mesh"):
+            url = mesh.get("filename", "")
+            if "://" not in url:
+                mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
     def fix_joints(self, names: Iterable[str]) -> None:
         """Makes joints rigid, at zero.
@@ -107,6 +184,31 @@ class UrdfCopy:
             "own collision shapes"
         )
 
+    def restore_boxes(self, link_name: str) -> bool:
+        """Gives a link the boxes around the collision meshes that it has lost.
+
+        Args:
+            link_name: The link.
+
+        Returns:
+            Whether there are any.
+        """
+        boxes = self.lost_shapes.get(link_name, [])
+        link = self.link(link_name)
+        for index, (low, high) in enumerate(boxes):
+            collision = ET.SubElement(link, "collision", name=f"{link_name}_box_{index}")
+            xyz, size = (
+                " ".join(f"{value:.5g}" for value in values)
+                for values in ((low + high) / 2, high - low)
+            )
+            ET.SubElement(collision, "origin", xyz=xyz, rpy="0 0 0")
+            ET.SubElement(ET.SubElement(collision, "geometry"), "box", size=size)
+        if boxes:
+            self.notes.append(
+                f"link '{link_name}' collides as the box around each mesh that it had"
+            )
+        return bool(boxes)
+
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Lets pairs of links pass through each other.
 
@@ -143,7 +245,7 @@ class UrdfCopy:
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF and takes out what Drake cannot read.
+    """Reads a URDF, to be changed.
 
     Args:
         path: The file.
@@ -155,7 +257,7 @@ def read_urdf(path: Path) -> UrdfCopy:
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")
     try:
-        root = ET.parse(path).getroot()
+        root = _parsed(path.read_bytes())
     except ET.ParseError as error:
         raise ValueError(f"'{path}' is not XML: {error}") from error
     if root.tag != "robot":
@@ -167,134 +269,43 @@ def read_urdf(path: Path) -> UrdfCopy:
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
     if not root.findall("link"):
         raise ValueError(f"'{path}' has no links")
-    copy = UrdfCopy(source=path, root=root)
-    for element in root.findall("gazebo"):
-        root.remove(element)
-    _drop_friction(copy)
-    _mend_inertias(copy)
-    dropped: dict[str, int] = {"visual": 0, "collision": 0}
-    for link in root.findall("link"):
-        for kind in dropped:
-            for shape in link.findall(kind):
-                dropped[kind] += _drop_unreadable(copy, link, shape)
-        if link.find("visual") is None:
-            # Something to look at: the shapes that touch.
-            for shape in link.findall("collision"):
-                visual = ET.SubElement(link, "visual")
-                visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
-    for kind, count in dropped.items():
-        if count:
-            copy.notes.append(
-                f"{count} {kind} meshes that Drake cannot read, or that do not exist, are left out"
-            )
-    return copy
+    return UrdfCopy(source=path, root=root)
 
 
-def _drop_friction(copy: UrdfCopy) -> None:
-    """Takes out dry friction, which Drake does not simulate from a URDF."""
-    for joint in copy.root.iter("joint"):
-        dynamics = joint.find("dynamics")
-        if dynamics is not None:
-            friction = _number(dynamics, "friction")
-            dynamics.attrib.pop("friction", None)
-            if friction > 0:
-                copy.joint_friction[joint.get("name", "")] = friction
-    if copy.joint_friction:
-        copy.notes.append(
-            f"the dry friction of {len(copy.joint_friction)} joints is left out; a scenario states "
-            "it, as joint_friction_nm"
-        )
+def _parsed(content: bytes) -> ET.Element:
+    """The outermost element; elements that Drake knows by their prefix keep it."""
+    root = None
+    prefixes = {"drake": _DRAKE}
+    parser = ET.iterparse(io.BytesIO(content), events=("start-ns", "start"))
+    for event, value in parser:
+        if event == "start-ns":
+            prefixes[value[0]] = value[1]
+        elif root is None:
+            root = value
+    assert root is not None  # There is no XML without an element.
+    # Drake looks at the prefix alone, whatever address a file gives it.
+    own = f"{{{prefixes.pop('drake')}}}"
+    for element in root.iter():
+        if element.tag.startswith(own):
+            element.tag = f"{{{_DRAKE}}}{element.tag.removeprefix(own)}"
+    for prefix, address in prefixes.items():
+        ET.register_namespace(prefix, address)
+    ET.register_namespace("drake", _DRAKE)
+    return root
 
 
-def _mend_inertias(copy: UrdfCopy) -> None:
-    """Takes out products of inertia that no body can have."""
-    for link in copy.root.iter("link"):
-        inertia = link.find("inertial/inertia")
-        if inertia is None:
-            continue
-        xx, yy, zz, xy, xz, yz = (
-            _number(inertia, key) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        )
-        moments = np.nan_to_num([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        principal = np.linalg.eigvalsh(moments)
-        # A flat or a thin body is allowed, one without extent in some direction is not.
-        if principal[0] < 1e-6 * principal[2] and np.any([xy, xz, yz]):
-            for key in ("ixy", "ixz", "iyz"):
-                inertia.set(key, "0")
-            copy.notes.append(
-                f"link '{link.get('name')}' has an inertia that no body can have; its products of "
-                "inertia are taken to be zero"
-            )
+def _colour(material: ET.Element | None, colours: dict[str, ET.Element]) -> str:
+    if material is None:
+        return ""
+    for one in (material, colours.get(material.get("name", ""))):
+        colour = None if one is None else one.find("color")
+        if colour is not None:
+            return colour.get("rgba", "")
+    return ""
 
 
-def _drop_unreadable(copy: UrdfCopy, link: ET.Element, shape: ET.Element) -> bool:
-    mesh = shape.find("geometry/mesh")
-    if mesh is None:
-        return False
-    file = _mesh_file(mesh.get("filename", ""), copy.source)
-    if file is not None and file.suffix.lower() in _READABLE:
-        name = f"meshes/{file.name}"
-        # Two files of one name would be one in the copy.
-        if copy.meshes.setdefault(name, file) == file:
-            mesh.set("filename", name)
-            return False
-    link.remove(shape)
-    box = None if file is None else _stl_box(file)
-    if shape.tag == "collision" and box is not None:
-        scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
-        origin = shape.find("origin")
-        xyz, rpy = (
-            [
-                float(v)
-                for v in (origin.get(key, "0 0 0") if origin is not None else "0 0 0").split()
-            ]
-            for key in ("xyz", "rpy")
-        )
-        corners = np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1).T
-        corners = corners @ _rotation(*rpy).T + xyz
-        copy.lost_shapes.setdefault(link.get("name", ""), []).append(
-            np.array([corners.min(axis=0), corners.max(axis=0)])
-        )
-    return True
-
-
-def _mesh_file(url: str, source: Path) -> Path | None:
-    """The file behind a mesh's URL, looked for around the URDF as ROS lays packages out."""
-    scheme, _, rest = url.rpartition("://")
-    if scheme not in ("", "package", "file", "model"):
-        return None
-    if scheme in ("", "file"):
-        candidates = [source.parent / rest]
-    else:
-        package, _, inside = rest.partition("/")
-        candidates = []
-        for folder in source.resolve().parents:
-            if folder.name == package:
-                candidates.append(folder / inside)
-            candidates.append(folder / package / inside)
-    return next((file for file in candidates if file.is_file()), None)
-
-
-def _stl_box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a binary STL, (2, 3)."""
-    if file.suffix.lower() != ".stl":
-        return None
-    content = file.read_bytes()
-    count = int.from_bytes(content[80:84], "little")
-    if count == 0 or len(content) < 84 + 50 * count:
-        return None
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    corners = np.frombuffer(content, kind, count, 84)["corners"].reshape(-1, 3)
-    return np.array([corners.min(axis=0), corners.max(axis=0)], dtype=float)
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-
-
-def _number(element: ET.Element | None, key: str) -> float:
+def number(element: ET.Element | None, key: str) -> float:
+    """An attribute of an element; NaN where there is none, or no number."""
     try:
         return math.nan if element is None else float(element.get(key, "nan"))
     except ValueError:

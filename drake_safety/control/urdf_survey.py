@@ -138,16 +138,27 @@ class Survey:
 
     def leaves(self) -> list[list[str]]:
         """Groups of bodies, welded to each other, beyond which nothing moves."""
-        carries = {name for joint in self.joints for name in self._welded(joint.parent_body())}
+        carries = {
+            name for joint in self.joints for name in self.welded(joint.parent_body().name())
+        }
         groups = []
         for joint in self.joints:
-            group = self._welded(joint.child_body())
+            group = self.welded(joint.child_body().name())
             if not carries & set(group):
                 groups.append(group)
         return groups
 
-    def _welded(self, body: object) -> list[str]:
-        return [b.name() for b in self.plant.GetBodiesWeldedTo(body)]
+    def welded(self, body: str) -> list[str]:
+        """Bodies that are rigidly one with a body, itself among them."""
+        one = self.plant.GetBodyByName(body, self.instance)
+        return [b.name() for b in self.plant.GetBodiesWeldedTo(one)]
+
+    def collides(self, body: str) -> bool:
+        """Whether a body, or one that is welded to it, has collision geometry."""
+        return any(
+            self.plant.GetCollisionGeometriesForBody(self.plant.GetBodyByName(name, self.instance))
+            for name in self.welded(body)
+        )
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
         """The limbs that reach lowest, or those that end in the given links.

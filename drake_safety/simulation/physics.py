@@ -35,6 +35,7 @@ from drake_safety.control.robot import (
     actuation_matrix,
     add_robot,
     apply_masses,
+    require_motors,
     servo_matrix,
 )
 from drake_safety.control.robot_model import RobotModel
@@ -234,8 +235,8 @@ def add_physics(
         The plant, its ports and its state.
 
     Raises:
-        ValueError: A body, joint or file that does not exist, a decoration that can be touched, or
-            something that the engine cannot simulate.
+        ValueError: A body, joint or file that does not exist, a leg or an arm without motors, a
+            decoration that can be touched, or something that the engine cannot simulate.
     """
     physics = _ENGINES[variation.engine]
     return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
@@ -260,6 +261,7 @@ def _furnish(
     # What the ports say is of now, not of the last step: no copies are kept for it.
     plant.SetUseSampledOutputPorts(False)
     plant.Finalize()
+    require_motors(plant, robot)
     for decoration, model in zip(scene.decorations, decorations, strict=True):
         if collision_geometries(plant, [model]):
             raise ValueError(

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from drake_safety.control.robot_model import load_robot_file
+from drake_safety.control.simulatable_urdf import simulatable_copy
 from drake_safety.control.standing_posture import solve_standing_posture
-from drake_safety.control.urdf_copy import JointLimits, UrdfCopy, read_urdf
+from drake_safety.control.urdf_copy import JointLimits, UrdfCopy
 from drake_safety.control.urdf_survey import Limb, Survey
 from drake_safety.simulation.scenario_template import TASKS, Sizes, scenario_yaml
 
@@ -32,12 +33,14 @@ class NewRobot:
         folder: Where.
         files: The files.
         asked: What the URDF does not tell and the user is asked for.
+        left_out: Visuals of the URDF that the copy lacks, and why.
         sizes: Of the robot as it stands.
     """
 
     folder: Path
     files: list[Path]
     asked: list[str]
+    left_out: list[str]
     sizes: Sizes
 
 
@@ -90,11 +93,17 @@ def write_robot(
         folder.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(staged, folder)
     files = [folder / file for file in (f"{name}.urdf", "robot.yaml", "README.md", f"{task}.yaml")]
-    return NewRobot(folder=folder, files=files, asked=found.asked, sizes=found.sizes)
+    return NewRobot(
+        folder=folder,
+        files=files,
+        asked=found.asked,
+        left_out=found.copy.left_out,
+        sizes=found.sizes,
+    )
 
 
 def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | None) -> _Findings:
-    copy = read_urdf(urdf)
+    copy = simulatable_copy(urdf)
     copy.write(scratch)
     survey = Survey(scratch, copy.lost_shapes)
     legs = survey.legs(feet)
@@ -111,6 +120,12 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
             copy.replace_collisions(limb.body, limb.points, limb.radius_m)
     if idle or not all(limb.is_own_shape for limb in legs):
         copy.fix_joints(idle)
+        copy.write(scratch)
+        survey = Survey(scratch)
+    # A ball that is thrown aims at the base.
+    is_base_bare = not survey.collides(survey.base)
+    if is_base_bare and any([copy.restore_boxes(link) for link in survey.welded(survey.base)]):
+        is_base_bare = False
         copy.write(scratch)
         survey = Survey(scratch)
     posture = solve_standing_posture(survey, legs)
@@ -131,6 +146,11 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
         for limb in legs
         if limb.is_guess
     ]
+    if is_base_bare:
+        found.asked.append(
+            f"a <collision> shape of the base '{survey.base}', in {name}.urdf [m]: without one no "
+            "ball can hit it"
+        )
     return found
 
 
@@ -226,6 +246,7 @@ def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
     motors = {
         plant.get_joint_actuator(index).joint().name()
         for index in plant.GetJointActuatorIndices(found.survey.instance)
+        if math.isfinite(plant.get_joint_actuator(index).effort_limit())
     }
     lines = []
     for name in names:
@@ -240,7 +261,7 @@ def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
     if not lines:
         return []
     return [
-        "effort_limits:  # the URDF has no transmissions; from its joints' limits [N·m]",
+        "effort_limits:  # where the URDF has no motor, or none with a limit [N·m]",
         *lines,
     ]
 

@@ -69,6 +69,7 @@ def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -
         return
     if state.kinematics is not None:
         yield from _guarded("contact spheres", lambda: _contacts(state))
+        yield from _guarded("shape of the base", lambda: _target(state))
         yield from _guarded("stands for 1 s", lambda: _stands(state))
     loop = state.loop
     yield from _guarded("contract", lambda: iter(check_contract(loop, seed=seed)))
@@ -206,6 +207,13 @@ def _motors(state: _State) -> Iterator[Finding]:
         )
     else:
         yield _ok("motors", f"one on each of {len(limits)} joints")
+    unlimited = [name for name, limit in limits.items() if not np.isfinite(limit)]
+    if unlimited:
+        yield _bad(
+            "effort limits",
+            f"the motors of joints {unlimited} have none, so that no load is too heavy",
+            "give them one [N·m] under 'effort_limits' in robot.yaml",
+        )
     if robot.joint_gains:
         loose = [
             name
@@ -236,6 +244,28 @@ def _motors(state: _State) -> Iterator[Finding]:
             if name in limits
         ]
         yield _ok("effort against gravity", f"{100 * max(shares, default=0):.0f} % at most")
+
+
+def _target(state: _State) -> Iterator[Finding]:
+    """Whether a ball can hit the base, of a task that throws some."""
+    loop, robot = _of(state.loop), _of(state.robot)
+    if not hasattr(loop, "ball"):
+        return
+    plant = loop.plant
+    base = plant.GetBodyByName(robot.base, loop.robot_instance)
+    bodies = plant.GetBodiesWeldedTo(base)
+    count = sum(len(plant.GetCollisionGeometriesForBody(body)) for body in bodies)
+    if count:
+        yield _ok("shape of the base", f"{count} collision shapes for balls to hit")
+    else:
+        yield _bad(
+            "shape of the base",
+            f"base '{robot.base}' has no collision geometry, so balls, also those that episodes "
+            "begin with, fly through it",
+            f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
+            f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in "
+            "robot.yaml",
+        )
 
 
 def _contacts(state: _State) -> Iterator[Finding]:

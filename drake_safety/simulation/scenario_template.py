@@ -54,6 +54,13 @@ def _numbers(values: Sequence[float]) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
 
 
+def _ball(time_s: float, mass_kg: float, speed_m_s: float, direction_rad: float) -> str:
+    return (
+        f"{{time_s: {time_s:g}, mass_kg: {mass_kg:.3g}, speed_m_s: {speed_m_s:.3g}, "
+        f"direction_rad: {direction_rad:g}}}"
+    )
+
+
 def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: float) -> str:
     friction = sizes.joint_friction_nm
     if friction is None:
@@ -97,6 +104,9 @@ robot: robot.yaml
     speed_m_s: {_numbers([2 * slow, 11 * slow])}  # [m/s]
     height_m: {0.03 * tall:.3g}
     target_offset_m: {_numbers([0.05 * length, 0.03 * width])}
+  demonstration:  # the balls of `run --push ball`: a weak one and a strong one, towards [rad]
+    - {_ball(0.6, 2.0 * heavy, 3.5 * slow, 1.5708)}
+    - {_ball(1.68, 3.0 * heavy, 9.0 * slow, -1.2)}
   recovery:
     threshold: 0.4
     step:

@@ -1,0 +1,266 @@
+"""Any URDF made fit for Drake, as `drake-safety new` writes it; every change is written down."""
+
+from __future__ import annotations
+
+import contextlib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from drake_safety.control.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
+from drake_safety.control.model_files import MissingExtraError, model_file
+from drake_safety.control.urdf_copy import UrdfCopy, number, read_urdf
+
+_IGNORED = ("calibration", "safety_controller")
+"""Of a joint, what Drake ignores with a warning each time that a robot is built."""
+
+
+def simulatable_copy(path: Path) -> UrdfCopy:
+    """Reads a URDF, changes what Drake would refuse, and gathers the meshes that go along.
+
+    Visual meshes that Drake does not show are converted; see
+    :func:`~drake_safety.control.mesh_cache.shown_mesh`. Those that cannot be are left out, as are
+    collision meshes that Drake does not read.
+
+    Args:
+        path: The URDF.
+
+    Raises:
+        ValueError: It does not exist, or is no URDF.
+    """
+    copy = read_urdf(path)
+    for element in copy.root.findall("gazebo"):
+        copy.root.remove(element)
+    for joint in copy.root.findall("joint"):
+        for element in [part for part in joint if part.tag in _IGNORED]:
+            joint.remove(element)
+    copy.free_fixed_joints()
+    _drop_friction(copy)
+    _mend_inertias(copy)
+    _tell_materials_apart(copy)
+    _gather_visual_meshes(copy)
+    _gather_collision_meshes(copy)
+    for link in copy.root.findall("link"):
+        if link.find("visual") is None:
+            # Something to look at: the shapes that touch.
+            for shape in link.findall("collision"):
+                visual = ET.SubElement(link, "visual")
+                visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
+    return copy
+
+
+def _drop_friction(copy: UrdfCopy) -> None:
+    """Takes out dry friction, which Drake does not simulate from a URDF."""
+    for joint in copy.root.iter("joint"):
+        dynamics = joint.find("dynamics")
+        if dynamics is not None:
+            friction = number(dynamics, "friction")
+            dynamics.attrib.pop("friction", None)
+            if friction > 0:
+                copy.joint_friction[joint.get("name", "")] = friction
+    if copy.joint_friction:
+        copy.notes.append(
+            f"the dry friction of {len(copy.joint_friction)} joints is left out; a scenario states "
+            "it, as joint_friction_nm"
+        )
+
+
+def _mend_inertias(copy: UrdfCopy) -> None:
+    """Takes out products of inertia that no body can have, and inertias of bodies without mass."""
+    for link in copy.root.iter("link"):
+        inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
+        if inertial is None or inertia is None:
+            continue
+        if number(inertial.find("mass"), "value") == 0:
+            link.remove(inertial)
+            continue
+        xx, yy, zz, xy, xz, yz = (
+            number(inertia, key) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        )
+        moments = np.nan_to_num([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        principal = np.linalg.eigvalsh(moments)
+        # A flat or a thin body is allowed, one without extent in some direction is not.
+        if principal[0] < 1e-6 * principal[2] and np.any([xy, xz, yz]):
+            for key in ("ixy", "ixz", "iyz"):
+                inertia.set(key, "0")
+            copy.notes.append(
+                f"link '{link.get('name')}' has an inertia that no body can have; its products of "
+                "inertia are taken to be zero"
+            )
+
+
+def _tell_materials_apart(copy: UrdfCopy) -> None:
+    """Gives materials of one name and several colours several names."""
+    seen: dict[str, list[tuple[str, ...]]] = {}
+    for material in copy.root.iter("material"):
+        content = tuple(
+            _plain(value) for part in material for value in " ".join(part.attrib.values()).split()
+        )
+        if not content:
+            continue  # It only mentions a material.
+        name = material.get("name", "")
+        known = seen.setdefault(name, [])
+        if content not in known:
+            known.append(content)
+        index = known.index(content)
+        if index:
+            material.set("name", f"{name}_{index}")
+    for name, contents in seen.items():
+        if len(contents) > 1:
+            copy.notes.append(
+                f"the material '{name}' has {len(contents)} colours; now each has its own name"
+            )
+
+
+def _plain(value: str) -> str:
+    """A number as it is mostly written, so that 0 and 0.0 are the same."""
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return value
+
+
+def _gather_visual_meshes(copy: UrdfCopy) -> None:
+    missing: list[str] = []
+    wanting: list[str] = []  # What would convert them.
+    unreadable: list[str] = []  # Why.
+    converted: list[str] = []
+
+    def shown(url: str, rgba: str) -> str:
+        file = _mesh_file(url, copy.source)
+        if file is None:
+            missing.append(url)
+            return ""
+        try:
+            mesh = shown_mesh(file, rgba)
+        except MissingExtraError:
+            wanting.append(file.name)
+            return ""
+        except ValueError as error:
+            unreadable.append(str(error))
+            return ""
+        if mesh != file:
+            converted.append(file.name)
+            return _gather(copy, mesh, f"{file.stem}.gltf")
+        return _gather(copy, mesh, file.name)
+
+    copy.replace_visual_meshes(shown)
+    if converted:
+        copy.notes.append(f"visual meshes are converted to glTF: {_listed(converted)}")
+    if missing:
+        copy.left_out.append(
+            f"visual meshes that are not where the URDF says are left out: {_listed(missing)}"
+        )
+    if wanting:
+        copy.left_out.append(
+            f"visual meshes that Drake does not show are left out: {_listed(wanting)}; "
+            "`pip install 'drake_safety[robots]'` brings what converts them, then write the folder "
+            "anew"
+        )
+    copy.left_out += [f"a visual is left out: {why}" for why in dict.fromkeys(unreadable)]
+    copy.notes += copy.left_out
+
+
+def _gather_collision_meshes(copy: UrdfCopy) -> None:
+    lost: list[str] = []
+    for link in copy.root.findall("link"):
+        for shape in link.findall("collision"):
+            mesh = shape.find("geometry/mesh")
+            if mesh is None:
+                continue
+            url = mesh.get("filename", "")
+            file = _mesh_file(url, copy.source)
+            if file is not None and file.suffix.lower() in SHOWN_FORMATS:
+                mesh.set("filename", _gather(copy, file, file.name))
+                continue
+            link.remove(shape)
+            lost.append(url if file is None else file.name)
+            box = None if file is None else _box(file)
+            if box is not None:
+                boxes = copy.lost_shapes.setdefault(link.get("name", ""), [])
+                boxes.append(_box_in_link(box, shape, mesh))
+    if lost:
+        copy.notes.append(
+            f"collision meshes that Drake cannot read, or that do not exist, are left out: "
+            f"{_listed(lost)}"
+        )
+
+
+def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
+    """The name in the copy of a mesh that goes along; namesakes get folders of their own."""
+    index = 0
+    while True:
+        target = f"meshes/{index}/{name}" if index else f"meshes/{name}"
+        if copy.meshes.setdefault(target, file) == file:
+            return target
+        index += 1
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(dict.fromkeys(names))
+
+
+def _box_in_link(box: np.ndarray, shape: ET.Element, mesh: ET.Element) -> np.ndarray:
+    """The box around a mesh's box, scaled and posed as a shape is, (2, 3) [m]."""
+    scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
+    origin = shape.find("origin")
+    xyz, rpy = (
+        [float(v) for v in (origin.get(key, "0 0 0") if origin is not None else "0 0 0").split()]
+        for key in ("xyz", "rpy")
+    )
+    corners = np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1).T
+    corners = corners @ _rotation(*rpy).T + xyz
+    return np.array([corners.min(axis=0), corners.max(axis=0)])
+
+
+def _mesh_file(url: str, source: Path) -> Path | None:
+    """The file behind a mesh's URL, looked for around the URDF as ROS lays packages out.
+
+    What is not there may be in a package that pip has installed.
+    """
+    scheme, _, rest = url.rpartition("://")
+    if scheme not in ("", "package", "file", "model"):
+        return None
+    if scheme in ("", "file"):
+        candidates = [source.parent / rest]
+    else:
+        package, _, inside = rest.partition("/")
+        candidates = []
+        for folder in source.resolve().parents:
+            if folder.name == package:
+                candidates.append(folder / inside)
+            candidates.append(folder / package / inside)
+        if scheme == "package":
+            with contextlib.suppress(ValueError):
+                candidates.append(model_file(url))
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _box(file: Path) -> np.ndarray | None:
+    """Lowest and highest corner of a mesh, (2, 3); binary STL needs no other package."""
+    box = _stl_box(file)
+    if box is None:
+        with contextlib.suppress(ValueError):
+            box = mesh_box(file)
+    return box
+
+
+def _stl_box(file: Path) -> np.ndarray | None:
+    """Lowest and highest corner of a binary STL, (2, 3)."""
+    if file.suffix.lower() != ".stl":
+        return None
+    content = file.read_bytes()
+    count = int.from_bytes(content[80:84], "little")
+    if count == 0 or len(content) < 84 + 50 * count:
+        return None
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = np.frombuffer(content, kind, count, 84)["corners"].reshape(-1, 3)
+    return np.array([corners.min(axis=0), corners.max(axis=0)], dtype=float)
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()

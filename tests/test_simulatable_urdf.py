@@ -1,0 +1,166 @@
+"""A URDF made fit for Drake: what can be seen stays, and what cannot is told with its reason."""
+
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_safety.control.simulatable_urdf import simulatable_copy
+from urdf_files import GOOD, LINK, mesh, stl, written
+
+TRIANGLE = [[0, 0, 0], [2, 0, 0], [0, 1, 4]]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "cache"))
+
+
+def meshes_of(path):
+    return [element.get("filename") for element in ET.parse(path).getroot().iter("mesh")]
+
+
+def test_a_mesh_that_drake_shows_goes_along_as_it_is(tmp_path):
+    source = tmp_path / "bot_description" / "urdf"
+    source.mkdir(parents=True)
+    (source.parent / "hull.obj").write_text("v 0 0 0\n")
+    shapes = mesh("visual", "package://bot_description/hull.obj")
+    copy = simulatable_copy(written(source, LINK.format("a", GOOD, shapes)))
+    copy.write(tmp_path / "copy.urdf")
+    assert meshes_of(tmp_path / "copy.urdf") == ["meshes/hull.obj"]
+    assert (tmp_path / "meshes" / "hull.obj").read_text() == "v 0 0 0\n"
+    assert copy.notes == []
+
+
+def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_path):
+    pytest.importorskip("trimesh")
+    stl(tmp_path / "skin.stl", TRIANGLE)
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
+    folder = tmp_path / "written"
+    folder.mkdir()
+    copy.write(folder / "copy.urdf")
+    assert meshes_of(folder / "copy.urdf") == ["meshes/skin.gltf"]
+    assert copy.notes == ["visual meshes are converted to glTF: skin.stl"]
+    assert copy.left_out == []
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(folder / "copy.urdf"))
+    (visual,) = plant.GetVisualGeometriesForBody(plant.GetBodyByName("a"))
+    shape = scene_graph.model_inspector().GetShape(visual)
+    assert shape.source().path() == folder / "meshes" / "skin.gltf"
+
+
+def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    stl(tmp_path / "skin.stl", TRIANGLE)
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
+    (note,) = copy.left_out
+    assert "left out: skin.stl; `pip install 'drake_safety[robots]'`" in note
+    assert list(copy.root.iter("visual")) == [] and copy.meshes == {}
+
+
+def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "broken.dae").write_text("no mesh")
+    shapes = mesh("visual", "gone.stl") + mesh("visual", "broken.dae")
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
+    missing, broken = copy.left_out
+    assert missing == "visual meshes that are not where the URDF says are left out: gone.stl"
+    assert "broken.dae' cannot be read" in broken
+    assert copy.notes == copy.left_out
+
+
+def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
+    for name, x in (("left", 1), ("right", 2)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "hull.obj").write_text(f"v {x} 0 0\n")
+    shapes = mesh("visual", "left/hull.obj") + mesh("visual", "right/hull.obj")
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
+    folder = tmp_path / "written"
+    folder.mkdir()
+    copy.write(folder / "copy.urdf")
+    texts = [(folder / name).read_text() for name in meshes_of(folder / "copy.urdf")]
+    assert texts == ["v 1 0 0\n", "v 2 0 0\n"]
+
+
+def test_a_mesh_of_an_installed_package_is_found(tmp_path):
+    pytest.importorskip("trimesh")
+    url = "package://example-robot-data/robots/hyq_description/meshes/leg/lowerleg.dae"
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", url))))
+    assert list(copy.meshes) == ["meshes/lowerleg.gltf"]
+
+
+def test_a_lost_collision_mesh_leaves_its_box_behind_turned_as_it_was(tmp_path):
+    stl(tmp_path / "foot.stl", TRIANGLE)
+    shape = mesh("collision", "foot.stl").replace(
+        "<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>'
+    )
+    links = LINK.format("foot", GOOD, shape), LINK.format("a", GOOD, "")
+    copy = simulatable_copy(written(tmp_path, *links))
+    (box,) = copy.lost_shapes["foot"]
+    # A quarter turn about z: x becomes y, and y becomes -x.
+    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 5]], atol=1e-12)
+    assert list(copy.root.iter("collision")) == []
+    assert copy.restore_boxes("foot") and not copy.restore_boxes("a")
+    assert copy.root.find(".//collision/geometry/box").get("size") == "1 2 4"
+    assert copy.root.find(".//collision/origin").get("xyz") == "-0.5 1 3"
+
+
+def test_the_box_of_another_format_is_the_same(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(tmp_path / "foot.ply")
+    shape = mesh("collision", "foot.ply")
+    copy = simulatable_copy(written(tmp_path, LINK.format("foot", GOOD, shape)))
+    (box,) = copy.lost_shapes["foot"]
+    np.testing.assert_allclose(box, [[-0.5, -1, -2], [0.5, 1, 2]], atol=1e-6)
+
+
+def test_friction_and_impossible_inertias_are_mended_and_told(tmp_path):
+    odd = GOOD.replace('ixy="0"', 'ixy="3"')
+    joint = (
+        '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
+        '<limit effort="5" velocity="2" lower="-1" upper="1"/>'
+        '<dynamics damping="0.1" friction="0.2"/></joint>'
+    )
+    copy = simulatable_copy(
+        written(tmp_path, LINK.format("a", GOOD, ""), LINK.format("b", odd, ""), joint)
+    )
+    assert copy.joint_friction == {"j": 0.2}
+    assert [element.get("ixy") for element in copy.root.iter("inertia")] == ["0", "0"]
+    assert copy.joint_limits()["j"].effort == 5.0
+    (dynamics,) = copy.root.iter("dynamics")
+    assert dynamics.attrib == {"damping": "0.1"}
+    assert len(copy.notes) == 2
+
+
+def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
+    nothing = LINK.format("b", GOOD, "").replace('mass value="1"', 'mass value="0.0"')
+    joint = (
+        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/><mimic joint="k"/>'
+        '<safety_controller k_velocity="1"/><calibration rising="0"/></joint>'
+    )
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, ""), nothing, joint))
+    copy.write(tmp_path / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    assert [record.getMessage() for record in caplog.records] == []
+
+
+def test_a_material_of_two_colours_becomes_two(tmp_path):
+    black = '<material name="black"><color rgba="0 0 0 {}"/></material>'
+    box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
+    parts = [
+        black.format("1"),
+        LINK.format("a", GOOD, box.format(black.format("1.0"))),
+        LINK.format("b", GOOD, box.format(black.format("0.9"))),
+        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>',
+    ]
+    copy = simulatable_copy(written(tmp_path, *parts))
+    assert [one.get("name") for one in copy.root.iter("material")] == ["black", "black", "black_1"]
+    copy.write(tmp_path / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    assert copy.notes == ["the material 'black' has 2 colours; now each has its own name"]
