@@ -184,39 +184,48 @@ def sample_weights(set_index: np.ndarray, samples_per_set: float) -> np.ndarray:
     return samples_per_set / np.bincount(set_index)[set_index]
 
 
-def fitted_shift(
-    logit: np.ndarray,
-    is_unsafe: np.ndarray,
-    nominal_is_unsafe: np.ndarray,
-    *,
-    weight: np.ndarray,
-    prior_std: float,
-) -> float:
-    """The one number b that makes sigma(L + b) fit what the feedback says.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcomes:
+    """How segments were judged, and how they ended.
 
-    The target of a segment is sigma(L) plus the difference of the pair's labels: the twins take
-    out what L is wrong about on the nominal plant, too, and without a differing pair b is 0.
+    Attributes:
+        logit: L of each, (M,).
+        is_unsafe: Whether its episode ended unsafely, (M,).
+        weight: Independent samples that it counts for, (M,).
+    """
+
+    logit: np.ndarray
+    is_unsafe: np.ndarray
+    weight: np.ndarray
+
+    def surplus(self, shift: float = 0.0) -> float:
+        """Unsafe segments that sigma(L + shift) expects beyond those that there were."""
+        from scipy.special import expit
+
+        return float(self.weight @ (expit(self.logit + shift) - self.is_unsafe))
+
+
+def fitted_shift(actual: Outcomes, nominal: Outcomes, *, prior_std: float) -> float:
+    """The one number b for which sigma(L + b) is as right of the actual robot as L of the twins.
+
+    On average over the actual segments, sigma(L + b) exceeds their labels by as much as sigma(L)
+    exceeds the twins' labels over the twins' own segments. What is hard to tell of a start is so
+    for both of a pair, and what L is wrong about on the nominal plant, too, is nothing to adapt to.
 
     Args:
-        logit: L of each segment, (M,).
-        is_unsafe: Whether the actual episode ended unsafely, (M,).
-        nominal_is_unsafe: Whether the twin did, (M,).
-        weight: Independent samples that each segment counts for, (M,).
+        actual: Segments of the actual episodes.
+        nominal: Segments of their twins, of the same weight in all.
         prior_std: Standard deviation of b before any feedback.
     """
-    difference = is_unsafe.astype(float) - nominal_is_unsafe.astype(float)
-    if not difference.any():
-        return 0.0
     from scipy.optimize import brentq
-    from scipy.special import expit
 
-    target = expit(logit) + difference
+    expected = nominal.surplus()
 
     def slope(b: float) -> float:
-        return float(weight @ (expit(logit + b) - target) + b / prior_std**2)
+        return actual.surplus(b) - expected + b / prior_std**2
 
     # The slope of the negative log posterior rises throughout; out there it has the sign of b.
-    bound = 2.0 * float(weight.sum()) * prior_std**2
+    bound = 2.0 * float(actual.weight.sum() + nominal.weight.sum()) * prior_std**2
     return float(brentq(slope, -bound, bound, xtol=1e-10))
 
 

@@ -19,12 +19,13 @@ from drake_safety.learning.assessment_parameters import (
     AssessmentParameters,
 )
 from drake_safety.learning.calibration import Calibration
-from drake_safety.learning.embedding import INPUT_LIMIT, Embedding
+from drake_safety.learning.embedding import INPUT_LIMIT, Embedding, EmbeddingOutput
 from drake_safety.learning.feedback import (
     FeedbackSegments,
     FeedbackSet,
     check_feedback,
     segments_of,
+    twin_segments_of,
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit
@@ -114,7 +115,7 @@ class SafetyAssessment:
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_ = learned_maps(training, x, self.grid_, parameters, progress)
+        self.embedding_, is_held_out = learned_maps(training, x, self.grid_, parameters, progress)
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
@@ -124,7 +125,7 @@ class SafetyAssessment:
         self.training_logit_ = self.training_nearest_ = None
         if self.embedding_.has_heads:
             margins = output.margins.mean(axis=0)
-            self.base_logit_ = fitted_base_logit(margins, segments, parameters)
+            self.base_logit_ = fitted_base_logit(output, is_held_out, segments, parameters)
             self.training_logit_ = _single(self.base_logit_.of_output(output))
             self.training_nearest_ = (
                 margins.argmin(axis=1)
@@ -206,14 +207,9 @@ class SafetyAssessment:
                 self._training, segments, points, *arguments
             )
         elif self.base_logit_ is not None:
-            settings = self.parameters.adaptation
-            b = adaptation.fitted_shift(
-                self.base_logit_.of_output(output),
-                segments.is_unsafe,
-                segments.nominal_is_unsafe,
-                weight=adaptation.sample_weights(segments.set_index, settings.samples_per_set),
-                prior_std=settings.shift_std,
-            )
+            # Outcomes are what counts: with the same ones on both sides there is no evidence.
+            if any(one.differs for one in feedback):
+                b = self._fitted_shift(segments, output, feedback)
             adapted.shift_ = adaptation.cell_shift(b, segments, points, self.grid_)
             adapted.beliefs_ = adaptation.shifted_beliefs(
                 self._training, adapted.shift_, *arguments
@@ -226,6 +222,34 @@ class SafetyAssessment:
             shift=b,
         )
         return adapted
+
+    def _fitted_shift(
+        self,
+        segments: FeedbackSegments,
+        output: EmbeddingOutput,
+        feedback: Sequence[FeedbackSet],
+    ) -> float:
+        assert self.base_logit_ is not None
+        parameters = self.parameters
+        settings = parameters.adaptation
+        twins = twin_segments_of(feedback, stride=parameters.stride, shortest=parameters.shortest)
+        twin_output = self.embedding_.evaluate(
+            self._inputs(twins.state, twins.desired_preview, twins.features)
+        )
+        outcomes = []
+        for one, other, said in ((segments, twins, output), (twins, segments, twin_output)):
+            # A pair of which either side is too short for a segment says nothing.
+            is_paired = np.isin(one.set_index, other.set_index)
+            outcomes.append(
+                adaptation.Outcomes(
+                    logit=self.base_logit_.of_output(said)[is_paired],
+                    is_unsafe=one.is_unsafe[is_paired],
+                    weight=adaptation.sample_weights(
+                        one.set_index[is_paired], settings.samples_per_set
+                    ),
+                )
+            )
+        return adaptation.fitted_shift(*outcomes, prior_std=settings.shift_std)
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
         """The segments of feedback sets, cut as the training episodes were."""

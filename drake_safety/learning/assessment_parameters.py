@@ -74,6 +74,8 @@ class AssessmentParameters:
         batch_size: Segments a training step.
         epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
         ensemble_size: Number of maps K (sharpened).
+        held_out: Share of the episodes that a map does not learn from, others for each map: what
+            the maps say of those makes Gamma a probability (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Share of activations dropped in training (sharpened).
         target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
@@ -108,6 +110,7 @@ class AssessmentParameters:
     batch_size: int = 512
     epochs: int = 18
     ensemble_size: int = 3
+    held_out: float = 0.1
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
     dropout: float = 0.2
     target_weight: float = 0.1
@@ -150,7 +153,8 @@ class AssessmentParameters:
             "shortest_segment", 0 <= self.shortest_segment <= self.horizon, "a value in 0..horizon"
         )
         self._expect("perplexity", self.perplexity >= 1.0, ">= 1")
-        self._expect("dropout", 0.0 <= self.dropout < 1.0, "a value in [0, 1)")
+        for name in ("dropout", "held_out"):
+            self._expect(name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
         self._expect(
             "hidden_sizes",
             bool(self.hidden_sizes) and all(size >= 1 for size in self.hidden_sizes),

@@ -333,6 +333,18 @@ class MapData:
     sample_weight: np.ndarray
     input_scale: np.ndarray
 
+    def take(self, rows: np.ndarray) -> MapData:
+        """Some of the inputs, chosen by a mask (N,)."""
+        return MapData(
+            x=self.x[rows],
+            has_target=self.has_target[rows],
+            target=self.target[rows[self.has_target]],
+            is_unsafe=self.is_unsafe[rows],
+            margins=self.margins[rows],
+            sample_weight=self.sample_weight[rows],
+            input_scale=self.input_scale,
+        )
+
 
 def train_map(
     data: MapData,

@@ -16,11 +16,29 @@ _logger = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class TwinRows:
+    """The inputs x at every start row of a nominal twin.
+
+    Attributes:
+        state: State as the assessor sees it, (M, n_s).
+        desired_preview: Coming desired outputs, (M, H*n_z).
+        features: Features, (M, n_f).
+        steps_since_start: Rows from the episode's `first_step` to each start, (M,).
+        remaining_steps: Steps until the twin ends, (M,).
+    """
+
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    steps_since_start: np.ndarray
+    remaining_steps: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FeedbackSet:
     """One actual episode and its nominal twin from the same state along the same plan.
 
-    Both are known by what adaptation needs: the inputs x at every start row of the actual one, and
-    when either ended.
+    Both are known by what adaptation needs: the inputs x at every start row, and when either ended.
 
     Attributes:
         info: What the actual episodes share.
@@ -32,7 +50,8 @@ class FeedbackSet:
         features: Features, (N, n_f).
         steps_since_start: Rows from the episode's `first_step` to each start, (N,).
         remaining_steps: R, steps until the actual episode ends, (N,).
-        nominal_remaining_steps: Steps until the twin ends, (N,); 0 where it has ended.
+        nominal_remaining_steps: Steps from there until the twin ends, (N,); 0 where it has ended.
+        twin: The twin's own rows.
         is_unsafe: Whether the actual episode ended unsafely.
         nominal_is_unsafe: Whether the twin did.
         cause: Column of the constraint that ended the actual episode, -1 when safe.
@@ -48,6 +67,7 @@ class FeedbackSet:
     steps_since_start: np.ndarray
     remaining_steps: np.ndarray
     nominal_remaining_steps: np.ndarray
+    twin: TwinRows
     is_unsafe: bool
     nominal_is_unsafe: bool
     cause: int
@@ -96,9 +116,12 @@ def feedback_sets(
         if DIVERGED in (episode.cause, twin.cause):
             _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
             continue
-        if episode.num_steps == episode.first_step:
+        if any(one.num_steps == one.first_step for one in (episode, twin)):
             continue
-        segments = split(Episodes(actual.info, [episode]), stride=1, discount=1.0, shortest=1)
+        segments, rows = (
+            split(Episodes(info, [one]), stride=1, discount=1.0, shortest=1)
+            for info, one in ((actual.info, episode), (nominal.info, twin))
+        )
         sets.append(
             FeedbackSet(
                 info=actual.info,
@@ -111,6 +134,13 @@ def feedback_sets(
                 steps_since_start=segments.start_row - episode.first_step,
                 remaining_steps=segments.remaining_steps,
                 nominal_remaining_steps=np.maximum(twin.num_steps - segments.start_row, 0),
+                twin=TwinRows(
+                    state=rows.state,
+                    desired_preview=rows.desired_preview,
+                    features=rows.features,
+                    steps_since_start=rows.start_row - twin.first_step,
+                    remaining_steps=rows.remaining_steps,
+                ),
                 is_unsafe=not episode.is_safe,
                 nominal_is_unsafe=not twin.is_safe,
                 cause=int(segments.cause[0]),
@@ -241,3 +271,50 @@ def segments_of(
             f"segment of {shortest} steps"
         )
     return segments
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TwinSegments:
+    """Segments of the nominal twins, by their own inputs.
+
+    Attributes:
+        set_index: Position of the segment's set, (M,).
+        state: State that Psi is given, (M, n_s).
+        desired_preview: Coming desired outputs, (M, H*n_z).
+        features: Features, (M, n_f).
+        is_unsafe: Whether the twin ended unsafely, (M,).
+    """
+
+    set_index: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    is_unsafe: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.set_index)
+
+
+def twin_segments_of(
+    feedback: Sequence[FeedbackSet], *, stride: int, shortest: int
+) -> TwinSegments:
+    """The segments of the nominal twins, cut as the training episodes were.
+
+    Args:
+        feedback: The feedback sets.
+        stride: Rows between two starts.
+        shortest: Steps that a safe episode's segment has at least.
+    """
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in TwinSegments.__annotations__}
+    for position, one in enumerate(feedback):
+        twin = one.twin
+        is_taken = twin.steps_since_start % stride == 0
+        if not one.nominal_is_unsafe:
+            is_taken &= twin.remaining_steps >= shortest
+        rows = np.flatnonzero(is_taken)
+        parts["set_index"].append(np.full(rows.size, position))
+        parts["state"].append(twin.state[rows])
+        parts["desired_preview"].append(twin.desired_preview[rows])
+        parts["features"].append(twin.features[rows])
+        parts["is_unsafe"].append(np.full(rows.size, one.nominal_is_unsafe))
+    return TwinSegments(**{name: np.concatenate(values) for name, values in parts.items()})

@@ -60,20 +60,24 @@ class Assessment:
 class BaseLogit:
     """L, one logit of an unsafe end from what the maps' heads say.
 
-    It is the mean of the safety heads' logit and of a logit of the smallest predicted margin; a
-    head that is missing leaves the other alone.
+    ``offset + scale h``, where h is the mean of the safety heads' logit and of a logit of the
+    smallest predicted margin; a head that is missing leaves the other alone.
 
     Attributes:
+        margin_unit: Unit of margins [unit of the margins].
+        margin_range: Margins are clipped to this range [unit of the margins].
         intercept: Logit where the smallest margin is zero.
         slope: Logits by which a margin of one unit is safer.
-        margin_unit: That unit [unit of the margins].
-        margin_range: Margins are clipped to this range [unit of the margins].
+        offset: L where h is zero.
+        scale: L's part of h.
     """
 
-    intercept: float
-    slope: float
     margin_unit: float
     margin_range: tuple[float, float]
+    intercept: float = 0.0
+    slope: float = 1.0
+    offset: float = 0.0
+    scale: float = 1.0
 
     def of_output(self, output: EmbeddingOutput) -> np.ndarray:
         """L of all inputs of an `EmbeddingOutput`, (N,); NaN without heads."""
@@ -84,7 +88,7 @@ class BaseLogit:
         safety = np.clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT).mean(axis=0)
         if not heads or np.isfinite(safety).any():
             heads.append(safety)
-        return np.mean(heads, axis=0)
+        return self.offset + self.scale * np.mean(heads, axis=0)
 
     def of_margin(self, margin: np.ndarray) -> np.ndarray:
         """The logit of smallest margins (N,)."""
@@ -107,7 +111,7 @@ class BaseLogit:
             z = self.intercept - self.slope * min(max(margin, low), high) / self.margin_unit
             total += min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT)
             count += 1
-        return total / count
+        return self.offset + self.scale * total / count
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
     Embedding,
+    EmbeddingOutput,
     MapData,
     MapSettings,
     stack_members,
@@ -82,7 +83,7 @@ def learned_maps(
     grid: Grid,
     parameters: AssessmentParameters,
     progress: StageProgress | None,
-) -> Embedding:
+) -> tuple[Embedding, np.ndarray]:
     """t-SNE of the segments, and the maps Psi that reproduce it.
 
     Args:
@@ -91,6 +92,9 @@ def learned_maps(
         grid: The grid that t-SNE's points are scaled to.
         parameters: Of the assessment.
         progress: Called with "distances", "t-SNE", "training" and the fraction that is done.
+
+    Returns:
+        The maps, and which segments each of them did not learn from, (K, N).
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
@@ -121,7 +125,26 @@ def learned_maps(
         sample_weight=_sample_weight(segments, parameters),
         input_scale=_input_scale(x.shape[1], segments.features.shape[1], parameters),
     )
-    return _train(data, parameters, stage("training"))
+    is_held_out = held_out_segments(segments, parameters)
+    return _train(data, is_held_out, parameters, stage("training")), is_held_out
+
+
+def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
+    """Which segments each map does not learn from, (K, N): those of some episodes, others for each.
+
+    Args:
+        segments: The training segments.
+        parameters: Of the assessment.
+    """
+    episodes = np.unique(segments.episode)
+    num_members = parameters.num_members
+    share = parameters.held_out if parameters.is_sharpened else 0.0
+    num_held_out = min(int(share * len(episodes)), len(episodes) // (num_members + 1))
+    rng = np.random.default_rng(np.random.SeedSequence(parameters.seed, spawn_key=(num_members,)))
+    drawn = rng.permutation(episodes)[: num_members * num_held_out]
+    return np.array(
+        [np.isin(segments.episode, fold) for fold in drawn.reshape(num_members, num_held_out)]
+    )
 
 
 def _sample_weight(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
@@ -142,7 +165,10 @@ def _input_scale(
 
 
 def _train(
-    data: MapData, parameters: AssessmentParameters, progress: Callable[[float], None] | None
+    data: MapData,
+    is_held_out: np.ndarray,
+    parameters: AssessmentParameters,
+    progress: Callable[[float], None] | None,
 ) -> Embedding:
     is_sharpened = parameters.is_sharpened
     settings = MapSettings(
@@ -168,7 +194,8 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        members.append(train_map(data, settings, seed=seed, progress=report))
+        learned = data.take(~is_held_out[member])
+        members.append(train_map(learned, settings, seed=seed, progress=report))
     num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
     return _fill_grid(embedding, data) if is_sharpened else embedding
@@ -186,45 +213,63 @@ def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
 
 
 def fitted_base_logit(
-    margins: np.ndarray, segments: Segments, parameters: AssessmentParameters
+    output: EmbeddingOutput,
+    is_held_out: np.ndarray,
+    segments: Segments,
+    parameters: AssessmentParameters,
 ) -> BaseLogit:
-    """Scales the smallest predicted margin to a logit, by logistic regression.
+    """Scales what the maps' heads say to one logit, by logistic regression.
+
+    Each map is asked about the episodes that it has not learned from: of its own it is too sure.
+    Where those are all safe or all unsafe, all segments are taken.
 
     Args:
-        margins: Predicted margins of the training segments, mean of the maps, (N, n_c); n_c is 0
-            without a margin head.
+        output: What the maps say of the training segments.
+        is_held_out: Which of them each map has not learned from, (K, N).
         segments: The training segments.
         parameters: Of the assessment.
     """
+    member, row = np.nonzero(is_held_out)
+    is_unsafe = segments.is_unsafe[row]
+    if not 0 < is_unsafe.sum() < len(is_unsafe):
+        member, row = np.nonzero(np.ones_like(is_held_out))
+        is_unsafe = segments.is_unsafe[row]
+    weight = _sample_weight(segments, parameters)[row]
     logit = BaseLogit(
-        intercept=0.0,
-        slope=1.0,
         margin_unit=parameters.margin_unit,
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
-    if not margins.shape[1]:
-        return logit
+    if output.margins.shape[2]:
+        margin = output.margins[member, row].min(axis=1)
+        scaled = np.clip(margin, *logit.margin_range) / logit.margin_unit
+        intercept, slope = _logistic(-scaled, is_unsafe, weight, LOGIT_LIMIT)
+        logit = replace(logit, intercept=intercept, slope=slope)
+    heads = EmbeddingOutput(
+        output.embedding[member, row][None],
+        output.unsafe_logit[member, row][None],
+        output.margins[member, row][None],
+    )
+    offset, scale = _logistic(logit.of_output(heads), is_unsafe, weight, 1.0)
+    return replace(logit, offset=offset, scale=scale)
+
+
+def _logistic(
+    z: np.ndarray, label: np.ndarray, weight: np.ndarray, limit: float
+) -> tuple[float, float]:
+    """Intercept, at most a limit, and slope, not negative, of a logistic regression on z (N,)."""
     from scipy.optimize import minimize
 
-    scaled = np.clip(margins.min(axis=1), *logit.margin_range) / logit.margin_unit
-    weight = _sample_weight(segments, parameters) / len(segments)
-    is_unsafe = segments.is_unsafe.astype(float)
+    share = weight / weight.sum()
+    y = label.astype(float)
 
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
-        z = values[0] - values[1] * scaled
+        logit = values[0] + values[1] * z
         # As light as a hundredth of a sample: it only keeps separable classes finite.
-        penalty = 0.01 / len(segments) * values
-        residual = weight * (1.0 / (1.0 + np.exp(-np.clip(z, -500.0, 500.0))) - is_unsafe)
-        cost = weight @ (np.logaddexp(0.0, z) - is_unsafe * z) + 0.5 * penalty @ values
-        gradient = np.array([residual.sum(), -residual @ scaled]) + penalty
-        return float(cost), gradient
+        penalty = 0.01 / len(z) * values
+        residual = share * (1.0 / (1.0 + np.exp(-np.clip(logit, -500.0, 500.0))) - y)
+        cost = share @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * penalty @ values
+        return float(cost), np.array([residual.sum(), residual @ z]) + penalty
 
-    found = minimize(
-        loss, [0.0, 1.0], jac=True, method="L-BFGS-B", bounds=[(-LOGIT_LIMIT, LOGIT_LIMIT), (0, 50)]
-    )
-    return BaseLogit(
-        intercept=float(found.x[0]),
-        slope=float(found.x[1]),
-        margin_unit=logit.margin_unit,
-        margin_range=logit.margin_range,
-    )
+    bounds = [(-limit, limit), (0, 50)]
+    found = minimize(loss, [0.0, 1.0], jac=True, method="L-BFGS-B", bounds=bounds)
+    return float(found.x[0]), float(found.x[1])
