@@ -234,29 +234,22 @@ def test_the_average_refuses_cells_that_are_not_as_many_as_beliefs():
         average_cells(np.zeros((3, 3)), np.zeros(2, dtype=int), np.zeros(4))
 
 
-def outcomes(logit, is_unsafe, set_index):
-    return adaptation.Outcomes(
-        logit=logit, is_unsafe=is_unsafe, weight=adaptation.sample_weights(set_index, 3.0)
-    )
+def outcomes(logit, is_unsafe):
+    return adaptation.Outcomes(logit=logit, is_unsafe=is_unsafe)
 
 
 def test_the_shift_solves_its_own_equation():
     rng = np.random.default_rng(0)
-    logit, twin_logit = rng.normal(size=50), rng.normal(size=30)
-    is_unsafe, twin_is_unsafe = rng.random(50) < 0.6, rng.random(30) < 0.3
-    actual = outcomes(logit, is_unsafe, np.repeat([0, 1], [10, 40]))
-    twins = outcomes(twin_logit, twin_is_unsafe, np.repeat([0, 1], [15, 15]))
-    weight = actual.weight
-    np.testing.assert_allclose([weight[:10].sum(), weight[10:].sum()], 3.0)
+    logit, twin_logit = rng.normal(size=(2, 50))
+    is_unsafe, twin_is_unsafe = rng.random(50) < 0.6, rng.random(50) < 0.3
+    actual, twins = outcomes(logit, is_unsafe), outcomes(twin_logit, twin_is_unsafe)
     b = adaptation.fitted_shift(actual, twins, prior_std=2.0)
-    of_twins = twins.weight @ (sigmoid(twin_logit) - twin_is_unsafe)
-    expected = weight @ (sigmoid(logit + b) - is_unsafe)
-    assert expected - of_twins + b / 4.0 == pytest.approx(0.0, abs=1e-6)
+    surplus = np.sum(sigmoid(logit + b) - is_unsafe)
+    of_twins = np.sum(sigmoid(twin_logit) - twin_is_unsafe)
+    assert surplus - of_twins + b / 4.0 == pytest.approx(0.0, abs=1e-6)
     assert b > 0.0
     mirrored = adaptation.fitted_shift(
-        outcomes(-logit, ~is_unsafe, np.repeat([0, 1], [10, 40])),
-        outcomes(-twin_logit, ~twin_is_unsafe, np.repeat([0, 1], [15, 15])),
-        prior_std=2.0,
+        outcomes(-logit, ~is_unsafe), outcomes(-twin_logit, ~twin_is_unsafe), prior_std=2.0
     )
     assert mirrored == pytest.approx(-b, abs=1e-6)
 
@@ -264,16 +257,14 @@ def test_the_shift_solves_its_own_equation():
 def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
     rng = np.random.default_rng(1)
     logit, truth = rng.normal(size=(2, 4000))
-    set_index = np.arange(4000)
     # L knows nothing and is too low; both plants are alike.
     is_unsafe, twin_is_unsafe = rng.random((2, 4000)) < sigmoid(truth + 1.0)
-    both = (outcomes(logit, label, set_index) for label in (is_unsafe, twin_is_unsafe))
+    both = (outcomes(logit, label) for label in (is_unsafe, twin_is_unsafe))
     assert abs(adaptation.fitted_shift(*both, prior_std=2.0)) < 0.15
-    # Were the twins right, all of that would be the actual robot's.
-    right = outcomes(logit, rng.random(4000) < sigmoid(logit), set_index)
-    assert adaptation.fitted_shift(
-        outcomes(logit, is_unsafe, set_index), right, prior_std=2.0
-    ) == pytest.approx(1.0, abs=0.15)
+    # Were L right of the twins, all of that would be the actual robot's.
+    right = outcomes(logit, rng.random(4000) < sigmoid(logit))
+    b = adaptation.fitted_shift(outcomes(logit, is_unsafe), right, prior_std=2.0)
+    assert b == pytest.approx(1.0, abs=0.15)
 
 
 def test_the_shift_finds_the_actual_robot_where_its_states_look_otherwise():
@@ -281,19 +272,14 @@ def test_the_shift_finds_the_actual_robot_where_its_states_look_otherwise():
     rng = np.random.default_rng(2)
     logit = rng.normal(size=4000)
     is_unsafe = rng.random(4000) < sigmoid(logit)
-    set_index = np.arange(4000)
-    twins = outcomes(logit, is_unsafe, set_index)
-    calmer = outcomes(logit - 0.8, is_unsafe, set_index)
+    twins, calmer = outcomes(logit, is_unsafe), outcomes(logit - 0.8, is_unsafe)
     assert adaptation.fitted_shift(calmer, twins, prior_std=2.0) == pytest.approx(0.8, abs=0.01)
 
 
 def test_the_shift_stays_finite_however_large_the_gap():
-    set_index = np.arange(4000)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
     low = np.full(4000, -8.0)
-    b = adaptation.fitted_shift(
-        outcomes(low, every, set_index), outcomes(low, none, set_index), prior_std=2.0
-    )
+    b = adaptation.fitted_shift(outcomes(low, every), outcomes(low, none), prior_std=2.0)
     assert 8.0 < b < 1e6
     assert np.isfinite(b)
 

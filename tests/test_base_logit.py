@@ -1,4 +1,4 @@
-"""The logit L of an unsafe end: scaled by what maps say of episodes that they have not learned from."""
+"""The logit L of an unsafe end: scaled by what maps say of episodes that they have not learned."""
 
 import dataclasses
 

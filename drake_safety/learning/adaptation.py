@@ -171,50 +171,36 @@ def combined(prior: np.ndarray, feedback: np.ndarray) -> np.ndarray:
     return np.where(has_feedback[:, None], both, prior)
 
 
-def sample_weights(set_index: np.ndarray, samples_per_set: float) -> np.ndarray:
-    """Independent samples that each segment counts for, (M,): as many in all for every set.
-
-    An unsafe end comes early, and leaves few segments: counted alike, segments would say less of
-    it than of a safe one.
-
-    Args:
-        set_index: Which feedback set each segment is of, (M,).
-        samples_per_set: What the segments of a set count for together.
-    """
-    return samples_per_set / np.bincount(set_index)[set_index]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcomes:
-    """How segments were judged, and how they ended.
+    """How episodes were judged when they began, and how they ended.
 
     Attributes:
         logit: L of each, (M,).
-        is_unsafe: Whether its episode ended unsafely, (M,).
-        weight: Independent samples that it counts for, (M,).
+        is_unsafe: Whether it ended unsafely, (M,).
     """
 
     logit: np.ndarray
     is_unsafe: np.ndarray
-    weight: np.ndarray
 
     def surplus(self, shift: float = 0.0) -> float:
-        """Unsafe segments that sigma(L + shift) expects beyond those that there were."""
+        """Unsafe ends that sigma(L + shift) expects beyond those that there were."""
         from scipy.special import expit
 
-        return float(self.weight @ (expit(self.logit + shift) - self.is_unsafe))
+        return float(np.sum(expit(self.logit + shift) - self.is_unsafe))
 
 
 def fitted_shift(actual: Outcomes, nominal: Outcomes, *, prior_std: float) -> float:
     """The one number b for which sigma(L + b) is as right of the actual robot as L of the twins.
 
-    On average over the actual segments, sigma(L + b) exceeds their labels by as much as sigma(L)
-    exceeds the twins' labels over the twins' own segments. What is hard to tell of a start is so
-    for both of a pair, and what L is wrong about on the nominal plant, too, is nothing to adapt to.
+    On average sigma(L + b) exceeds the actual episodes' outcomes by as much as sigma(L) exceeds
+    their twins'. What is hard to tell of a start is so for both of a pair and cancels, and so does
+    what L is wrong about on the nominal plant, too. Only how pairs begin is compared: later a twin
+    is in another state, and its end says nothing of where the actual robot is.
 
     Args:
-        actual: Segments of the actual episodes.
-        nominal: Segments of their twins, of the same weight in all.
+        actual: The actual episodes.
+        nominal: Their twins.
         prior_std: Standard deviation of b before any feedback.
     """
     from scipy.optimize import brentq
@@ -225,7 +211,7 @@ def fitted_shift(actual: Outcomes, nominal: Outcomes, *, prior_std: float) -> fl
         return actual.surplus(b) - expected + b / prior_std**2
 
     # The slope of the negative log posterior rises throughout; out there it has the sign of b.
-    bound = 2.0 * float(actual.weight.sum() + nominal.weight.sum()) * prior_std**2
+    bound = 2.0 * (len(actual.logit) + len(nominal.logit)) * prior_std**2
     return float(brentq(slope, -bound, bound, xtol=1e-10))
 
 

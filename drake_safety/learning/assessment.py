@@ -19,13 +19,12 @@ from drake_safety.learning.assessment_parameters import (
     AssessmentParameters,
 )
 from drake_safety.learning.calibration import Calibration
-from drake_safety.learning.embedding import INPUT_LIMIT, Embedding, EmbeddingOutput
+from drake_safety.learning.embedding import INPUT_LIMIT, Embedding
 from drake_safety.learning.feedback import (
     FeedbackSegments,
     FeedbackSet,
     check_feedback,
     segments_of,
-    twin_segments_of,
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit
@@ -209,7 +208,7 @@ class SafetyAssessment:
         elif self.base_logit_ is not None:
             # Outcomes are what counts: with the same ones on both sides there is no evidence.
             if any(one.differs for one in feedback):
-                b = self._fitted_shift(segments, output, feedback)
+                b = self._fitted_shift(feedback)
             adapted.shift_ = adaptation.cell_shift(b, segments, points, self.grid_)
             adapted.beliefs_ = adaptation.shifted_beliefs(
                 self._training, adapted.shift_, *arguments
@@ -223,33 +222,21 @@ class SafetyAssessment:
         )
         return adapted
 
-    def _fitted_shift(
-        self,
-        segments: FeedbackSegments,
-        output: EmbeddingOutput,
-        feedback: Sequence[FeedbackSet],
-    ) -> float:
+    def _fitted_shift(self, feedback: Sequence[FeedbackSet]) -> float:
         assert self.base_logit_ is not None
-        parameters = self.parameters
-        settings = parameters.adaptation
-        twins = twin_segments_of(feedback, stride=parameters.stride, shortest=parameters.shortest)
-        twin_output = self.embedding_.evaluate(
-            self._inputs(twins.state, twins.desired_preview, twins.features)
+        actual = [(one.state[0], one.desired_preview[0], one.features[0]) for one in feedback]
+        twins = [(one.twin_state, one.twin_desired_preview, one.twin_features) for one in feedback]
+        logit, twin_logit = (
+            self.base_logit_.of_output(self.embedding_.evaluate(self._inputs(*map(np.array, x))))
+            for x in (zip(*actual, strict=True), zip(*twins, strict=True))
         )
-        outcomes = []
-        for one, other, said in ((segments, twins, output), (twins, segments, twin_output)):
-            # A pair of which either side is too short for a segment says nothing.
-            is_paired = np.isin(one.set_index, other.set_index)
-            outcomes.append(
-                adaptation.Outcomes(
-                    logit=self.base_logit_.of_output(said)[is_paired],
-                    is_unsafe=one.is_unsafe[is_paired],
-                    weight=adaptation.sample_weights(
-                        one.set_index[is_paired], settings.samples_per_set
-                    ),
-                )
-            )
-        return adaptation.fitted_shift(*outcomes, prior_std=settings.shift_std)
+        return adaptation.fitted_shift(
+            adaptation.Outcomes(logit=logit, is_unsafe=np.array([o.is_unsafe for o in feedback])),
+            adaptation.Outcomes(
+                logit=twin_logit, is_unsafe=np.array([o.nominal_is_unsafe for o in feedback])
+            ),
+            prior_std=self.parameters.adaptation.shift_std,
+        )
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
         """The segments of feedback sets, cut as the training episodes were."""

@@ -20,8 +20,6 @@ class AdaptationParameters:
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
             its own cell, or literally the number of all feedback sets (paper).
         shift_std: Standard deviation of the shift's prior (sharpened) [logit].
-        samples_per_set: How many independent samples the segments of one feedback set count for
-            (sharpened).
     """
 
     gate: float = 0.3
@@ -31,15 +29,13 @@ class AdaptationParameters:
     update_interval: int = 40
     counts_per_cell: bool = True
     shift_std: float = 2.0
-    samples_per_set: float = 3.0
 
     def __post_init__(self) -> None:
         for name in ("least_uncertainty", "first_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in ("gate", "decay_rate"):
             self._expect(name, getattr(self, name) >= 0.0, ">= 0")
-        for name in ("shift_std", "samples_per_set"):
-            self._expect(name, getattr(self, name) > 0.0, "> 0")
+        self._expect("shift_std", self.shift_std > 0.0, "> 0")
         self._expect("update_interval", self.update_interval >= 1, ">= 1")
 
     def _expect(self, name: str, holds: bool, expected: str) -> None:

@@ -16,29 +16,11 @@ _logger = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TwinRows:
-    """The inputs x at every start row of a nominal twin.
-
-    Attributes:
-        state: State as the assessor sees it, (M, n_s).
-        desired_preview: Coming desired outputs, (M, H*n_z).
-        features: Features, (M, n_f).
-        steps_since_start: Rows from the episode's `first_step` to each start, (M,).
-        remaining_steps: Steps until the twin ends, (M,).
-    """
-
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    steps_since_start: np.ndarray
-    remaining_steps: np.ndarray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class FeedbackSet:
     """One actual episode and its nominal twin from the same state along the same plan.
 
-    Both are known by what adaptation needs: the inputs x at every start row, and when either ended.
+    Both are known by what adaptation needs: the inputs x at every start row of the actual one, the
+    twin's at its first, and when either ended.
 
     Attributes:
         info: What the actual episodes share.
@@ -51,7 +33,9 @@ class FeedbackSet:
         steps_since_start: Rows from the episode's `first_step` to each start, (N,).
         remaining_steps: R, steps until the actual episode ends, (N,).
         nominal_remaining_steps: Steps from there until the twin ends, (N,); 0 where it has ended.
-        twin: The twin's own rows.
+        twin_state: State as the assessor sees it at the twin's first row, (n_s,).
+        twin_desired_preview: Coming desired outputs there, (H*n_z,).
+        twin_features: Features there, (n_f,).
         is_unsafe: Whether the actual episode ended unsafely.
         nominal_is_unsafe: Whether the twin did.
         cause: Column of the constraint that ended the actual episode, -1 when safe.
@@ -67,7 +51,9 @@ class FeedbackSet:
     steps_since_start: np.ndarray
     remaining_steps: np.ndarray
     nominal_remaining_steps: np.ndarray
-    twin: TwinRows
+    twin_state: np.ndarray
+    twin_desired_preview: np.ndarray
+    twin_features: np.ndarray
     is_unsafe: bool
     nominal_is_unsafe: bool
     cause: int
@@ -118,10 +104,7 @@ def feedback_sets(
             continue
         if any(one.num_steps == one.first_step for one in (episode, twin)):
             continue
-        segments, rows = (
-            split(Episodes(info, [one]), stride=1, discount=1.0, shortest=1)
-            for info, one in ((actual.info, episode), (nominal.info, twin))
-        )
+        segments = split(Episodes(actual.info, [episode]), stride=1, discount=1.0, shortest=1)
         sets.append(
             FeedbackSet(
                 info=actual.info,
@@ -134,13 +117,9 @@ def feedback_sets(
                 steps_since_start=segments.start_row - episode.first_step,
                 remaining_steps=segments.remaining_steps,
                 nominal_remaining_steps=np.maximum(twin.num_steps - segments.start_row, 0),
-                twin=TwinRows(
-                    state=rows.state,
-                    desired_preview=rows.desired_preview,
-                    features=rows.features,
-                    steps_since_start=rows.start_row - twin.first_step,
-                    remaining_steps=rows.remaining_steps,
-                ),
+                twin_state=twin.state[twin.first_step],
+                twin_desired_preview=twin.desired_preview[twin.first_step],
+                twin_features=twin.features[twin.first_step],
                 is_unsafe=not episode.is_safe,
                 nominal_is_unsafe=not twin.is_safe,
                 cause=int(segments.cause[0]),
@@ -271,50 +250,3 @@ def segments_of(
             f"segment of {shortest} steps"
         )
     return segments
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TwinSegments:
-    """Segments of the nominal twins, by their own inputs.
-
-    Attributes:
-        set_index: Position of the segment's set, (M,).
-        state: State that Psi is given, (M, n_s).
-        desired_preview: Coming desired outputs, (M, H*n_z).
-        features: Features, (M, n_f).
-        is_unsafe: Whether the twin ended unsafely, (M,).
-    """
-
-    set_index: np.ndarray
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    is_unsafe: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.set_index)
-
-
-def twin_segments_of(
-    feedback: Sequence[FeedbackSet], *, stride: int, shortest: int
-) -> TwinSegments:
-    """The segments of the nominal twins, cut as the training episodes were.
-
-    Args:
-        feedback: The feedback sets.
-        stride: Rows between two starts.
-        shortest: Steps that a safe episode's segment has at least.
-    """
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in TwinSegments.__annotations__}
-    for position, one in enumerate(feedback):
-        twin = one.twin
-        is_taken = twin.steps_since_start % stride == 0
-        if not one.nominal_is_unsafe:
-            is_taken &= twin.remaining_steps >= shortest
-        rows = np.flatnonzero(is_taken)
-        parts["set_index"].append(np.full(rows.size, position))
-        parts["state"].append(twin.state[rows])
-        parts["desired_preview"].append(twin.desired_preview[rows])
-        parts["features"].append(twin.features[rows])
-        parts["is_unsafe"].append(np.full(rows.size, one.nominal_is_unsafe))
-    return TwinSegments(**{name: np.concatenate(values) for name, values in parts.items()})
