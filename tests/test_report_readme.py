@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.metrics import Figure, proportion
 from drake_safety.evaluation.report.readme import generate, rewrite_readme
 from drake_safety.evaluation.report.results import Results, read_results, store_results
 from report_runs import make_figures
@@ -83,6 +83,27 @@ def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
     assert "| *the paper's own* | *0.952* | *0.987* | |" in text
     assert "of which 40.0 % (26.4–54.8) are safe" in text
     assert "named for 90.0 % (55.5–99.7) of the 10 rightly refused" in text
+
+
+def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path):
+    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    for prefix in ("plans.sharpened", "plans.other_hand.sharpened", "plans.learning_curve.512"):
+        for column in ("safe_recall", "unsafe_recall", "auc"):
+            figures[f"{prefix}.{column}"] = proportion(19, 20)
+    readme = write_readme(tmp_path, figures)
+    rewrite_readme(readme)
+    text = readme.read_text()
+    assert "loses" not in text
+    assert "| training episodes | safe recall | unsafe recall | AUC |" in text
+    assert "| 512 | 0.950 (0.751–0.999) | 0.950" in text
+    lost = {"safe": Figure(0.011, -0.002, 0.024, 40), "unsafe": Figure(0.0, 0.0, 0.0, 40)}
+    for what, figure in lost.items():
+        figures[f"plans.other_hand.sharpened.{what}_recall_loss"] = figure
+    rewrite_readme(write_readme(tmp_path, figures))
+    assert (
+        "On the same 40 targets, mirrored, the other hand loses 1.1 (-0.2–2.4) points of safe "
+        "recall and 0.0 (0.0–0.0) points of unsafe recall."
+    ) in readme.read_text()
 
 
 def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):

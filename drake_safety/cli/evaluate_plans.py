@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.closed_loop import ClosedLoop
 
+_DEFAULT_OTHER_HAND = 400
 _SETS = {
     "plans": "all targets",
     "plans.fair": "the fair set",
@@ -40,7 +41,7 @@ class PlanOptions:
     """What the command line may ask for beyond verdicts on fresh targets.
 
     Attributes:
-        other_hand: Number of targets for the other hand; None for as many as for the first.
+        other_hand: Number of targets that are mirrored to the other hand; None for the default.
         learning_curve: Numbers of training episodes.
         plane_x: Where the plane of the reachable region is [m]; None for the task's own.
         plane_step: Between two of its simulated targets [m]; 0 leaves it out.
@@ -115,7 +116,9 @@ def evaluate_plans(
     test = plans_of(loop, judged.test_set)
     calibration = plans_of(loop, judged.calibration_set)
     sets = {"plans": test}
-    num_other = len(judged.test_set) if options.other_hand is None else options.other_hand
+    num_other = options.other_hand
+    if num_other is None:
+        num_other = min(len(judged.test_set), _DEFAULT_OTHER_HAND)
     if mirror and num_other:
         # The same draws: what this hand is asked for is the mirror image of what that one was.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)

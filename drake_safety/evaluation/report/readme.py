@@ -148,7 +148,8 @@ def _throws(results: Results) -> list[str]:
 def _targets(results: Results) -> list[str]:
     parts = []
     columns = 3  # Recalls and AUC; the page shows the others, too.
-    for table in verdict_tables(results):
+    tables = verdict_tables(results)
+    for table in tables:
         if table.key != "plans":
             continue
         rows = [
@@ -164,13 +165,34 @@ def _targets(results: Results) -> list[str]:
     sets = one_judge_on_sets(results)
     if len(sets.rows) > 1:
         parts.append(sets.to_markdown())
+    parts.append(_losses(results))
     right = results.figures.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
             f"The right cause is named for {_written(right, _PERCENT)} of the {right.n} rightly "
             "refused targets."
         )
+    for table in tables:
+        if table.key == "learning_curve" and table.rows:
+            parts.append(_retitled(table, "training episodes").to_markdown())
     return parts
+
+
+def _losses(results: Results) -> str:
+    """What `sharpened` loses from the trained hand to the other."""
+    lost = {
+        what: results.figures.get(f"plans.other_hand.sharpened.{what}_recall_loss")
+        for what in ("safe", "unsafe")
+    }
+    told = [
+        f"{_written(figure, _PERCENT).replace(' %', '')} points of {what} recall"
+        for what, figure in lost.items()
+        if figure is not None
+    ]
+    if not told:
+        return ""
+    (n,) = {figure.n for figure in lost.values() if figure is not None}
+    return f"On the same {n} targets, mirrored, the other hand loses {' and '.join(told)}."
 
 
 def _ahead(table: Table) -> str:
