@@ -11,7 +11,7 @@ import typer
 
 from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
 from drake_safety.cli.console import cause_words, new_table, print_shipped
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, save_moving_picture
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
@@ -87,6 +87,9 @@ def run(
     meshcat: Annotated[
         bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
     ] = False,
+    animation: Annotated[
+        bool, typer.Option("--animation", help="Also write a moving picture, animation.gif.")
+    ] = False,
 ) -> None:
     """Simulate once with Γ in the loop: a recording, a timeline, and what happened when.
 
@@ -107,6 +110,7 @@ def run(
         duration_s=duration,
         folder=(out or learned.out) / "run",
         is_live=meshcat,
+        is_animated=animation,
     )
     print_shipped(learned)
     if target is not None:
@@ -145,6 +149,15 @@ def _run_with_balls(settings: RunSettings) -> None:
     )
     recording.save(
         _timeline(loop, log, throws), _table_of_events(loop, settings.assessment, log, throws)
+    )
+    save_moving_picture(
+        settings,
+        loop,
+        log.time_s,
+        {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]},
+        log.extra[loop.trigger_port][:, 0],
+        loop.scenario.parameters.recovery.threshold,
+        [start for start, _ in log.recovery_intervals_s],
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from drake_safety.cli.console import console, print_path
 from drake_safety.cli.provenance import command_line, versions
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
     from rich.table import Table
@@ -36,6 +38,7 @@ class RunSettings:
         duration_s: How long to simulate [s]; None for as long as this kind of run takes.
         folder: Where recording and pictures go.
         is_live: Whether somebody watches in the browser, in real time.
+        is_animated: Whether a moving picture is wanted, too.
     """
 
     scenario: Scenario
@@ -47,6 +50,7 @@ class RunSettings:
     duration_s: float | None
     folder: Path
     is_live: bool
+    is_animated: bool = False
 
     @property
     def realtime_rate(self) -> float:
@@ -111,6 +115,43 @@ class Recording:
         print_path("recording", recording)
         for path in pictures:
             print_path("picture  ", path)
+
+
+def save_moving_picture(
+    settings: RunSettings,
+    loop: ClosedLoop,
+    time_s: np.ndarray,
+    states: Mapping[str, np.ndarray],
+    gamma: np.ndarray,
+    threshold: float,
+    event_times_s: Sequence[float],
+) -> None:
+    """Writes animation.gif beside the recording, if it was asked for.
+
+    Args:
+        settings: Of the run.
+        loop: The closed loop that was simulated.
+        time_s: Instants of its log [s], (N,).
+        states: Per model instance by name its positions and velocities, (N, n).
+        gamma: Safety probability, (N,).
+        threshold: Below it something is done.
+        event_times_s: When it was [s].
+    """
+    if not settings.is_animated:
+        return
+    from drake_safety.evaluation.animation import save_animation
+    from drake_safety.evaluation.stills import stack_positions
+
+    path = save_animation(
+        loop,
+        time_s,
+        stack_positions(loop, states),
+        gamma,
+        threshold,
+        settings.folder / "animation.gif",
+        event_times_s=event_times_s,
+    )
+    print_path("animation", path)
 
 
 def _events_json(events: Table) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.cli.console import cause_words, console, new_table
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, save_moving_picture
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 
 if TYPE_CHECKING:
@@ -85,6 +85,16 @@ def run_to_target(
     recording.save(
         draw_motion(loop, motion, threshold),
         table_of_motion(loop, settings.assessment, motion, threshold),
+    )
+    alarm = alarm_row(motion, threshold)
+    save_moving_picture(
+        settings,
+        loop,
+        motion.time_s,
+        {loop.robot.name: motion.plant_state},
+        motion.extra["calibrated_safety_probability"][:, 0],
+        threshold,
+        [] if alarm is None else [float(motion.time_s[alarm])],
     )
     return True
 

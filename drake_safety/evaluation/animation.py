@@ -1,0 +1,106 @@
+"""A run as a moving picture: the robot, and Gamma up to the instant that is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    INK,
+    SAFE_COLOUR,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+)
+from drake_safety.evaluation.stills import StillCamera
+
+if TYPE_CHECKING:
+    from drake_safety.simulation.closed_loop import ClosedLoop
+
+_WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 6.4, 4.0, 1.15  # [inches]
+_DOTS_PER_INCH = 100
+_FRAMES_PER_SECOND = 15.0
+
+
+def save_animation(
+    loop: ClosedLoop,
+    time_s: np.ndarray,
+    positions: np.ndarray,
+    gamma: np.ndarray,
+    threshold: float,
+    path: Path,
+    *,
+    event_times_s: Sequence[float] = (),
+    frames_per_second: float = _FRAMES_PER_SECOND,
+) -> Path:
+    """Writes a GIF of a logged run, in real time.
+
+    Args:
+        loop: The closed loop that was simulated, or one with the same plant.
+        time_s: Instants of the log [s], (N,), increasing.
+        positions: All of the plant's positions at these instants, (N, n_q).
+        gamma: Safety probability, (N,).
+        threshold: Below it something is done.
+        path: Where to write it.
+        event_times_s: When something was done, each a mark on the curve [s].
+        frames_per_second: Of the picture.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: Logs of different lengths, or a rate that is not positive.
+    """
+    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    if not len(time_s) == len(positions) == len(gamma) or len(time_s) < 2:
+        raise ValueError(
+            f"animation: {len(time_s)} instants, {len(positions)} positions and {len(gamma)} "
+            "values of Γ; expected as many of each, two at least"
+        )
+    if not frames_per_second > 0.0:
+        raise ValueError(f"animation: frames_per_second must be positive; got {frames_per_second}")
+    instants = np.arange(time_s[0], time_s[-1] + 1e-9, 1.0 / frames_per_second)
+    rows = np.abs(time_s[:, None] - instants).argmin(axis=0)
+    width, height = (round(size * _DOTS_PER_INCH) for size in (_WIDTH, _PICTURE_HEIGHT))
+    camera = StillCamera(loop, positions[0], width=width, height=height)
+    with drawing_style():
+        fig = new_figure(_WIDTH, _PICTURE_HEIGHT + _GAMMA_HEIGHT)
+        FigureCanvasAgg(fig)  # Without one, nothing draws what moves.
+        fig.set_layout_engine("none")
+        share = _GAMMA_HEIGHT / (_PICTURE_HEIGHT + _GAMMA_HEIGHT)
+        picture_axes = fig.add_axes((0.0, share, 1.0, 1.0 - share))
+        picture_axes.set_axis_off()
+        picture = picture_axes.imshow(camera.render(positions[0]))
+        axes = fig.add_axes((0.09, 0.34 * share, 0.88, 0.58 * share))
+        axes.set_xlim(time_s[0], time_s[-1])
+        axes.set_ylim(-0.05, 1.05)
+        axes.set_yticks([0.0, 1.0])
+        axes.set_ylabel("Γ", rotation=0, labelpad=8)
+        axes.set_xlabel("time [s]", labelpad=0)
+        axes.axhline(threshold, color=FAINT_INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        (curve,) = axes.plot([], [], color=INK, linewidth=1.6)
+        (dot,) = axes.plot([], [], marker="o", markersize=7)
+        marks = [
+            axes.axvline(event, color=UNSAFE_COLOUR, linewidth=1.2, visible=False)
+            for event in event_times_s
+        ]
+
+        def draw(frame: int) -> list:
+            row = rows[frame]
+            picture.set_data(camera.render(positions[row]))
+            curve.set_data(time_s[: row + 1], gamma[: row + 1])
+            dot.set_data([time_s[row]], [gamma[row]])
+            dot.set_color(SAFE_COLOUR if gamma[row] >= threshold else UNSAFE_COLOUR)
+            for mark, event in zip(marks, event_times_s, strict=True):
+                mark.set_visible(bool(event <= time_s[row]))
+            return [picture, curve, dot, *marks]
+
+        moving = FuncAnimation(fig, draw, frames=len(rows), init_func=lambda: [])
+        moving.save(path, writer=PillowWriter(fps=round(frames_per_second)), dpi=_DOTS_PER_INCH)
+    return path
