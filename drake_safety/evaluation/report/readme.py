@@ -141,8 +141,24 @@ def _throws(results: Results) -> list[str]:
         f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
         f"falls in {_written(alone, _PERCENT)}."
     )
-    ahead = _ahead(table)
-    return [remark, _retitled(table, "trigger").to_markdown(), ahead]
+    return [remark, _retitled(table, "trigger").to_markdown(), _ahead(table), _broken(results)]
+
+
+def _broken(results: Results) -> str:
+    """In how many of the successful recoveries something happened that hardware would not bear."""
+    prefix = "throws.sharpened.recoveries_with_"
+    found = {
+        key.removeprefix(prefix).replace("_", " "): figure
+        for key, figure in results.figures.items()
+        if key.startswith(prefix)
+    }
+    if not found:
+        return ""
+    counts = [f"{kind} {round(figure.value * figure.n)}" for kind, figure in found.items()]
+    (n,) = {figure.n for figure in found.values()}
+    return (
+        f"Of {n} successful recoveries by `sharpened`, so many break a limit: {', '.join(counts)}."
+    )
 
 
 def _targets(results: Results) -> list[str]:
