@@ -1,5 +1,7 @@
 """The moving picture of a run."""
 
+import itertools
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -41,7 +43,7 @@ def test_a_gif_shows_every_instant_in_real_time(loop, tmp_path):
             frames.append(np.asarray(gif.convert("RGB"), dtype=float))
     robot = slice(0, round(0.75 * len(frames[0])))
     # The robot moves, and so does what is drawn of Gamma below it.
-    for before, after in zip(frames, frames[1:], strict=False):
+    for before, after in itertools.pairwise(frames):
         assert np.abs(before - after)[robot].max() > 50.0
         assert np.abs(before - after)[robot.stop :].max() > 50.0
 
