@@ -19,11 +19,14 @@ from drake_safety.evaluation.figure_style import (
 from drake_safety.evaluation.stills import StillCamera
 
 if TYPE_CHECKING:
+    from PIL import Image
+
     from drake_safety.simulation.closed_loop import ClosedLoop
 
-_WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 6.4, 4.0, 1.15  # [inches]
+_WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 5.6, 3.5, 1.1  # [inches]
 _DOTS_PER_INCH = 100
-_FRAMES_PER_SECOND = 15.0
+_FRAMES_PER_SECOND = 12.5
+_COLOURS, _PALETTE_FRAMES = 255, 8
 
 
 def save_animation(
@@ -55,8 +58,8 @@ def save_animation(
     Raises:
         ValueError: Logs of different lengths, or a rate that is not positive.
     """
-    from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     if not len(time_s) == len(positions) == len(gamma) or len(time_s) < 2:
         raise ValueError(
@@ -71,7 +74,8 @@ def save_animation(
     camera = StillCamera(loop, positions[0], width=width, height=height)
     with drawing_style():
         fig = new_figure(_WIDTH, _PICTURE_HEIGHT + _GAMMA_HEIGHT)
-        FigureCanvasAgg(fig)  # Without one, nothing draws what moves.
+        fig.set_dpi(_DOTS_PER_INCH)
+        canvas = FigureCanvasAgg(fig)
         fig.set_layout_engine("none")
         share = _GAMMA_HEIGHT / (_PICTURE_HEIGHT + _GAMMA_HEIGHT)
         picture_axes = fig.add_axes((0.0, share, 1.0, 1.0 - share))
@@ -85,22 +89,33 @@ def save_animation(
         axes.set_xlabel("time [s]", labelpad=0)
         axes.axhline(threshold, color=FAINT_INK, linewidth=1.0, linestyle=(0, (4, 3)))
         (curve,) = axes.plot([], [], color=INK, linewidth=1.6)
-        (dot,) = axes.plot([], [], marker="o", markersize=7)
+        (dot,) = axes.plot([], [], marker="o", markersize=7, clip_on=False)
         marks = [
             axes.axvline(event, color=UNSAFE_COLOUR, linewidth=1.2, visible=False)
             for event in event_times_s
         ]
 
-        def draw(frame: int) -> list:
-            row = rows[frame]
+        frames = []
+        for row in rows:
             picture.set_data(camera.render(positions[row]))
             curve.set_data(time_s[: row + 1], gamma[: row + 1])
             dot.set_data([time_s[row]], [gamma[row]])
             dot.set_color(SAFE_COLOUR if gamma[row] >= threshold else UNSAFE_COLOUR)
             for mark, event in zip(marks, event_times_s, strict=True):
                 mark.set_visible(bool(event <= time_s[row]))
-            return [picture, curve, dot, *marks]
-
-        moving = FuncAnimation(fig, draw, frames=len(rows), init_func=lambda: [])
-        moving.save(path, writer=PillowWriter(fps=round(frames_per_second)), dpi=_DOTS_PER_INCH)
+            canvas.draw()
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    # With one palette for all, what stands still is stored once.
+    joined = _joined(frames[:: max(len(frames) // _PALETTE_FRAMES, 1)])
+    # Not by the median cut: a ball has few pixels, and a colour of its own.
+    palette = joined.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
+    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration_ms = round(100 / frames_per_second) * 10  # GIFs count in hundredths of a second.
+    first.save(path, save_all=True, append_images=others, duration=duration_ms, loop=0)
     return path
+
+
+def _joined(frames: Sequence[Image.Image]) -> Image.Image:
+    from PIL import Image
+
+    return Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames]))
