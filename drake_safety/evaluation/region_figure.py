@@ -43,6 +43,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
     y, z = region.simulated_y_m, region.simulated_z_m
     with drawing_style():
         fig = new_figure(8.6, 5.0)
+        fig.set_layout_engine("compressed")  # Axes of equal scales, and room for their labels.
         axes = fig.subplots()
         handles = _draw_outcomes(axes, region, constraint_names)
         if region.obstacle_distance_m is not None and (region.obstacle_distance_m < 0).any():
