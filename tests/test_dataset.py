@@ -148,6 +148,18 @@ def test_info_and_extra_are_plain_json(tmp_path):
     assert read_info(tmp_path) == (make_info(), {"command": "train cart", "gain": 0.1})
 
 
+def test_a_set_that_goes_on_is_told_by_the_command_that_it_goes_on_with(tmp_path):
+    info = make_info()
+    with EpisodeWriter(tmp_path, info, extra={"command": "train --episodes 2", "kept": 1}):
+        pass
+    with EpisodeWriter(tmp_path, info, extra={"command": "train --episodes 4"}):
+        pass
+    assert read_info(tmp_path) == (info, {"command": "train --episodes 4", "kept": 1})
+    with EpisodeWriter(tmp_path, info):
+        pass
+    assert read_info(tmp_path)[1]["command"] == "train --episodes 4"
+
+
 def test_extra_that_json_cannot_hold_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(ValueError, match="JSON types"):
         EpisodeWriter(tmp_path, make_info(), {"when": object()})

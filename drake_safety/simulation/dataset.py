@@ -54,7 +54,7 @@ class EpisodeWriter:
         path: The folder; made if it does not exist.
         info: What all episodes share.
         extra: Anything else worth keeping in ``info.json``, as JSON types (the command, the
-            scenario's text, ...). On going on, what the folder already holds is kept.
+            scenario's text, ...). On going on, it replaces entries of the same names.
         flush_episodes: Number of pending episodes that make a shard.
         flush_seconds: Age of the oldest pending episode that makes a shard [s]; looked at when an
             episode is appended.
@@ -160,7 +160,8 @@ def open_folder(
     Args:
         path: The folder.
         info: What the set shares.
-        extra: What else a new folder's ``info.json`` holds, as JSON types.
+        extra: What else ``info.json`` holds, as JSON types. It replaces entries of the same names:
+            a set that goes on is told by the command that it goes on with.
 
     Raises:
         ValueError: The folder holds another set, or is not such a folder.
@@ -168,8 +169,10 @@ def open_folder(
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if (path / _INFO_NAME).exists():
-        stored, _ = read_info(path)
+        stored, known = read_info(path)
         _check_same_set(path, stored, info)
+        if known != (told := {**known, **(extra or {})}):
+            _write_info(path, stored, told)
     else:
         _write_info(path, info, extra or {})
 
