@@ -25,7 +25,7 @@ def write_readme(folder, figures, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
     store_results(
         Results(figures=figures, entries=ENTRIES),
         folder / "docs/results/lip.json",
-        train_command="drake-safety train lip --out=/somebodys/own/lip",
+        train_command="drake-safety train lip --resume --out=/somebodys/own/lip",
     )
     readme = folder / "README.md"
     readme.write_text(text)

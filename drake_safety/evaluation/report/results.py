@@ -141,7 +141,8 @@ def _indented(entries: Mapping[str, Any]) -> str:
 
 
 def _portable(command: str) -> str:
-    words = shlex.split(command)
+    # Going on gives what one call would have given.
+    words = [word for word in shlex.split(command) if word != "--resume"]
     for i, word in enumerate(words):
         option, equals, value = word.partition("=")
         if equals and option in _FOLDER_OPTIONS and Path(value).is_absolute():
