@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.mishap import Mishap
 from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.rollouts import Recorder, episode_rng
 
@@ -16,7 +17,7 @@ _PORTS = ("output", "margins", "plant_state")
 
 
 @dataclass(kw_only=True, eq=False)
-class GoalMotion:
+class GoalMotion(Mishap):
     """One motion: rows every ``log_period_s``, and what came of it.
 
     Attributes:
@@ -26,9 +27,7 @@ class GoalMotion:
         output: What shall reach the goal, measured, in the world, (N, 3) [m].
         margins: (N, n_c), of the true state.
         plant_state: (N, n_q + n_v) of the robot alone.
-        leave_time_s: When it left the safe set [s]; infinite if it did not.
-        cause: The constraint that was violated then; "" if it did not.
-        fall_time_s: When the robot fell [s]; infinite if it did not.
+        cause: The constraint that was violated when it left; "" if it did not.
         extra: Other ports that were asked for, (N, size) each.
     """
 
@@ -38,20 +37,8 @@ class GoalMotion:
     output: np.ndarray
     margins: np.ndarray
     plant_state: np.ndarray
-    leave_time_s: float
     cause: str
-    fall_time_s: float
     extra: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def has_left(self) -> bool:
-        """Whether the robot left its safe set."""
-        return math.isfinite(self.leave_time_s)
-
-    @property
-    def has_fallen(self) -> bool:
-        """Whether the robot fell."""
-        return math.isfinite(self.fall_time_s)
 
     @property
     def miss_m(self) -> float:

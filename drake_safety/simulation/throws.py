@@ -19,6 +19,7 @@ from pydrake.systems.framework import Context
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.mishap import Mishap
 from drake_safety.simulation.rollouts import (
     Progress,
     Recorder,
@@ -36,7 +37,7 @@ _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
 
 @dataclass(kw_only=True, eq=False)
-class ThrowLog:
+class ThrowLog(Mishap):
     """One throw: rows every ``log_period_s``, and what came of it.
 
     Attributes:
@@ -49,8 +50,6 @@ class ThrowLog:
         margins: (N, n_c), of the true state.
         plant_state: (N, n_q + n_v) of the robot alone.
         trigger_time_s: When recovery was triggered [s]; NaN without.
-        fall_time_s: When the robot fell [s]; infinite if it did not.
-        leave_time_s: When it left the safe set [s]; infinite if it did not.
         recovery_active: (N,), whether a recovery step was under way.
         violations: Rows in which what must not happen did: see :class:`ViolationCounter`.
         extra: Other ports that were asked for, (N, size) each.
@@ -65,21 +64,9 @@ class ThrowLog:
     margins: np.ndarray
     plant_state: np.ndarray
     trigger_time_s: float
-    fall_time_s: float
-    leave_time_s: float
     recovery_active: np.ndarray
     violations: dict[str, int] = field(default_factory=dict)
     extra: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def has_fallen(self) -> bool:
-        """Whether the robot fell."""
-        return math.isfinite(self.fall_time_s)
-
-    @property
-    def has_left(self) -> bool:
-        """Whether the robot left its safe set."""
-        return math.isfinite(self.leave_time_s)
 
     @property
     def recovery_intervals_s(self) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.simulation.goal_motion import GoalMotion
+from drake_safety.simulation.mishap import Mishap
 from drake_safety.simulation.throws import ThrowLog
 
 SEEN = ("state", "desired_preview", "features")
@@ -15,7 +16,7 @@ SEEN = ("state", "desired_preview", "features")
 
 
 @dataclass(kw_only=True, eq=False)
-class WatchedMotion:
+class WatchedMotion(Mishap):
     """One motion, pushed or not: rows of what a monitor sees, and what came of it.
 
     Attributes:
@@ -26,8 +27,6 @@ class WatchedMotion:
         desired_preview: (N, H n_z).
         features: (N, n_f).
         margins: (N, n_c), of the true state.
-        leave_time_s: When the robot left its safe set [s]; infinite if it did not.
-        fall_time_s: When it fell [s]; infinite if it did not.
     """
 
     index: int
@@ -37,18 +36,6 @@ class WatchedMotion:
     desired_preview: np.ndarray
     features: np.ndarray
     margins: np.ndarray
-    leave_time_s: float
-    fall_time_s: float
-
-    @property
-    def has_left(self) -> bool:
-        """Whether the robot left its safe set."""
-        return math.isfinite(self.leave_time_s)
-
-    @property
-    def has_fallen(self) -> bool:
-        """Whether the robot fell."""
-        return math.isfinite(self.fall_time_s)
 
     @classmethod
     def of_throw(cls, log: ThrowLog) -> WatchedMotion:
