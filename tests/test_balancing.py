@@ -286,12 +286,12 @@ def test_starts_are_inside_the_ranges_that_the_scenario_gives():
 def test_feet_are_at_rest_in_a_moving_start():
     """0 = J v: what the base does, the legs allow for."""
     scenario = scenario_of(PACKAGED)
-    text = yaml.safe_load(scenario.to_yaml().split("---")[0])
-    body = yaml.safe_load(scenario.to_yaml().split("---")[1])
-    body["start"] |= {"velocity_std_m_s": [0.5, 0.3, 0.1], "angular_velocity_std_rad_s": 0.4}
-    loop = parse_scenario(
-        yaml.safe_dump(text | {"parameters": body}), name="moving", folder=Path("/")
-    ).make_loop()
+    text = yaml.safe_load(scenario.to_yaml())
+    text["parameters"]["start"] |= {
+        "velocity_std_m_s": [0.5, 0.3, 0.1],
+        "angular_velocity_std_rad_s": 0.4,
+    }
+    loop = parse_scenario(yaml.safe_dump(text), name="moving", folder=Path("/")).make_loop()
     kinematics = loop.kinematics
     for seed in range(5):
         context = loop.CreateDefaultContext()

@@ -152,6 +152,14 @@ def test_the_canonical_text_keeps_every_value(tmp_path):
     assert "mass_scale: 1.2" in parsed(text).to_yaml()
 
 
+@pytest.mark.parametrize("name", scenario_names())
+def test_the_canonical_text_is_the_scenario_again(name):
+    scenario = load_scenario(name)
+    again = parse_scenario(scenario.to_yaml(), name=name, folder=Path("/"))
+    assert again == scenario
+    assert again.simulation_hash() == scenario.simulation_hash()
+
+
 def test_the_same_text_has_the_same_hash_and_order_does_not_matter():
     other = "robot: none\n" + SCENARIO.replace("robot: none\n", "")
     assert parsed(SCENARIO).simulation_hash() == parsed(other).simulation_hash()

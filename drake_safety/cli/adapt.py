@@ -61,11 +61,14 @@ def adapt(
         typer.Option("--scratch", help="Judging: also train from scratch on the feedback itself."),
     ] = False,
     log: Annotated[
-        Path | None,
-        typer.Option(help="Log of a real robot, in place of a simulated variation.", exists=True),
+        list[Path] | None,
+        typer.Option(
+            help="Log of a real robot, in place of a simulated variation; may be repeated.",
+            exists=True,
+        ),
     ] = None,
     log_map: Annotated[
-        Path | None, typer.Option("--map", help="What is where in the log, a YAML file.")
+        Path | None, typer.Option("--map", help="What is where in the logs, a YAML file.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 2_000_000,
     workers: WorkersOption = None,
@@ -73,9 +76,9 @@ def adapt(
     """Adapt Γ to what an actual robot does, and judge it before and after.
 
     Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
-    --log it is named after the log. Episodes are kept in ASSESSMENT: an adaptation that was stopped
-    goes on when it is called again. For an assessment that came with the package, ASSESSMENT is
-    runs/SCENARIO-shipped.
+    --log it is named after the first log. Episodes are kept in ASSESSMENT: an adaptation that was
+    stopped goes on when it is called again. For an assessment that came with the package,
+    ASSESSMENT is runs/SCENARIO-shipped.
     """
     from drake_safety.evaluation.adaptation_figure import adaptation_figure
     from drake_safety.evaluation.figure_style import save
@@ -90,16 +93,19 @@ def adapt(
             f"adapt: seeds {used.start} to {used.stop - 1} would be used, and "
             f"{priors[MODES[0]].info_.seed} is the training episodes' own; choose another"
         )
-    if (log is None) != (log_map is None):
+    logs = log or []
+    if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log and --map go together: a log is read by its map")
-    if log is not None and evaluate:
+    if logs and evaluate:
         raise ValueError("adapt: there is nothing fresh in a log to judge by; leave out --evaluate")
-    name = variation if log is None else log.stem
+    if len({one.resolve() for one in logs}) < len(logs):
+        raise ValueError(f"adapt: each log counts once; got {', '.join(str(one) for one in logs)}")
+    name = logs[0].stem if logs else variation
     print_shipped(learned)
     folder = adapted_folder(learned.out, name)
     with open_stages() as stages:
-        if log is not None and log_map is not None:
-            pairs = _logged_pairs(loaded, log, log_map, seed)
+        if log_map is not None:
+            pairs = _logged_pairs(loaded, logs, log_map, seed)
         else:
             pairs = _run_pairs(loaded, feedback, variation, seed, learned.out, workers, stages)
         sets = pairs.feedback()
@@ -133,7 +139,7 @@ def adapt(
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,
         "variation": name,
-        "log": None if log is None else str(log),
+        "logs": [str(one) for one in logs],
         "seed": seed,
         "feedback_sets": num_pairs,
         "differing_pairs": differing,
@@ -181,13 +187,14 @@ def _run_pairs(
     )
 
 
-def _logged_pairs(scenario: Scenario, log: Path, log_map: Path, seed: int) -> EpisodePairs:
-    from drake_safety.logs.episodes import cut_log
+def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int) -> EpisodePairs:
+    from drake_safety.logs.episodes import cut_logs
     from drake_safety.logs.robot_log import read_log
     from drake_safety.models import load_robot
     from drake_safety.simulation.feedback import pair_starts
 
-    actual, starts = cut_log(read_log(log, log_map, load_robot(scenario.robot)), scenario)
+    robot = load_robot(scenario.robot)
+    actual, starts = cut_logs([read_log(log, log_map, robot) for log in logs], scenario)
     return pair_starts(scenario, actual, starts, seed=seed)
 
 

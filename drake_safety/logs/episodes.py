@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -94,6 +96,33 @@ def cut_log(
             f"log '{log.path}' lasts {log.duration_s:g} s: too short for a segment of {shortest} "
             f"steps of {scenario.step_s} s of scenario '{scenario.name}'"
         )
+    return Episodes(episodes_info(loop, seed=0), episodes), starts
+
+
+def cut_logs(
+    logs: Sequence[RobotLog],
+    loop: ClosedLoop | Scenario,
+    *,
+    desired_output: np.ndarray | None = None,
+) -> tuple[Episodes, list[EpisodeStart]]:
+    """The episodes of several logs of one robot, numbered through; see :func:`cut_log`.
+
+    Args:
+        logs: The logs.
+        loop: As for :func:`cut_log`.
+        desired_output: As for :func:`cut_log`, the same for all logs.
+
+    Raises:
+        ValueError: As :func:`cut_log`.
+    """
+    if isinstance(loop, Scenario):
+        loop = loop.make_loop("actual")
+    episodes: list[Episode] = []
+    starts: list[EpisodeStart] = []
+    for log in logs:
+        found, begins = cut_log(log, loop, desired_output=desired_output)
+        episodes += [replace(one, index=len(episodes) + one.index) for one in found]
+        starts += begins
     return Episodes(episodes_info(loop, seed=0), episodes), starts
 
 

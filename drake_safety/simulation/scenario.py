@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import inspect
+import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -110,10 +111,10 @@ class Scenario:
         return task(self, variation, assessment=assessment, meshcat=meshcat, **options)
 
     def to_yaml(self) -> str:
-        """The scenario as canonical text, defaults included."""
+        """The scenario as canonical text, defaults included, that `load_scenario` reads."""
         head = yaml_dump_typed(self, schema=Scenario)
         body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
-        return head + "---\n" + body
+        return head + "parameters:\n" + textwrap.indent(body, "  ")
 
     def simulation_hash(self, variation: str = "nominal") -> str:
         """SHA-256 of all that decides what a rollout does and records, robot included.

@@ -86,14 +86,10 @@ class Run:
     def scenario(self) -> dict[str, Any]:
         """The scenario as it was when the episodes were simulated; empty if that is unknown."""
         try:
-            # The task's own parameters are a document of their own.
-            documents = list(yaml.safe_load_all(str(self.extra.get("scenario_yaml", ""))))
+            read = yaml.safe_load(str(self.extra.get("scenario_yaml", "")))
         except yaml.YAMLError:
             return {}
-        if not documents or not all(isinstance(document, dict) for document in documents):
-            return {}
-        head, *parameters = documents
-        return {**head, "parameters": parameters[0]} if parameters else head
+        return read if isinstance(read, dict) else {}
 
     @property
     def scenario_name(self) -> str:

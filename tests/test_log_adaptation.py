@@ -1,0 +1,90 @@
+"""``drake-safety adapt --log``: feedback from files adapts Γ as the run that was recorded does."""
+
+import numpy as np
+import pytest
+
+from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
+from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
+from drake_safety.learning.segments import Episodes
+from drake_safety.logs.episodes import cut_logs
+from drake_safety.simulation.feedback import EpisodePairs, pair_starts
+from drake_safety.simulation.rollouts import episodes_info
+from log_files import FORMATS, balancing_loop, balancing_scenario, map_text, recorded, write
+from test_cli import call
+
+INDICES = (10, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scenario of short episodes and what was learned from a few of them."""
+    folder = tmp_path_factory.mktemp("short")
+    (folder / "short.yaml").write_text(balancing_scenario().to_yaml())
+    scenario = load_scenario(folder / "short.yaml")
+    episodes = run_episodes(scenario, 48, seed=11, num_workers=1)
+    assert 8 <= episodes.num_unsafe <= 40
+    for mode in MODES:
+        scenario.assessment.mode = mode
+        scenario.assessment.perplexity, scenario.assessment.epochs = 5.0, 20
+        SafetyAssessment(scenario.assessment).fit(episodes).save(assessment_file(folder, mode))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def directly(folder):
+    """What the recorded runs themselves adapt each mode to, without any log."""
+    scenario = load_scenario(folder / "short.yaml")
+    sets = []
+    for loop in (scenario.make_loop("actual"), scenario.make_loop("nominal")):
+        episodes = [run_episode(loop, index) for index in INDICES]
+        sets.append(Episodes(episodes_info(loop, seed=0), episodes))
+    pairs = EpisodePairs(
+        actual=sets[0], nominal=sets[1], nominal_hash=scenario.simulation_hash("nominal")
+    )
+    assert pairs.gap == (1, len(INDICES))
+    return {mode: load(folder, mode).adapt(pairs.feedback()) for mode in MODES}
+
+
+@pytest.fixture(scope="module")
+def unwritten(folder):
+    """What logs adapt to that never were in a file."""
+    scenario = load_scenario(folder / "short.yaml")
+    actual, starts = cut_logs([recorded(index) for index in INDICES], scenario)
+    sets = pair_starts(scenario, actual, starts).feedback()
+    return {mode: load(folder, mode).adapt(sets) for mode in MODES}
+
+
+def load(folder, mode):
+    return SafetyAssessment.load(assessment_file(folder, mode))
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
+    kind, folder, directly, unwritten, tmp_path, monkeypatch
+):
+    joints = balancing_loop().kinematics.joint_names
+    files = []
+    for index in INDICES:
+        (tmp_path / f"{index}").mkdir()
+        files.append(write(recorded(index), joints, kind, tmp_path / f"{index}"))
+    (tmp_path / "columns.yaml").write_text(map_text(kind))
+    logs = [option for file in files for option in ("--log", file)]
+    options = ("--assessment", folder, "--map", tmp_path / "columns.yaml", "--seed", 0)
+    assert not call(monkeypatch, "adapt", folder / "short.yaml", *logs, *options)
+    for mode in MODES:
+        adapted = load(adapted_folder(folder, files[0].stem), mode)
+        assert not np.allclose(adapted.beliefs_, load(folder, mode).beliefs_, atol=0.01)
+        np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
+        np.testing.assert_allclose(adapted.shift_, unwritten[mode].shift_, atol=1e-6)
+        # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
+        np.testing.assert_allclose(adapted.beliefs_, directly[mode].beliefs_, atol=3e-3)
+        np.testing.assert_allclose(adapted.shift_, directly[mode].shift_, atol=0.05)
+
+
+def test_a_log_that_is_given_twice_or_without_a_map_is_refused(folder, capsys, monkeypatch):
+    log, asked = folder / "short.yaml", ("adapt", folder / "short.yaml", "--assessment", folder)
+    assert call(monkeypatch, *asked, "--log", log) == 2
+    assert "--log and --map go together" in capsys.readouterr().out
+    twice = ("--log", log, "--log", log, "--map", log)
+    assert call(monkeypatch, *asked, *twice) == 2
+    assert "each log counts once" in capsys.readouterr().out
