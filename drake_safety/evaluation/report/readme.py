@@ -181,7 +181,7 @@ def _targets(results: Results) -> list[str]:
     sets = one_judge_on_sets(results)
     if len(sets.rows) > 1:
         parts.append(sets.to_markdown())
-    parts.append(_losses(results))
+    parts.append(_differences(results))
     right = results.figures.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
@@ -194,21 +194,29 @@ def _targets(results: Results) -> list[str]:
     return parts
 
 
-def _losses(results: Results) -> str:
-    """What `sharpened` loses from the trained hand to the other."""
+def _points(loss: float) -> str:
+    return f"{0.0 - 100.0 * loss:+.1f}"
+
+
+def _differences(results: Results) -> str:
+    """What `sharpened` gains or loses from the trained hand to the other."""
     lost = {
         what: results.figures.get(f"plans.other_hand.sharpened.{what}_recall_loss")
         for what in ("safe", "unsafe")
     }
     told = [
-        f"{_written(figure, _PERCENT).replace(' %', '')} points of {what} recall"
+        f"{_points(figure.value)} ({_points(figure.high)} to {_points(figure.low)}) points of "
+        f"{what} recall"
         for what, figure in lost.items()
         if figure is not None
     ]
     if not told:
         return ""
     (n,) = {figure.n for figure in lost.values() if figure is not None}
-    return f"On the same {n} targets, mirrored, the other hand loses {' and '.join(told)}."
+    return (
+        f"On the same {n} targets, mirrored, the other hand minus the trained one: "
+        f"{', '.join(told)}."
+    )
 
 
 def _ahead(table: Table) -> str:
