@@ -21,8 +21,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from threadpoolctl import threadpool_limits
 
 from drake_safety import SafetyAssessment, Scenario, run_episodes
-from drake_safety.learning.embedding import Embedding
 from drake_safety.learning.segments import Episodes
+from drake_safety.learning.trained_maps import Embedding
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 PERIOD_S = 0.01

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
-from drake_safety.learning.embedding import EmbeddingOutput
 from drake_safety.learning.prediction import BaseLogit, sigmoid
+from drake_safety.learning.trained_maps import EmbeddingOutput
 from drake_safety.learning.training import fitted_base_logit, held_out_segments, segments_for
 from lip_episodes import make_episodes
 

@@ -3,7 +3,6 @@ import pytest
 
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
-    Embedding,
     MapData,
     MapSettings,
     stack_members,
@@ -11,6 +10,7 @@ from drake_safety.learning.embedding import (
     tsne,
 )
 from drake_safety.learning.segments import split
+from drake_safety.learning.trained_maps import Embedding
 from lip_episodes import make_episodes
 
 SETTINGS = MapSettings(

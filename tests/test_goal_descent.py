@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_safety.learning.embedding import Embedding
 from drake_safety.learning.gradients import logit_gradient
+from drake_safety.learning.trained_maps import Embedding
 from drake_safety.simulation.goal_descent import descend_to_accepted, suggest_goal
 from drake_safety.simulation.planning import nearest_accepted_goal
 from goal_field import BOX, FieldAssessment, GoalTask

@@ -19,7 +19,6 @@ from drake_safety.learning.assessment_parameters import (
     AssessmentParameters,
 )
 from drake_safety.learning.calibration import Calibration
-from drake_safety.learning.embedding import INPUT_LIMIT, Embedding
 from drake_safety.learning.feedback import (
     FeedbackSegments,
     FeedbackSet,
@@ -29,6 +28,7 @@ from drake_safety.learning.feedback import (
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit
 from drake_safety.learning.segments import Episodes
+from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 from drake_safety.learning.training import fitted_base_logit, learned_maps, segments_for
 
 __all__ = [

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.embedding import Embedding
+from drake_safety.learning.trained_maps import Embedding
 
 
 def unsafe_logits(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.embedding import Embedding, EmbeddingOutput
 from drake_safety.learning.grid import OUTSIDE, Grid
+from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 LOGIT_LIMIT = 8.0
 """Largest logit that a head is believed."""

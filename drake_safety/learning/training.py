@@ -11,8 +11,6 @@ import numpy as np
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
-    Embedding,
-    EmbeddingOutput,
     MapData,
     MapSettings,
     stack_members,
@@ -22,6 +20,7 @@ from drake_safety.learning.embedding import (
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
 from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 _INSIDE_SHARE = 0.995
 """Share of the inputs that a map may not send beyond the extent of t-SNE's points."""
