@@ -7,13 +7,12 @@ from types import MappingProxyType
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.obstacles import Clearance, Obstacle
 from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
@@ -42,7 +41,6 @@ from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpola
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
-_MAX_TRIES = 100
 
 
 @dataclass(kw_only=True)
@@ -378,8 +376,8 @@ class Reaching(ClosedLoop):
             ValueError: The goal is not three finite numbers.
             RuntimeError: No posture that is drawn is in the safe set.
         """
-        q = self._sample_posture(rng)
         parameters = self.scenario.parameters
+        q = parameters.start.sample(self.safe_set, rng, self.mirror)
         drawn = rng.uniform(*parameters.target.box)
         detour = push = None
         noise_rng = rng.spawn(1)[0]
@@ -442,7 +440,7 @@ class Reaching(ClosedLoop):
         ends = [planned.value(time).ravel() for time in (start, end)]
         plans = [planned]
         for _ in range(num_plans - 1):
-            detour = rng.uniform(detours.lowest_m, detours.highest_m)
+            detour = detours.draw(rng)
             if self.mirror is not None:
                 detour = self.mirror.points(detour)
             plans.append(interpolate(*ends, end - start, start, detour=detour))
@@ -494,41 +492,6 @@ class Reaching(ClosedLoop):
         hand[:2] += self.kinematics.nominal_base_offset
         v = np.zeros(self.kinematics.num_velocities)
         return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(hand[:, None]))
-
-    def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
-        sampling = self.scenario.parameters.start
-        kinematics = self.kinematics
-        legs = {name for foot in self.robot.feet.values() for name in foot.joints}
-        is_free = np.array([name not in legs for name in kinematics.joint_names])
-        standing = kinematics.standing_positions()
-        p_WC = kinematics.contact_positions(standing)
-        for _ in range(_MAX_TRIES):
-            joints = kinematics.posture + is_free * sampling.joint_offset_rad * rng.uniform(
-                -1, 1, kinematics.num_joints
-            )
-            offset = np.append(
-                rng.uniform(-1, 1, 2) * sampling.base_offset_m,
-                -rng.uniform(0, sampling.base_lowering_m),
-            )
-            rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
-            X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)
-            joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, joints)
-            q = kinematics.positions_at(X_WB, joints)
-            v = np.zeros(kinematics.num_velocities)
-            if self.mirror is not None:
-                # The mirror image of what the trained hand's episode of these draws begins with.
-                q, _ = self.mirror.plant_state(q, v, np.zeros(3))
-            margins = self.safe_set.margins(q, v)
-            clearance = margins[self.safe_set.names.index("collision")]
-            stops = margins[self.safe_set.names.index("joint_limits")]
-            is_clear = clearance >= sampling.clearance_m and stops >= sampling.joint_margin_rad
-            if is_clear and margins.min() > 0:
-                return q
-        raise RuntimeError(
-            f"reaching: none of {_MAX_TRIES} random postures of robot '{self.robot.name}' is in "
-            f"the safe set with a clearance of {sampling.clearance_m} m and "
-            f"{sampling.joint_margin_rad} rad off the joints' stops: narrow 'start'"
-        )
 
     def _set(
         self,

@@ -1,7 +1,5 @@
 """Reaching: starts, targets and ports of any robot with hands, and what is refused."""
 
-import math
-
 import numpy as np
 import pytest
 import yaml
@@ -11,7 +9,7 @@ from drake_safety import load_scenario
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
 from drake_safety.control.obstacles import Obstacle
-from drake_safety.diagrams.reaching import PostureSampling, ReachingParameters, TargetSampling
+from drake_safety.diagrams.reaching import ReachingParameters
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, REQUIRED_PORTS
 from drake_safety.simulation.rollouts import RECORDED_PORTS, episode_rng
 from legged_robots import edited, robot_model, write_biped, write_hexapod, write_porter
@@ -328,12 +326,6 @@ def test_a_decoration_that_can_be_touched_is_refused():
 @pytest.mark.parametrize(
     ("schema", "change", "message"),
     [
-        (PostureSampling, {"base_offset_m": [0.1]}, r"start: base_offset_m must be \[x, y\]"),
-        (PostureSampling, {"base_offset_m": [0.1, -0.1]}, "start: base_offset_m must be finite"),
-        (PostureSampling, {"tilt_rad": -0.1}, "start: tilt_rad must be finite and not negative"),
-        (PostureSampling, {"clearance_m": math.nan}, "start: clearance_m must be finite"),
-        (TargetSampling, {"x_m": [1.0, 0.5]}, r"target: x_m must be \[lowest, highest\], finite"),
-        (TargetSampling, {"z_m": [0.0, math.inf]}, "target: z_m must be"),
         (ReachingParameters, {"plan_duration_s": 0.0}, "plan_duration_s must be positive; got 0.0"),
         (ReachingParameters, {"monitor_period_s": -1.0}, "monitor_period_s must be positive"),
         (
