@@ -24,6 +24,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.physics import Scene, add_physics
+from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
 from drake_safety.simulation.pushes import Push, RandomPushes
 from drake_safety.simulation.reaching_sampling import (
     Detours,
@@ -329,8 +330,7 @@ class Reaching(ClosedLoop):
 
     def is_fair(self, episode: Episode) -> bool:
         """Whether the target is in the fair box, and the plan leads through no obstacle."""
-        start, goal, detour = self._shape_of_plan(episode)
-        path = _points_of_plan(np.linspace(0, 1, _NUM_OUTLOOK)) @ [start, goal, detour]
+        path = points_of_plan(self._shape_of_plan(episode), _NUM_OUTLOOK)
         radius_m = self.robot.reaching_frame(self.hand).radius_m
         is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
         return bool(is_clear) and super().is_fair(episode)
@@ -340,10 +340,7 @@ class Reaching(ClosedLoop):
         # The preview carries no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        seen_s = self.scenario.step_s * np.arange(len(preview))
-        motion = interpolate(np.zeros(1), np.ones(1), duration_s)
-        progress = motion.vector_values(seen_s.tolist()).ravel()
-        shape, *_ = np.linalg.lstsq(_points_of_plan(progress), preview, rcond=None)
+        shape = plan_shape(preview, self.scenario.step_s, duration_s)
         if self.mirror is not None:
             shape = self.mirror.points(shape)
         # An episode begins on the feet of the standing posture.
@@ -537,8 +534,3 @@ class Reaching(ClosedLoop):
             start.plan,
             start.stance_pose(self.kinematics),
         )
-
-
-def _points_of_plan(progress: np.ndarray) -> np.ndarray:
-    """Shares of start, goal and detour in the plan's points, (M, 3), see ``interpolate``."""
-    return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
