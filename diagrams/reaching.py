@@ -305,16 +305,21 @@ class Reaching(ClosedLoop):
     @property
     def target_box(self) -> np.ndarray:
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
-        return self._of_this_hand(self.scenario.parameters.target.box)
+        return np.sort(self._of_this_hand(self.scenario.parameters.target.box), axis=0)
 
     @property
     def fair_box(self) -> np.ndarray:
         """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
         parameters = self.scenario.parameters
-        return self._of_this_hand(parameters.fair.box(parameters.target))
+        return np.sort(self._of_this_hand(parameters.fair.box(parameters.target)), axis=0)
 
-    def _of_this_hand(self, box: np.ndarray) -> np.ndarray:
-        return box if self.mirror is None else np.sort(self.mirror.points(box), axis=0)
+    def _of_this_hand(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) that are told of the trained hand, or the other way round."""
+        return points if self.mirror is None else self.mirror.points(points)
+
+    def _push_of_this_hand(self, push: Push) -> Push:
+        force_n = self._of_this_hand(np.array(push.force_n))
+        return replace(push, force_n=force_n.tolist())
 
     @property
     def mirror_options(self) -> dict[str, str]:
@@ -340,9 +345,7 @@ class Reaching(ClosedLoop):
         # The preview carries no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        shape = plan_shape(preview, self.scenario.step_s, duration_s)
-        if self.mirror is not None:
-            shape = self.mirror.points(shape)
+        shape = self._of_this_hand(plan_shape(preview, self.scenario.step_s, duration_s))
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
@@ -379,19 +382,17 @@ class Reaching(ClosedLoop):
         detour = push = None
         noise_rng = rng.spawn(1)[0]
         if goal is None:
-            goal = drawn if self.mirror is None else self.mirror.points(drawn)
+            goal = self._of_this_hand(drawn)
             if self._is_exploring:
                 push = parameters.random_pushes.sample(rng, self.robot.base)
                 detour = parameters.detours.sample(rng)
-        if detour is not None and self.mirror is not None:
-            detour = self.mirror.points(detour)
+        if detour is not None:
+            detour = self._of_this_hand(detour)
         self._set(context, q, goal, detour)
         self._observers.reseed(context, noise_rng)
         if push is None:
             return 0
-        if self.mirror is not None:
-            push = replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
-        self.set_push(context, push)
+        self.set_push(context, self._push_of_this_hand(push))
         end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
@@ -416,9 +417,7 @@ class Reaching(ClosedLoop):
     def sample_push(self, rng: np.random.Generator) -> Push:
         """A push as episodes begin with it, whatever their share."""
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
-        if self.mirror is None:
-            return push
-        return replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
+        return self._push_of_this_hand(push)
 
     @property
     def rate_names(self) -> list[str]:
@@ -437,9 +436,7 @@ class Reaching(ClosedLoop):
         ends = [planned.value(time).ravel() for time in (start, end)]
         plans = [planned]
         for _ in range(num_plans - 1):
-            detour = detours.draw(rng)
-            if self.mirror is not None:
-                detour = self.mirror.points(detour)
+            detour = self._of_this_hand(detours.draw(rng))
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
 
