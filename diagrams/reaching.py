@@ -1,7 +1,7 @@
 """Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -14,9 +14,10 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.obstacles import Clearance, Obstacle
-from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
+from drake_safety.control.obstacles import Clearance
+from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.control.robot import ObservationNoise, model_file
+from drake_safety.diagrams.reaching_parameters import ReachingParameters
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
@@ -25,15 +26,8 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.physics import Scene, add_physics
 from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
-from drake_safety.simulation.pushes import Push, RandomPushes
-from drake_safety.simulation.reaching_sampling import (
-    Detours,
-    FairTargets,
-    PostureSampling,
-    TargetSampling,
-)
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.view import View
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
@@ -42,59 +36,6 @@ from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpola
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
-
-
-@dataclass(kw_only=True)
-class ReachingParameters:
-    """The task's part of the scenario file."""
-
-    hand: str = ""
-    """The hand that episodes are recorded of, a reaching frame of the robot; its first one by
-    default."""
-    plan_duration_s: float = 3.0
-    """Duration of the planned motion [s]."""
-    monitor_period_s: float = 0.02
-    """Time between two looks at the margins [s]."""
-    clearance_range_m: float = 0.1
-    """Distances to obstacles beyond this count as this [m]."""
-    safe_set: ReachingLimits = field(default_factory=ReachingLimits)
-    start: PostureSampling = field(default_factory=PostureSampling)
-    target: TargetSampling = field(default_factory=TargetSampling)
-    random_pushes: RandomPushes = field(default_factory=RandomPushes)
-    """Pushes that episodes begin with, so that Γ knows what follows one."""
-    detours: Detours = field(default_factory=Detours)
-    fair: FairTargets = field(default_factory=FairTargets)
-    obstacles: list[Obstacle] = field(default_factory=list)
-    decorations: list[Obstacle] = field(default_factory=list)
-    """Models without collision geometry, to be seen."""
-    named_targets: dict[str, list[float]] = field(default_factory=dict)
-    """Targets in the world that can be asked for by name, (3,) [m] each."""
-    pushes: dict[str, Push] = field(default_factory=dict)
-    """Pushes that a run can be disturbed with, by name."""
-    assessment_period_s: float = 0.02
-    """Time between two evaluations of Γ [s]."""
-    view: View = field(default_factory=View)
-    """Where pictures are taken from when the trained hand reaches."""
-
-    def __post_init__(self) -> None:
-        for name in (
-            "plan_duration_s",
-            "monitor_period_s",
-            "clearance_range_m",
-            "assessment_period_s",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
-        if not self.start.clearance_m <= self.clearance_range_m:
-            raise ValueError(
-                f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
-                f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
-            )
-        for name, target in self.named_targets.items():
-            if len(target) != 3 or not np.isfinite(target).all():
-                raise ValueError(
-                    f"reaching: named target '{name}' must be three numbers [m]; got {target}"
-                )
 
 
 class Reaching(ClosedLoop):
