@@ -1,6 +1,5 @@
 """Balancing: a legged robot keeps its base over its feet along a plan, and steps when it must."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,10 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.robot import ObservationNoise
 from drake_safety.control.robot_model import by_pattern
-from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
+from drake_safety.control.safe_sets import BalanceSafeSet
+from drake_safety.diagrams.balancing_parameters import BalancingParameters, fitted_to_robot
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.simulation.balls import Throw
@@ -21,8 +20,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.physics import ENGINES_WITH_BALLS, Scene, add_physics
-from drake_safety.simulation.robot_size import RobotSize, overlaid, scaled_defaults
-from drake_safety.simulation.sampling import PushSampling, Start, StartSampling, calm_start
+from drake_safety.simulation.sampling import Start, calm_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.plan_features import PlanFeatures
@@ -33,69 +31,6 @@ from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpola
 
 _NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
 _LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
-
-_DEFAULT_SIZE = RobotSize(height_m=0.4245, half_length_m=0.2194, half_width_m=0.1245, mass_kg=25.43)
-"""Of a robot that the parameters' defaults fit."""
-_QUANTITIES: dict[str, Any] = {
-    "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
-    "start": {
-        "foot_offset_m": "width",
-        "base_offset_m": ["length", "width"],
-        "base_height_m": "height",
-        "velocity_std_m_s": ["speed_x", "speed_y", "speed_z"],
-        "angular_velocity_std_rad_s": "rate",
-        "target_offset_m": ["length", "width"],
-        "target_height_m": "height",
-        "plan_duration_s": "duration",
-    },
-    "push": {
-        "mass_kg": "mass",
-        "speed_m_s": "speed_y",
-        "height_m": "height",
-        "target_offset_m": ["length", "width"],
-    },
-    "recovery": {
-        "step": {
-            "step_duration_s": "duration",
-            "lift_m": "height",
-            "velocity_gain_s": "duration",
-            "max_reach_m": "height",
-            "min_lateral_m": "width",
-            "settle_speed_m_s": "speed_y",
-            "settle_margin_m": "width",
-            "return_duration_s": "duration",
-        }
-    },
-}
-"""What each parameter that depends on the robot's size is."""
-
-
-@dataclass(kw_only=True)
-class RecoveryParameters:
-    """When the robot steps, and how."""
-
-    threshold: float = 0.6
-    """Γ_thre."""
-    is_normalized: bool = True
-    """Whether the threshold is on b_safe / (1 - μ) or, literally, on b_safe."""
-    assessment_period_s: float = 0.02
-    """Time between two evaluations of Γ [s]."""
-    step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
-
-
-@dataclass(kw_only=True)
-class BalancingParameters:
-    """The task's part of the scenario file."""
-
-    scale_to_robot: bool = False
-    """Whether defaults are scaled to the robot's standing height, foot spacing and mass; what the
-    file states is taken as it is. By default they are those of a robot 0.42 m high, of 25 kg."""
-    safe_set: BalanceLimits = field(default_factory=BalanceLimits)
-    start: StartSampling = field(default_factory=StartSampling)
-    push: PushSampling = field(default_factory=PushSampling)
-    recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
-    demonstration: list[Throw] = field(default_factory=list)
-    """The balls of ``drake-safety run --push ball``."""
 
 
 class Balancing(ClosedLoop):
@@ -296,8 +231,7 @@ class Balancing(ClosedLoop):
         """Scales defaults to the robot where the scenario asks for it."""
         if stated.get("scale_to_robot") is not True:
             return stated
-        factors = RobotSize.of(RobotKinematics(load_robot(robot))).factors(_DEFAULT_SIZE)
-        return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)
+        return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
     @classmethod
     def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, bool]:

@@ -1,23 +1,23 @@
 """Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.control.kinematics import RobotKinematics, fit_stance
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.obstacles import Clearance, Obstacle
-from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
+from drake_safety.control.obstacles import Clearance
+from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.control.robot import ObservationNoise, model_file
+from drake_safety.diagrams.reaching_parameters import ReachingParameters
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
@@ -25,15 +25,9 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.physics import Scene, add_physics
-from drake_safety.simulation.pushes import Push, RandomPushes
-from drake_safety.simulation.reaching_sampling import (
-    Detours,
-    FairTargets,
-    PostureSampling,
-    TargetSampling,
-)
+from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
+from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.view import View
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
@@ -42,60 +36,6 @@ from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpola
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
-_MAX_TRIES = 100
-
-
-@dataclass(kw_only=True)
-class ReachingParameters:
-    """The task's part of the scenario file."""
-
-    hand: str = ""
-    """The hand that episodes are recorded of, a reaching frame of the robot; its first one by
-    default."""
-    plan_duration_s: float = 3.0
-    """Duration of the planned motion [s]."""
-    monitor_period_s: float = 0.02
-    """Time between two looks at the margins [s]."""
-    clearance_range_m: float = 0.1
-    """Distances to obstacles beyond this count as this [m]."""
-    safe_set: ReachingLimits = field(default_factory=ReachingLimits)
-    start: PostureSampling = field(default_factory=PostureSampling)
-    target: TargetSampling = field(default_factory=TargetSampling)
-    random_pushes: RandomPushes = field(default_factory=RandomPushes)
-    """Pushes that episodes begin with, so that Γ knows what follows one."""
-    detours: Detours = field(default_factory=Detours)
-    fair: FairTargets = field(default_factory=FairTargets)
-    obstacles: list[Obstacle] = field(default_factory=list)
-    decorations: list[Obstacle] = field(default_factory=list)
-    """Models without collision geometry, to be seen."""
-    named_targets: dict[str, list[float]] = field(default_factory=dict)
-    """Targets in the world that can be asked for by name, (3,) [m] each."""
-    pushes: dict[str, Push] = field(default_factory=dict)
-    """Pushes that a run can be disturbed with, by name."""
-    assessment_period_s: float = 0.02
-    """Time between two evaluations of Γ [s]."""
-    view: View = field(default_factory=View)
-    """Where pictures are taken from when the trained hand reaches."""
-
-    def __post_init__(self) -> None:
-        for name in (
-            "plan_duration_s",
-            "monitor_period_s",
-            "clearance_range_m",
-            "assessment_period_s",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
-        if not self.start.clearance_m <= self.clearance_range_m:
-            raise ValueError(
-                f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
-                f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
-            )
-        for name, target in self.named_targets.items():
-            if len(target) != 3 or not np.isfinite(target).all():
-                raise ValueError(
-                    f"reaching: named target '{name}' must be three numbers [m]; got {target}"
-                )
 
 
 class Reaching(ClosedLoop):
@@ -306,16 +246,21 @@ class Reaching(ClosedLoop):
     @property
     def target_box(self) -> np.ndarray:
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
-        return self._of_this_hand(self.scenario.parameters.target.box)
+        return np.sort(self._of_this_hand(self.scenario.parameters.target.box), axis=0)
 
     @property
     def fair_box(self) -> np.ndarray:
         """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
         parameters = self.scenario.parameters
-        return self._of_this_hand(parameters.fair.box(parameters.target))
+        return np.sort(self._of_this_hand(parameters.fair.box(parameters.target)), axis=0)
 
-    def _of_this_hand(self, box: np.ndarray) -> np.ndarray:
-        return box if self.mirror is None else np.sort(self.mirror.points(box), axis=0)
+    def _of_this_hand(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) that are told of the trained hand, or the other way round."""
+        return points if self.mirror is None else self.mirror.points(points)
+
+    def _push_of_this_hand(self, push: Push) -> Push:
+        force_n = self._of_this_hand(np.array(push.force_n))
+        return replace(push, force_n=force_n.tolist())
 
     @property
     def mirror_options(self) -> dict[str, str]:
@@ -331,8 +276,7 @@ class Reaching(ClosedLoop):
 
     def is_fair(self, episode: Episode) -> bool:
         """Whether the target is in the fair box, and the plan leads through no obstacle."""
-        start, goal, detour = self._shape_of_plan(episode)
-        path = _points_of_plan(np.linspace(0, 1, _NUM_OUTLOOK)) @ [start, goal, detour]
+        path = points_of_plan(self._shape_of_plan(episode), _NUM_OUTLOOK)
         radius_m = self.robot.reaching_frame(self.hand).radius_m
         is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
         return bool(is_clear) and super().is_fair(episode)
@@ -342,12 +286,7 @@ class Reaching(ClosedLoop):
         # The preview carries no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        seen_s = self.scenario.step_s * np.arange(len(preview))
-        motion = interpolate(np.zeros(1), np.ones(1), duration_s)
-        progress = motion.vector_values(seen_s.tolist()).ravel()
-        shape, *_ = np.linalg.lstsq(_points_of_plan(progress), preview, rcond=None)
-        if self.mirror is not None:
-            shape = self.mirror.points(shape)
+        shape = self._of_this_hand(plan_shape(preview, self.scenario.step_s, duration_s))
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
@@ -378,25 +317,23 @@ class Reaching(ClosedLoop):
             ValueError: The goal is not three finite numbers.
             RuntimeError: No posture that is drawn is in the safe set.
         """
-        q = self._sample_posture(rng)
         parameters = self.scenario.parameters
+        q = parameters.start.sample(self.safe_set, rng, self.mirror)
         drawn = rng.uniform(*parameters.target.box)
         detour = push = None
         noise_rng = rng.spawn(1)[0]
         if goal is None:
-            goal = drawn if self.mirror is None else self.mirror.points(drawn)
+            goal = self._of_this_hand(drawn)
             if self._is_exploring:
                 push = parameters.random_pushes.sample(rng, self.robot.base)
                 detour = parameters.detours.sample(rng)
-        if detour is not None and self.mirror is not None:
-            detour = self.mirror.points(detour)
+        if detour is not None:
+            detour = self._of_this_hand(detour)
         self._set(context, q, goal, detour)
         self._observers.reseed(context, noise_rng)
         if push is None:
             return 0
-        if self.mirror is not None:
-            push = replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
-        self.set_push(context, push)
+        self.set_push(context, self._push_of_this_hand(push))
         end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
@@ -421,9 +358,7 @@ class Reaching(ClosedLoop):
     def sample_push(self, rng: np.random.Generator) -> Push:
         """A push as episodes begin with it, whatever their share."""
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
-        if self.mirror is None:
-            return push
-        return replace(push, force_n=self.mirror.points(np.array(push.force_n)).tolist())
+        return self._push_of_this_hand(push)
 
     @property
     def rate_names(self) -> list[str]:
@@ -442,9 +377,7 @@ class Reaching(ClosedLoop):
         ends = [planned.value(time).ravel() for time in (start, end)]
         plans = [planned]
         for _ in range(num_plans - 1):
-            detour = rng.uniform(detours.lowest_m, detours.highest_m)
-            if self.mirror is not None:
-                detour = self.mirror.points(detour)
+            detour = self._of_this_hand(detours.draw(rng))
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
 
@@ -495,41 +428,6 @@ class Reaching(ClosedLoop):
         v = np.zeros(self.kinematics.num_velocities)
         return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(hand[:, None]))
 
-    def _sample_posture(self, rng: np.random.Generator) -> np.ndarray:
-        sampling = self.scenario.parameters.start
-        kinematics = self.kinematics
-        legs = {name for foot in self.robot.feet.values() for name in foot.joints}
-        is_free = np.array([name not in legs for name in kinematics.joint_names])
-        standing = kinematics.standing_positions()
-        p_WC = kinematics.contact_positions(standing)
-        for _ in range(_MAX_TRIES):
-            joints = kinematics.posture + is_free * sampling.joint_offset_rad * rng.uniform(
-                -1, 1, kinematics.num_joints
-            )
-            offset = np.append(
-                rng.uniform(-1, 1, 2) * sampling.base_offset_m,
-                -rng.uniform(0, sampling.base_lowering_m),
-            )
-            rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * sampling.tilt_rad)
-            X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)
-            joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, joints)
-            q = kinematics.positions_at(X_WB, joints)
-            v = np.zeros(kinematics.num_velocities)
-            if self.mirror is not None:
-                # The mirror image of what the trained hand's episode of these draws begins with.
-                q, _ = self.mirror.plant_state(q, v, np.zeros(3))
-            margins = self.safe_set.margins(q, v)
-            clearance = margins[self.safe_set.names.index("collision")]
-            stops = margins[self.safe_set.names.index("joint_limits")]
-            is_clear = clearance >= sampling.clearance_m and stops >= sampling.joint_margin_rad
-            if is_clear and margins.min() > 0:
-                return q
-        raise RuntimeError(
-            f"reaching: none of {_MAX_TRIES} random postures of robot '{self.robot.name}' is in "
-            f"the safe set with a clearance of {sampling.clearance_m} m and "
-            f"{sampling.joint_margin_rad} rad off the joints' stops: narrow 'start'"
-        )
-
     def _set(
         self,
         context: Context,
@@ -574,8 +472,3 @@ class Reaching(ClosedLoop):
             start.plan,
             start.stance_pose(self.kinematics),
         )
-
-
-def _points_of_plan(progress: np.ndarray) -> np.ndarray:
-    """Shares of start, goal and detour in the plan's points, (M, 3), see ``interpolate``."""
-    return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)

@@ -16,6 +16,7 @@ from drake_safety.simulation.planning import (
     assess_goal,
     goal_inputs,
     nearest_accepted_goal,
+    on_grid,
 )
 from goal_field import BOX, FieldAssessment, GoalTask
 
@@ -124,6 +125,14 @@ def test_goals_are_judged_by_the_first_instant_on_the_way_to_each():
     goals = np.array([INSIDE, BOX[0]])
     for part in goal_inputs(GoalTask(), goals):
         np.testing.assert_array_equal(part, goals)
+
+
+def test_points_on_the_grid_are_the_numbers_that_their_digits_say():
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3))
+    placed = on_grid(points, 1e-3)
+    assert np.abs(placed - points).max() <= 0.5e-3 + 1e-9
+    assert placed.tolist() == [[float(f"{value:.3f}") for value in row] for row in placed]
+    np.testing.assert_array_equal(on_grid(placed, 1e-3), placed)
 
 
 def test_what_is_accepted_is_its_own_nearest_accepted_goal():

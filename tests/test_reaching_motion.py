@@ -10,6 +10,7 @@ from drake_safety.control.whole_body_qp import solve_qp
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.pushes import Push
+from drake_safety.simulation.reaching_sampling import PostureSampling
 from drake_safety.systems import whole_body_controller
 from reaching_loops import (
     EASY,
@@ -156,7 +157,7 @@ def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
     loop = porter()
     q = loop.kinematics.standing_positions()
     q[6] += 0.5
-    monkeypatch.setattr(loop, "_sample_posture", lambda rng: q)
+    monkeypatch.setattr(PostureSampling, "sample", lambda *arguments: q)
     episode = run_episode(loop, 0)
     assert not episode.is_safe
     assert episode.cause == "support_polygon"

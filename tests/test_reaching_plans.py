@@ -5,7 +5,6 @@ import pytest
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.mirror import Mirror
-from drake_safety.diagrams.reaching import FairTargets, TargetSampling
 from drake_safety.learning.segments import Episode
 from legged_robots import edited
 from reaching_loops import EASY, LOOPS, easy_episode, evaluated, goal_of, porter, porting, started
@@ -165,16 +164,6 @@ def test_a_plan_into_an_obstacle_is_not_fair_though_its_goal_is_in_the_box(hand,
     assert np.all((loop.goal_of(blocked) >= low) & (loop.goal_of(blocked) <= high))
     assert loop.is_fair(clear)
     assert not loop.is_fair(blocked)
-
-
-def test_fair_bounds_are_the_targets_own_unless_they_are_given():
-    target = TargetSampling(x_m=[0.2, 0.5], y_m=[-0.1, 0.4], z_m=[0.3, 0.9])
-    np.testing.assert_array_equal(FairTargets().box(target), target.box)
-    narrowed = FairTargets(x_m=[0.3, 0.4]).box(target)
-    np.testing.assert_array_equal(narrowed, [[0.3, -0.1, 0.3], [0.4, 0.4, 0.9]])
-    for bounds in ([0.4], [0.4, 0.3], [0.1, 0.2, 0.3]):
-        with pytest.raises(ValueError, match=r"fair: x_m must be \[lowest, highest\] or empty"):
-            FairTargets(x_m=bounds)
 
 
 def test_what_is_fair_decides_nothing_that_is_simulated(tmp_path):

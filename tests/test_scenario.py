@@ -1,11 +1,13 @@
 """A scenario is one YAML file; what it misspells is answered with what exists."""
 
+import importlib
 from pathlib import Path
 
 import pytest
 
 from drake_safety import load_scenario
 from drake_safety.control.robot import PlantVariation
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
 from gliding_task import SCENARIO, Gliding
 from legged_robots import write_hexapod
@@ -142,8 +144,15 @@ def test_a_horizon_as_long_as_the_episode_is_allowed_in_spite_of_rounding():
     assert parsed(text).num_steps == 3
 
 
-def test_task_names_are_modules_of_the_package():
+def test_task_names_are_modules_of_the_package_that_have_a_task():
     assert "drake_safety.diagrams.balancing" in task_names()
+    for name in task_names():
+        tasks = [
+            value
+            for value in vars(importlib.import_module(name)).values()
+            if isinstance(value, type) and issubclass(value, ClosedLoop)
+        ]
+        assert set(tasks) > {ClosedLoop}
 
 
 def test_the_canonical_text_keeps_every_value(tmp_path):

@@ -18,6 +18,7 @@ from drake_safety.simulation.planning import (
     checked_goal,
     goal_inputs,
     nearest_accepted_goal,
+    on_grid,
     target_box,
     threshold_with_reserve,
 )
@@ -88,11 +89,9 @@ def descend_to_accepted(
 
     def judged(point: np.ndarray) -> GoalVerdict:
         nonlocal num_judged, best
-        on_grid = np.round(np.round(point / resolution_m) * resolution_m, 9)
         num_judged += 1
-        (verdict,) = assess_goals(
-            loop, assessment, np.clip(on_grid, *box)[None], threshold=stricter
-        )
+        candidate = np.clip(on_grid(point, resolution_m), *box)
+        (verdict,) = assess_goals(loop, assessment, candidate[None], threshold=stricter)
         if verdict.is_accepted and (best is None or _far(verdict, goal) < _far(best, goal)):
             best = verdict
         return verdict

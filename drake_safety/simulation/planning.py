@@ -266,10 +266,8 @@ def nearest_accepted_goal(
     centre = np.clip(goal, *box)
 
     def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
-        on_grid = np.unique(np.round(candidates / resolution_m), axis=0) * resolution_m
-        # A multiple of the spacing is not yet the number that is read back from its digits.
-        on_grid = np.round(on_grid, 9)
-        inside = on_grid[np.all((on_grid >= box[0]) & (on_grid <= box[1]), axis=1)]
+        points = np.unique(on_grid(candidates, resolution_m), axis=0)
+        inside = points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
         verdicts = assess_goals(loop, assessment, inside, threshold=stricter)
         accepted = [verdict for verdict in verdicts if verdict.is_accepted]
         return min(accepted, key=lambda one: _distance(one.goal, goal), default=None)
@@ -334,6 +332,17 @@ def _bisected(
         else:
             break
     return best
+
+
+def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
+    """The nearest points of the grid that suggested goals lie on.
+
+    Args:
+        points: In the world, (..., 3) [m].
+        resolution_m: Spacing of the grid [m].
+    """
+    # A multiple of the spacing is not yet the number that is read back from its digits.
+    return np.round(np.round(points / resolution_m) * resolution_m, 9)
 
 
 def target_box(loop: ClosedLoop) -> np.ndarray:

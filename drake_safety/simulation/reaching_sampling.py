@@ -1,8 +1,16 @@
-"""What a reaching episode draws at random: a standing posture and a target."""
+"""What a reaching episode draws at random: a standing posture, a target and a detour."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.reaching_safe_set import ReachingSafeSet
+
+_MAX_TRIES = 100
 
 
 @dataclass(kw_only=True)
@@ -43,6 +51,53 @@ class PostureSampling:
                 raise ValueError(
                     f"start: {name} must be finite and not negative; got {getattr(self, name)}"
                 )
+
+    def sample(
+        self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
+    ) -> np.ndarray:
+        """Positions in the safe set with the feet where they stand, (n_q,).
+
+        Args:
+            safe_set: Of the robot and its obstacles.
+            rng: Source of every draw.
+            mirror: Where it is not the trained hand that reaches: the other one begins with the
+                mirror image of what the trained hand's episode of these draws begins with.
+
+        Raises:
+            RuntimeError: No posture that is drawn is in the safe set.
+        """
+        kinematics = safe_set.kinematics
+        robot = kinematics.robot
+        legs = {name for foot in robot.feet.values() for name in foot.joints}
+        is_free = np.array([name not in legs for name in kinematics.joint_names])
+        standing = kinematics.standing_positions()
+        p_WC = kinematics.contact_positions(standing)
+        v = np.zeros(kinematics.num_velocities)
+        for _ in range(_MAX_TRIES):
+            joints = kinematics.posture + is_free * self.joint_offset_rad * rng.uniform(
+                -1, 1, kinematics.num_joints
+            )
+            offset = np.append(
+                rng.uniform(-1, 1, 2) * self.base_offset_m,
+                -rng.uniform(0, self.base_lowering_m),
+            )
+            rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
+            X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)
+            joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, joints)
+            q = kinematics.positions_at(X_WB, joints)
+            if mirror is not None:
+                q, _ = mirror.plant_state(q, v, np.zeros(3))
+            margins = safe_set.margins(q, v)
+            clearance = margins[safe_set.names.index("collision")]
+            stops = margins[safe_set.names.index("joint_limits")]
+            is_clear = clearance >= self.clearance_m and stops >= self.joint_margin_rad
+            if is_clear and margins.min() > 0:
+                return q
+        raise RuntimeError(
+            f"reaching: none of {_MAX_TRIES} random postures of robot '{robot.name}' is in "
+            f"the safe set with a clearance of {self.clearance_m} m and "
+            f"{self.joint_margin_rad} rad off the joints' stops: narrow 'start'"
+        )
 
 
 @dataclass(kw_only=True)
@@ -122,4 +177,12 @@ class Detours:
         """
         if rng.random() >= self.share:
             return None
+        return self.draw(rng)
+
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        """A detour, whatever the share of episodes that make one, (3,) [m].
+
+        Args:
+            rng: Source of every draw.
+        """
         return rng.uniform(self.lowest_m, self.highest_m)

@@ -210,12 +210,9 @@ def scenario_names() -> list[str]:
 
 
 def task_names() -> list[str]:
-    """Import paths of the modules of tasks that come with the package."""
-    return sorted(
-        f"drake_safety.diagrams.{path.stem}"
-        for path in _scenario_folder().glob("*.py")
-        if path.stem != "__init__"
-    )
+    """Import paths of the modules of tasks that come with the package: those of its scenarios."""
+    texts = (path.read_text(encoding="utf-8") for path in _scenario_folder().glob("*.yaml"))
+    return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
 
 
 def load_scenario(name: str | Path) -> Scenario:

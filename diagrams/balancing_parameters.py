@@ -1,0 +1,86 @@
+"""What a scenario file says of balancing, and defaults that fit the robot's size."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.control.safe_sets import BalanceLimits
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.robot_size import RobotSize, overlaid, scaled_defaults
+from drake_safety.simulation.sampling import PushSampling, StartSampling
+
+
+@dataclass(kw_only=True)
+class RecoveryParameters:
+    """When the robot steps, and how."""
+
+    threshold: float = 0.6
+    """Γ_thre."""
+    is_normalized: bool = True
+    """Whether the threshold is on b_safe / (1 - μ) or, literally, on b_safe."""
+    assessment_period_s: float = 0.02
+    """Time between two evaluations of Γ [s]."""
+    step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
+
+
+@dataclass(kw_only=True)
+class BalancingParameters:
+    """The task's part of the scenario file."""
+
+    scale_to_robot: bool = False
+    """Whether defaults are scaled to the robot's standing height, foot spacing and mass; what the
+    file states is taken as it is. By default they are those of a robot 0.42 m high, of 25 kg."""
+    safe_set: BalanceLimits = field(default_factory=BalanceLimits)
+    start: StartSampling = field(default_factory=StartSampling)
+    push: PushSampling = field(default_factory=PushSampling)
+    recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
+    demonstration: list[Throw] = field(default_factory=list)
+    """The balls of ``drake-safety run --push ball``."""
+
+
+_DEFAULT_SIZE = RobotSize(height_m=0.4245, half_length_m=0.2194, half_width_m=0.1245, mass_kg=25.43)
+"""Of a robot that the parameters' defaults fit."""
+_QUANTITIES: dict[str, Any] = {
+    "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
+    "start": {
+        "foot_offset_m": "width",
+        "base_offset_m": ["length", "width"],
+        "base_height_m": "height",
+        "velocity_std_m_s": ["speed_x", "speed_y", "speed_z"],
+        "angular_velocity_std_rad_s": "rate",
+        "target_offset_m": ["length", "width"],
+        "target_height_m": "height",
+        "plan_duration_s": "duration",
+    },
+    "push": {
+        "mass_kg": "mass",
+        "speed_m_s": "speed_y",
+        "height_m": "height",
+        "target_offset_m": ["length", "width"],
+    },
+    "recovery": {
+        "step": {
+            "step_duration_s": "duration",
+            "lift_m": "height",
+            "velocity_gain_s": "duration",
+            "max_reach_m": "height",
+            "min_lateral_m": "width",
+            "settle_speed_m_s": "speed_y",
+            "settle_margin_m": "width",
+            "return_duration_s": "duration",
+        }
+    },
+}
+"""What each parameter that depends on the robot's size is."""
+
+
+def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict[str, Any]:
+    """What the file states, over defaults that are scaled to the robot.
+
+    Args:
+        stated: The task's part of the scenario file.
+        kinematics: The robot.
+    """
+    factors = RobotSize.of(kinematics).factors(_DEFAULT_SIZE)
+    return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)

@@ -1,0 +1,92 @@
+"""What a reaching episode draws: postures in the safe set, targets and detours; what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_safety.control.mirror import Mirror
+from drake_safety.simulation.reaching_sampling import (
+    Detours,
+    FairTargets,
+    PostureSampling,
+    TargetSampling,
+)
+from reaching_loops import porter
+
+
+def test_a_posture_is_safe_with_the_clearance_and_off_the_stops_as_asked():
+    safe_set = porter().safe_set
+    asked = PostureSampling(
+        base_lowering_m=0.04, joint_offset_rad=0.3, clearance_m=0.05, joint_margin_rad=0.1
+    )
+    loose = PostureSampling(base_lowering_m=0.04, joint_offset_rad=0.3, clearance_m=0.0)
+    v = np.zeros(safe_set.kinematics.num_velocities)
+    columns = [safe_set.names.index(name) for name in ("collision", "joint_limits")]
+    found = {}
+    for name, sampling in {"asked": asked, "loose": loose}.items():
+        postures = [sampling.sample(safe_set, np.random.default_rng(seed)) for seed in range(25)]
+        margins = np.array([safe_set.margins(q, v) for q in postures])
+        assert margins.min() > 0
+        found[name] = margins[:, columns].min(axis=0)
+    assert np.all(found["asked"] >= [0.05, 0.1])
+    # It is not for want of others.
+    assert np.any(found["loose"] < [0.05, 0.1])
+
+
+def test_with_a_mirror_the_same_draws_are_the_mirror_image():
+    left, right = porter().safe_set, porter(hand="right").safe_set
+    mirror, sampling = Mirror(left.kinematics), porter().scenario.parameters.start
+    for seed in range(3):
+        q = sampling.sample(left, np.random.default_rng(seed))
+        v = np.zeros(left.kinematics.num_velocities)
+        image, _ = mirror.plant_state(q, v, np.zeros(3))
+        found = sampling.sample(right, np.random.default_rng(seed), mirror)
+        np.testing.assert_allclose(found, image, atol=1e-12)
+
+
+def test_postures_that_cannot_be_safe_are_given_up():
+    sampling = PostureSampling(joint_margin_rad=3.2)  # More than half a turn.
+    with pytest.raises(RuntimeError, match="random postures of robot 'porter' is in the safe set"):
+        sampling.sample(porter().safe_set, np.random.default_rng(0))
+
+
+def test_detours_are_made_by_the_share_of_episodes_and_lie_in_their_box():
+    detours = Detours(share=0.25, lowest_m=[-0.3, -0.2, 0.0], highest_m=[0.0, 0.2, 0.3])
+    rng = np.random.default_rng(0)
+    sampled = [detours.sample(rng) for _ in range(400)]
+    made = np.array([detour for detour in sampled if detour is not None])
+    assert len(made) == pytest.approx(100, abs=30)
+    drawn = np.array([detours.draw(rng) for _ in range(100)])
+    for points in (made, drawn):
+        assert np.all((points >= detours.lowest_m) & (points <= detours.highest_m))
+        assert np.all(np.ptp(points, axis=0) > 0.2)
+    assert Detours().sample(rng) is None
+
+
+def test_fair_bounds_are_the_targets_own_unless_they_are_given():
+    target = TargetSampling(x_m=[0.2, 0.5], y_m=[-0.1, 0.4], z_m=[0.3, 0.9])
+    np.testing.assert_array_equal(FairTargets().box(target), target.box)
+    narrowed = FairTargets(x_m=[0.3, 0.4]).box(target)
+    np.testing.assert_array_equal(narrowed, [[0.3, -0.1, 0.3], [0.4, 0.4, 0.9]])
+    for bounds in ([0.4], [0.4, 0.3], [0.1, 0.2, 0.3]):
+        with pytest.raises(ValueError, match=r"fair: x_m must be \[lowest, highest\] or empty"):
+            FairTargets(x_m=bounds)
+
+
+@pytest.mark.parametrize(
+    ("schema", "change", "message"),
+    [
+        (PostureSampling, {"base_offset_m": [0.1]}, r"start: base_offset_m must be \[x, y\]"),
+        (PostureSampling, {"base_offset_m": [0.1, -0.1]}, "start: base_offset_m must be finite"),
+        (PostureSampling, {"tilt_rad": -0.1}, "start: tilt_rad must be finite and not negative"),
+        (PostureSampling, {"clearance_m": math.nan}, "start: clearance_m must be finite"),
+        (TargetSampling, {"x_m": [1.0, 0.5]}, r"target: x_m must be \[lowest, highest\], finite"),
+        (TargetSampling, {"z_m": [0.0, math.inf]}, "target: z_m must be"),
+        (Detours, {"share": 1.0}, r"detours: share must be in \[0, 1\); got 1.0"),
+        (Detours, {"lowest_m": [0.1, 0.0, 0.0]}, "detours: .* three numbers each"),
+    ],
+)
+def test_ranges_that_make_no_sense_are_refused(schema, change, message):
+    with pytest.raises(ValueError, match=message):
+        schema(**change)
