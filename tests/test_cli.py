@@ -312,7 +312,7 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
         (["--learning-curve", "many"], "--learning-curve 'many': give numbers of episodes"),
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
-        (["--seed", "-3"], "-3 to 0 would be used, and 0 is the training episodes' own"),
+        (["--seed", "-3"], "-3, -2, -1, 0 would be used, and 0 is the training episodes' own"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(

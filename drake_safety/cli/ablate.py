@@ -16,6 +16,7 @@ from drake_safety.cli.console import Stages, console, interval, new_table, open_
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
+    check_fresh,
     episodes_folder,
     fresh_episodes_folder,
     load_assessment,
@@ -78,17 +79,7 @@ def ablate(
     loaded = load_scenario(scenario)
     base = load_assessment(assessment, MODES[0]).parameters
     training = load_episodes(episodes_folder(assessment))
-    if training.info.scenario_hash != loaded.simulation_hash():
-        raise ValueError(
-            f"ablate: the training episodes were made by scenario '{training.info.scenario}' with "
-            f"hash {training.info.scenario_hash[:12]}, but '{loaded.name}' now has hash "
-            f"{loaded.simulation_hash()[:12]}: train again"
-        )
-    if training.info.seed in (seed, seed + 3):
-        raise ValueError(
-            f"ablate: seeds {seed} and {seed + 3} would be used, and {training.info.seed} is the "
-            "training episodes' own; choose another"
-        )
+    check_fresh(training.info, loaded, (seed, seed + 3))
     num_training = len(training)
     if quick:
         num_training = min(num_training, _QUICK_EPISODES)

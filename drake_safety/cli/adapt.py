@@ -26,6 +26,7 @@ from drake_safety.cli.training_folder import (
     adapted_folder,
     assessment_file,
     assessment_folder,
+    check_fresh,
     feedback_folder,
     load_assessment,
 )
@@ -87,12 +88,7 @@ def adapt(
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
-    used = range(seed, seed + 3)
-    if priors[MODES[0]].info_.seed in used:
-        raise ValueError(
-            f"adapt: seeds {used.start} to {used.stop - 1} would be used, and "
-            f"{priors[MODES[0]].info_.seed} is the training episodes' own; choose another"
-        )
+    check_fresh(priors[MODES[0]].info_, loaded, range(seed, seed + 3))
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log and --map go together: a log is read by its map")

@@ -20,6 +20,7 @@ from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
     assessment_folder,
+    check_fresh,
     fresh_episodes_folder,
     load_assessment,
 )
@@ -79,16 +80,7 @@ def calibrate(
     }
     scenario_hash = loaded.simulation_hash()
     for gamma in learned.values():
-        if gamma.info_.scenario_hash != scenario_hash:
-            raise ValueError(
-                f"calibrate: the assessment was learned from scenario '{gamma.info_.scenario}' "
-                f"with hash {gamma.info_.scenario_hash[:12]}, but '{loaded.name}' now has hash "
-                f"{scenario_hash[:12]}: train again"
-            )
-        if gamma.info_.seed == seed:
-            raise ValueError(
-                f"calibrate: {seed} is the training episodes' own seed; choose another"
-            )
+        check_fresh(gamma.info_, loaded, (seed,))
     judging = dict(loaded.task_class().judging_options)
     with open_stages() as stages:
         fresh = run_episodes(

@@ -27,6 +27,7 @@ from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
+    check_fresh,
     episodes_folder,
     fresh_episodes_folder,
     load_assessment,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
     from drake_safety.evaluation.metrics import Figure
     from drake_safety.evaluation.throw_study import ThrowStudy
-    from drake_safety.learning.segments import Episodes, EpisodesInfo
+    from drake_safety.learning.segments import Episodes
 
 _DEFAULT_THROWS = 600
 
@@ -139,15 +140,10 @@ def evaluate(
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
     train_set = load_episodes(episodes_folder(assessment))
-    _check_same_simulation(train_set.info, loaded.simulation_hash())
-    check_options(loop, options, len(train_set))
     # Episodes, throws or pushes, those that their alarms and other thresholds are chosen on.
     used = range(seed, seed + 4)
-    if train_set.info.seed in used:
-        raise ValueError(
-            f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and "
-            f"{train_set.info.seed} is the training episodes' own; choose another"
-        )
+    check_fresh(train_set.info, loaded, used)
+    check_options(loop, options, len(train_set))
     for one in (*sharpened.calibrations_.values(), *paper.calibrations_.values()):
         if one.seed in used:
             raise ValueError(
@@ -308,15 +304,6 @@ def _throws_picture(study: ThrowStudy) -> Picture:
         },
         mass_kg=np.array([ball.mass_kg for ball in balls]),
     )
-
-
-def _check_same_simulation(trained: EpisodesInfo, scenario_hash: str) -> None:
-    if trained.scenario_hash != scenario_hash:
-        raise ValueError(
-            f"evaluate: the assessment's episodes were made by scenario '{trained.scenario}' with "
-            f"hash {trained.scenario_hash[:12]}, which now has hash {scenario_hash[:12]}: train "
-            "again"
-        )
 
 
 def _episodes_table(figures: dict[str, Figure], names: list[str], kind: str, title: str) -> Table:

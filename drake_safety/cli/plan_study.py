@@ -21,6 +21,7 @@ from drake_safety.cli.console import (
 from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     assessment_folder,
+    check_fresh,
     goal_threshold,
     load_assessment,
     planning_folder,
@@ -57,14 +58,7 @@ def plan_study(
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     gamma = load_assessment(learned.path, mode)
-    if gamma.info_.scenario_hash != loaded.simulation_hash():
-        raise ValueError(
-            f"plan-study: the assessment was learned from scenario '{gamma.info_.scenario}' with "
-            f"hash {gamma.info_.scenario_hash[:12]}, but '{loaded.name}' now has hash "
-            f"{loaded.simulation_hash()[:12]}: train again"
-        )
-    if seed == gamma.info_.seed:
-        raise ValueError(f"plan-study: {seed} is the training episodes' own seed; choose another")
+    check_fresh(gamma.info_, loaded, (seed,))
     rule = goal_threshold(learned.path, mode, gamma)
     print_shipped(learned)
     with open_stages() as stages:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import EpisodesInfo
     from drake_safety.simulation.scenario import Scenario
 
 
@@ -155,6 +157,32 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
             "run `drake-safety train` first"
         )
     return SafetyAssessment.load(path)
+
+
+def check_fresh(trained: EpisodesInfo, scenario: Scenario, seeds: Sequence[int]) -> None:
+    """Refuses what a training cannot be judged by.
+
+    Args:
+        trained: Of the episodes that it learned from.
+        scenario: That fresh episodes are simulated of.
+        seeds: Of the fresh sets.
+
+    Raises:
+        ValueError: The scenario is no longer the one that was learned from, or a set would be the
+            training's own.
+    """
+    scenario_hash = scenario.simulation_hash()
+    if trained.scenario_hash != scenario_hash:
+        raise ValueError(
+            f"scenario '{trained.scenario}' was learned from with hash "
+            f"{trained.scenario_hash[:12]}, but '{scenario.name}' now has hash "
+            f"{scenario_hash[:12]}: train again"
+        )
+    if trained.seed in seeds:
+        raise ValueError(
+            f"seeds {', '.join(f'{seed}' for seed in seeds)} would be used, and {trained.seed} is "
+            "the training episodes' own seed; choose another --seed"
+        )
 
 
 def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> GoalThreshold:
