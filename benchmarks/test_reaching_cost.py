@@ -20,7 +20,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.ground import add_ground
 
 SCENARIO = "atlas_reaching"
-NUM_EPISODES, ROUNDS = 6, 3
+NUM_EPISODES, ROUNDS = 6, 6
 FINE_TIME_STEP_S, FINE_CONTROL_PERIOD_S = 0.0005, 0.001
 
 
