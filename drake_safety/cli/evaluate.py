@@ -62,7 +62,9 @@ def evaluate(
     ] = 200,
     other_hand: Annotated[
         int | None,
-        typer.Option(help="Targets: how many to mirror to the other hand; all by default.", min=0),
+        typer.Option(
+            help="Targets: how many to mirror to the other hand; at most 400 by default.", min=0
+        ),
     ] = None,
     learning_curve: Annotated[
         str,
