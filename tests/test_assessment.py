@@ -198,9 +198,9 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
         SafetyAssessment.load(tmp_path / "foreign")
     metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
     save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match="schema version 0, this version reads 2"):
+    with pytest.raises(ValueError, match="schema version 0, this version reads 3"):
         SafetyAssessment.load(tmp_path / "old")
-    metadata["schema_version"] = "2"
+    metadata["schema_version"] = "3"
     save_file(load_file(path), tmp_path / "hollow", metadata)
     with pytest.raises(ValueError, match="damaged safety assessment"):
         SafetyAssessment.load(tmp_path / "hollow")

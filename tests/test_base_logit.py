@@ -58,40 +58,44 @@ def test_maps_that_know_their_own_episodes_by_heart_are_scaled_by_the_others(seg
     )
     relabelled = dataclasses.replace(segments, is_unsafe=is_unsafe)
     found = fitted_base_logit(output, held_out, relabelled, parameters())
-    assert found.scale == pytest.approx(0.5, abs=0.06)
+    assert found.safety_slope == pytest.approx(0.5, abs=0.06)
     assert found.offset == pytest.approx(0.4, abs=0.15)
     own = fitted_base_logit(output, np.zeros_like(held_out), relabelled, parameters())
-    assert own.scale > 1.2 * found.scale
+    assert own.safety_slope > 1.2 * found.safety_slope
 
 
-def test_margins_are_scaled_before_the_heads_are_averaged(segments):
+@pytest.mark.parametrize("safety_slope", [0.0, 0.4])
+def test_each_head_counts_for_what_it_is_worth(segments, safety_slope):
     rng = np.random.default_rng(1)
     held_out = held_out_segments(segments, parameters(held_out=0.25))
+    said = rng.normal(scale=2.0, size=held_out.shape)
     margins = rng.uniform(-0.03, 0.1, (*held_out.shape, 2))
-    nearest = (held_out * margins.min(axis=2)).sum(axis=0) / 0.02
-    is_unsafe = rng.random(len(segments)) < sigmoid(1.0 - 1.5 * nearest)
-    nan = np.full(held_out.shape, np.nan)
-    output = EmbeddingOutput(np.zeros((*held_out.shape, 2)), nan, margins)
+    logit = safety_slope * said + 1.0 - 1.5 * margins.min(axis=2) / 0.02
+    is_unsafe = rng.random(len(segments)) < sigmoid((held_out * logit).sum(axis=0))
+    output = EmbeddingOutput(np.zeros((*held_out.shape, 2)), said, margins)
     relabelled = dataclasses.replace(segments, is_unsafe=is_unsafe)
     found = fitted_base_logit(output, held_out, relabelled, parameters())
-    assert found.intercept == pytest.approx(1.0, abs=0.3)
-    assert found.slope == pytest.approx(1.5, abs=0.3)
-    assert (found.offset, found.scale) == pytest.approx((0.0, 1.0), abs=0.05)
+    assert found.offset == pytest.approx(1.0, abs=0.3)
+    assert found.margin_slope == pytest.approx(1.5, abs=0.3)
+    assert found.safety_slope == pytest.approx(safety_slope, abs=0.06)
+    alone = output._replace(unsafe_logit=np.full(held_out.shape, np.nan))
+    logit = fitted_base_logit(alone, held_out, relabelled, parameters()).of_output(alone)
+    assert np.isfinite(logit).all()
 
 
 def test_one_input_has_the_same_logit_as_many():
     logit = BaseLogit(
         margin_unit=0.02,
         margin_range=(-0.03, 0.1),
-        intercept=0.7,
-        slope=1.3,
         offset=-0.2,
-        scale=0.8,
+        safety_slope=0.8,
+        margin_slope=1.3,
     )
     output = EmbeddingOutput(
         np.zeros((2, 1, 2)), np.array([[1.0], [9.0]]), np.array([[[0.02, 0.5]], [[0.04, 0.5]]])
     )
-    margin = 0.7 - 1.3 * 0.03 / 0.02
-    expected = -0.2 + 0.8 * np.mean([np.mean([1.0, 8.0]), margin])
+    expected = -0.2 + 0.8 * np.mean([1.0, 8.0]) - 1.3 * 0.03 / 0.02
     assert logit.of_output(output)[0] == pytest.approx(expected)
     assert logit.of_one([1.0, 9.0], 0.03) == pytest.approx(expected)
+    steep = dataclasses.replace(logit, safety_slope=10.0)
+    assert steep.of_output(output)[0] == steep.of_one([1.0, 9.0], 0.03) == 8.0

@@ -60,40 +60,37 @@ class Assessment:
 class BaseLogit:
     """L, one logit of an unsafe end from what the maps' heads say.
 
-    ``offset + scale h``, where h is the mean of the safety heads' logit and of a logit of the
-    smallest predicted margin; a head that is missing leaves the other alone.
+    ``offset + safety_slope z - margin_slope m / margin_unit``, where z is the mean logit of the
+    safety heads and m the smallest predicted margin; a head that is missing has no part in it.
 
     Attributes:
         margin_unit: Unit of margins [unit of the margins].
         margin_range: Margins are clipped to this range [unit of the margins].
-        intercept: Logit where the smallest margin is zero.
-        slope: Logits by which a margin of one unit is safer.
-        offset: L where h is zero.
-        scale: L's part of h.
+        offset: L where both heads are zero.
+        safety_slope: What a logit of the safety heads counts for.
+        margin_slope: Logits by which a margin of one unit is safer.
     """
 
     margin_unit: float
     margin_range: tuple[float, float]
-    intercept: float = 0.0
-    slope: float = 1.0
     offset: float = 0.0
-    scale: float = 1.0
+    safety_slope: float = 1.0
+    margin_slope: float = 1.0
+
+    def heads(self, output: EmbeddingOutput) -> np.ndarray:
+        """z and -m / margin_unit of all inputs, (N, 2); zero for a head that is missing."""
+        found = np.zeros((output.embedding.shape[1], 2))
+        if np.isfinite(output.unsafe_logit).any() or not output.margins.shape[2]:
+            found[:, 0] = np.clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT).mean(axis=0)
+        if output.margins.shape[2]:
+            smallest = output.margins.mean(axis=0).min(axis=1)
+            found[:, 1] = -np.clip(smallest, *self.margin_range) / self.margin_unit
+        return found
 
     def of_output(self, output: EmbeddingOutput) -> np.ndarray:
         """L of all inputs of an `EmbeddingOutput`, (N,); NaN without heads."""
-        heads = []
-        if output.margins.shape[2]:
-            margins = output.margins.mean(axis=0).min(axis=1)
-            heads.append(self.of_margin(margins))
-        safety = np.clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT).mean(axis=0)
-        if not heads or np.isfinite(safety).any():
-            heads.append(safety)
-        return self.offset + self.scale * np.mean(heads, axis=0)
-
-    def of_margin(self, margin: np.ndarray) -> np.ndarray:
-        """The logit of smallest margins (N,)."""
-        scaled = np.clip(margin, *self.margin_range) / self.margin_unit
-        return np.clip(self.intercept - self.slope * scaled, -LOGIT_LIMIT, LOGIT_LIMIT)
+        logit = self.offset + self.heads(output) @ (self.safety_slope, self.margin_slope)
+        return np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
     def of_one(self, logits: list[float], margin: float | None) -> float:
         """L in plain floats, for the online run.
@@ -102,16 +99,14 @@ class BaseLogit:
             logits: Of each member's safety head; none without heads.
             margin: Smallest predicted margin, if there is a margin head.
         """
-        total, count = 0.0, 0
+        logit = self.offset
         if logits:
-            total += sum(min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT) for z in logits) / len(logits)
-            count += 1
+            clipped = [min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT) for z in logits]
+            logit += self.safety_slope * sum(clipped) / len(clipped)
         if margin is not None:
             low, high = self.margin_range
-            z = self.intercept - self.slope * min(max(margin, low), high) / self.margin_unit
-            total += min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT)
-            count += 1
-        return self.offset + self.scale * total / count
+            logit -= self.margin_slope * min(max(margin, low), high) / self.margin_unit
+        return min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:

@@ -238,37 +238,33 @@ def fitted_base_logit(
         margin_unit=parameters.margin_unit,
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
-    if output.margins.shape[2]:
-        margin = output.margins[member, row].min(axis=1)
-        scaled = np.clip(margin, *logit.margin_range) / logit.margin_unit
-        intercept, slope = _logistic(-scaled, is_unsafe, weight, LOGIT_LIMIT)
-        logit = replace(logit, intercept=intercept, slope=slope)
-    heads = EmbeddingOutput(
-        output.embedding[member, row][None],
-        output.unsafe_logit[member, row][None],
-        output.margins[member, row][None],
+    heads = logit.heads(
+        EmbeddingOutput(
+            output.embedding[member, row][None],
+            output.unsafe_logit[member, row][None],
+            output.margins[member, row][None],
+        )
     )
-    offset, scale = _logistic(logit.of_output(heads), is_unsafe, weight, 1.0)
-    return replace(logit, offset=offset, scale=scale)
+    offset, safety_slope, margin_slope = _logistic(heads, is_unsafe, weight)
+    return replace(logit, offset=offset, safety_slope=safety_slope, margin_slope=margin_slope)
 
 
-def _logistic(
-    z: np.ndarray, label: np.ndarray, weight: np.ndarray, limit: float
-) -> tuple[float, float]:
-    """Intercept, at most a limit, and slope, not negative, of a logistic regression on z (N,)."""
+def _logistic(z: np.ndarray, label: np.ndarray, weight: np.ndarray) -> list[float]:
+    """Intercept and slopes, none of them negative, of a logistic regression on z (N, m)."""
     from scipy.optimize import minimize
 
     share = weight / weight.sum()
     y = label.astype(float)
+    columns = np.column_stack([np.ones(len(z)), z])
 
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
-        logit = values[0] + values[1] * z
+        logit = columns @ values
         # As light as a hundredth of a sample: it only keeps separable classes finite.
         penalty = 0.01 / len(z) * values
         residual = share * (1.0 / (1.0 + np.exp(-np.clip(logit, -500.0, 500.0))) - y)
         cost = share @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * penalty @ values
-        return float(cost), np.array([residual.sum(), residual @ z]) + penalty
+        return float(cost), residual @ columns + penalty
 
-    bounds = [(-limit, limit), (0, 50)]
-    found = minimize(loss, [0.0, 1.0], jac=True, method="L-BFGS-B", bounds=bounds)
-    return float(found.x[0]), float(found.x[1])
+    bounds = [(-LOGIT_LIMIT, LOGIT_LIMIT), *((0.0, 50.0) for _ in range(z.shape[1]))]
+    start = np.r_[0.0, np.ones(z.shape[1])]
+    return minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x.tolist()
