@@ -10,7 +10,7 @@ from drake_safety.simulation.dataset import EpisodeWriter
 from lip_episodes import make_episodes
 
 MODES = ("sharpened", "paper")
-SCENARIO = "name: lip\ntask: nowhere.to_be:Found\nrobot: pendulum\n---\npush: {}\n"
+SCENARIO = "name: lip\ntask: nowhere.to_be:Found\nrobot: pendulum\nparameters: {push: {}}\n"
 
 
 def make_figures():
