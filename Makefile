@@ -10,11 +10,11 @@ INSTALLED := .venv/.installed
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED) ## Train on 2048 episodes, evaluate, and throw a ball at the robot
-	$(BIN)/drake-safety train laikago_balancing --episodes 2048 --out runs/laikago
-	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/laikago \
+demo: $(INSTALLED) ## Train on 1024 episodes, evaluate, and throw balls at the robot
+	$(BIN)/drake-safety train laikago_balancing --episodes 1024 --out runs/demo --resume
+	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
 		--episodes 200 --calibration-episodes 60 --throws 60 --calibration-throws 40
-	$(BIN)/drake-safety run laikago_balancing --assessment runs/laikago --push ball
+	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
 test: $(INSTALLED) ## Run the tests
 	$(BIN)/python -m pytest
