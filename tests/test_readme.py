@@ -87,7 +87,8 @@ def test_every_make_target_of_the_readme_is_in_the_makefile():
 
 def test_what_is_said_of_the_demo_is_what_it_does():
     makefile = (ROOT / "Makefile").read_text()
-    (num_episodes,) = re.findall(r"/drake-safety train .*--episodes (\d+) --out runs/demo", makefile)
+    trained = r"/drake-safety train .*--episodes (\d+) --out runs/demo"
+    (num_episodes,) = re.findall(trained, makefile)
     assert f"simulates {num_episodes} episodes" in README
     assert f"## Train on {num_episodes} episodes" in makefile
 
