@@ -26,6 +26,7 @@ from drake_safety.learning.feedback import (
     segments_of,
 )
 from drake_safety.learning.grid import Grid
+from drake_safety.learning.inputs import check_width, input_parts, num_inputs
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
@@ -253,27 +254,17 @@ class SafetyAssessment:
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
         """x, (N, n_x): [s; z*] in the paper's mode, [s; z*; features] in the sharpened one."""
-        parts = [np.asarray(state, dtype=float), np.asarray(desired_preview, dtype=float)]
-        if self.parameters.is_sharpened and features is not None:
-            parts.append(np.asarray(features, dtype=float))
-            if self.parameters.feature_unit:
-                parts.append(np.arcsinh(parts[-1] / self.parameters.feature_unit))
+        parts = input_parts(
+            np.asarray(state, dtype=float),
+            np.asarray(desired_preview, dtype=float),
+            None if features is None else np.asarray(features, dtype=float),
+            self.parameters,
+        )
         return np.concatenate(parts, axis=-1)
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "beliefs_"):
             raise ValueError("SafetyAssessment: it has not been fitted or loaded yet")
-
-    def _check_width(self, num_columns: int) -> None:
-        if num_columns != self.embedding_.num_inputs:
-            info = self.info_
-            num_features = len(info.feature_names) if self.parameters.is_sharpened else 0
-            raise ValueError(
-                f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, "
-                f"expected {len(info.state_names)} of the state, "
-                f"{info.horizon * len(info.output_names)} of the desired preview and "
-                f"{num_features} features{' twice' if self.parameters.feature_unit else ''}"
-            )
 
     def _cells(
         self, beliefs: np.ndarray | None, shift: np.ndarray | None
@@ -318,7 +309,7 @@ class SafetyAssessment:
         x = self._inputs(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
-        self._check_width(x.shape[1])
+        check_width(x.shape[1], self.info_, self.parameters)
         with np.errstate(over="ignore", invalid="ignore"):
             is_usable = np.einsum("ij,ij->i", x, x) < INPUT_LIMIT
         return prediction.predict(
@@ -366,15 +357,10 @@ class SafetyAssessment:
         Returns:
             The fields of `Assessment` one after the other, in their order, (8 + 2 n_c,).
         """
-        is_sharpened = self.parameters.mode == "sharpened"
-        parts: tuple[np.ndarray, ...] = (state, desired_preview)
-        if is_sharpened and features is not None:
-            parts = (state, desired_preview, features)
-            if self.parameters.feature_unit:
-                parts = (*parts, np.arcsinh(features / self.parameters.feature_unit))
+        parts = input_parts(state, desired_preview, features, self.parameters)
         width = sum(map(len, parts))
         if width != self.embedding_.num_inputs:
-            self._check_width(width)
+            check_width(width, self.info_, self.parameters)
         return prediction.predict_row(
             parts,
             embedding=self.embedding_,
@@ -382,7 +368,7 @@ class SafetyAssessment:
             beliefs=beliefs,
             shift=shift,
             base_logit=self.base_logit_,
-            is_sharpened=is_sharpened,
+            is_sharpened=self.parameters.is_sharpened,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -444,13 +430,10 @@ class SafetyAssessment:
         prefix = "embedding."
         weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
         self.embedding_ = Embedding(weights, num_margins=num_margins)
-        num_inputs = len(info.state_names) + info.horizon * len(info.output_names)
-        if parameters.is_sharpened:
-            num_inputs += len(info.feature_names) * (2 if parameters.feature_unit else 1)
-        if self.embedding_.num_inputs != num_inputs:
+        if self.embedding_.num_inputs != num_inputs(info, parameters):
             raise ValueError(
                 f"its maps take {self.embedding_.num_inputs} inputs, "
-                f"its names amount to {num_inputs}"
+                f"its names amount to {num_inputs(info, parameters)}"
             )
         self.training_points_ = tensors["training_points"]
         self.training_score_ = _single(tensors["training_score"])

@@ -1,0 +1,53 @@
+"""x, what the maps take in: the state, the desired outputs ahead and, "sharpened", the features."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.segments import EpisodesInfo
+
+
+def input_parts(
+    state: np.ndarray,
+    desired_preview: np.ndarray,
+    features: np.ndarray | None,
+    parameters: AssessmentParameters,
+) -> tuple[np.ndarray, ...]:
+    """What x consists of, in its order, along the last axis.
+
+    Args:
+        state: States as the assessor sees them, (..., n_s).
+        desired_preview: Coming desired outputs, row-major in time, (..., H*n_z).
+        features: Features, (..., n_f); the paper's mode has no use for them.
+        parameters: Of the assessment. With a feature unit u, asinh(features / u) comes last.
+    """
+    if features is None or not parameters.is_sharpened:
+        return state, desired_preview
+    if not parameters.feature_unit:
+        return state, desired_preview, features
+    return state, desired_preview, features, np.arcsinh(features / parameters.feature_unit)
+
+
+def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:
+    """n_x, the width of x."""
+    width = len(info.state_names) + info.horizon * len(info.output_names)
+    if parameters.is_sharpened:
+        width += len(info.feature_names) * (2 if parameters.feature_unit else 1)
+    return width
+
+
+def check_width(num_columns: int, info: EpisodesInfo, parameters: AssessmentParameters) -> None:
+    """Refuses an x of another width, and says what it should consist of.
+
+    Raises:
+        ValueError: There are not n_x columns.
+    """
+    if num_columns != num_inputs(info, parameters):
+        num_features = len(info.feature_names) if parameters.is_sharpened else 0
+        raise ValueError(
+            f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, "
+            f"expected {len(info.state_names)} of the state, "
+            f"{info.horizon * len(info.output_names)} of the desired preview and "
+            f"{num_features} features{' twice' if parameters.feature_unit else ''}"
+        )
