@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from drake_safety.learning.adaptation import TrainingScores, paper_beliefs, shifted_beliefs
+from drake_safety.learning.adaptation import TrainingScores, paper_beliefs
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
+from drake_safety.learning.prediction import BaseLogit, Correction
+from drake_safety.learning.recalibration import (
+    Outcomes,
+    fitted_change,
+    guarded_cells,
+    recalibrated_beliefs,
+    row_weights,
+)
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 NUM_TRAINING, NUM_FEEDBACK, NUM_CAUSES = 20_000, 1_000, 2
@@ -27,7 +35,7 @@ def training(num_members: int) -> TrainingScores:
         points=rng.uniform(-65.0, 65.0, (num_members, NUM_TRAINING, 2)).astype(np.float32),
         score=score,
         cause=np.where(score > 0.0, 0, -1),
-        logit=rng.normal(0.0, 3.0, NUM_TRAINING),
+        heads=rng.normal(0.0, 3.0, (NUM_TRAINING, 2)),
         nearest=np.zeros(NUM_TRAINING, dtype=int),
     )
 
@@ -51,21 +59,36 @@ def feedback() -> FeedbackSegments:
 
 
 @pytest.mark.benchmark(timer=time.process_time)
-@pytest.mark.parametrize("method", ["paper", "shift"])
+@pytest.mark.parametrize("method", ["paper", "recalibration"])
 def test_one_update(benchmark: Any, report: Callable[..., None], method: str) -> None:
     mode, num_members = ("paper", 1) if method == "paper" else ("sharpened", 3)
     parameters = AssessmentParameters(mode=mode)
     grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
     scores, segments = training(num_members), feedback()
-    points = np.random.default_rng(2).uniform(-65.0, 65.0, (num_members, NUM_FEEDBACK, 2))
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-65.0, 65.0, (num_members, NUM_FEEDBACK, 2))
+    base_logit = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1))
+    heads = rng.normal(0.0, 3.0, (NUM_FEEDBACK, 2))
+    num_rows = np.bincount(segments.set_index)
+    weight = row_weights(num_rows)
+    actual = Outcomes(heads=heads, is_unsafe=segments.is_unsafe, weight=weight)
+    first = weight > 1.0
+    twins = Outcomes(
+        heads=heads[first],
+        is_unsafe=segments.nominal_is_unsafe[first],
+        weight=np.ones(len(num_rows)),
+    )
 
     def update() -> float:
         started = time.process_time()
         if method == "paper":
             paper_beliefs(scores, segments, points, grid, parameters, NUM_CAUSES)
         else:
-            shift = np.full((num_members, grid.num_cells), 0.7)
-            shifted_beliefs(scores, shift, grid, parameters, NUM_CAUSES)
+            correction = Correction(
+                change=fitted_change(actual, twins, base_logit, parameters.adaptation),
+                guard=guarded_cells(segments, points, grid),
+            )
+            recalibrated_beliefs(scores, base_logit, correction, grid, parameters, NUM_CAUSES)
         return time.process_time() - started
 
     with threadpool_limits(1):
@@ -98,4 +121,9 @@ def test_adopting_beliefs(benchmark: Any, report: Callable[..., None], scenario:
 
     costs = [adopt() for _ in range(5)]
     benchmark.pedantic(adopt, rounds=1)
-    report("beliefs and shift into a Context", statistics.median(costs), "ms", at_most=MAX_ADOPT_MS)
+    report(
+        "beliefs and correction into a Context",
+        statistics.median(costs),
+        "ms",
+        at_most=MAX_ADOPT_MS,
+    )

@@ -15,7 +15,8 @@ from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY, average_cells, fro
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import feedback_sets, segments_of
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import sigmoid
+from drake_safety.learning.prediction import BaseLogit, Correction, sigmoid
+from drake_safety.learning.recalibration import Outcomes, fitted_change, row_weights
 from drake_safety.learning.segments import Episodes
 from lip_episodes import make_episodes
 from test_assessment import QUICK, inputs
@@ -77,17 +78,15 @@ def test_without_a_differing_pair_nothing_changes(sharpened):
     feedback = pairs_with(lambda episode: False)
     adapted = sharpened.adapt(feedback)
     np.testing.assert_array_equal(adapted.beliefs_, sharpened.beliefs_)
-    np.testing.assert_array_equal(adapted.shift_, 0.0)
+    np.testing.assert_array_equal(adapted.correction_.change, 0.0)
     assert adapted.adaptation_.num_differing == 0
     assert adapted.adaptation_.num_sets == NUM_PAIRS
 
 
-def test_a_robot_that_fails_more_lowers_every_gamma_and_one_that_fails_less_raises_it(sharpened):
+def test_gamma_falls_for_a_robot_that_fails_more_and_rises_for_one_that_fails_less(sharpened):
     before = sharpened.beliefs_[..., 0]
     lower, higher = (sharpened.adapt(sets).beliefs_[..., 0] for sets in (worse(), better()))
-    assert np.all(lower <= before + 1e-12)
     assert lower.sum() < before.sum() - 0.1
-    assert np.all(higher >= before - 1e-12)
     assert higher.sum() > before.sum() + 0.1
 
 
@@ -104,14 +103,21 @@ def test_gamma_never_rises_in_a_cell_whose_feedback_was_unsafe(sharpened, make):
         )
     ]
     num_held = 0
-    for unsafe, safe, before, after, shift in zip(
-        *counts, sharpened.beliefs_, adapted.beliefs_, adapted.shift_, strict=True
+    for unsafe, safe, before, after, guard in zip(
+        *counts, sharpened.beliefs_, adapted.beliefs_, adapted.correction_.guard, strict=True
     ):
         is_held = unsafe > safe
         num_held += is_held.sum()
         assert np.all(after[is_held, 0] <= before[is_held, 0] + 1e-12)
-        assert np.all(shift[is_held] >= 0.0)
+        np.testing.assert_array_equal(guard, is_held)
     assert num_held > 5
+    # What is published rises nowhere either where all that is read are such cells.
+    x = [getattr(feedback[0], name) for name in ("state", "desired_preview", "features")]
+    all_guarded = Correction(
+        change=adapted.correction_.change, guard=np.ones_like(adapted.correction_.guard)
+    )
+    held = sharpened.predict(*x, correction=all_guarded).calibrated
+    assert np.all(held <= sharpened.predict(*x).calibrated + 1e-12)
 
 
 def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_it(sharpened):
@@ -119,7 +125,7 @@ def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_i
     adapted = sharpened.adapt(worse())
     np.testing.assert_array_equal(sharpened.beliefs_, before)
     assert sharpened.adaptation_ is None
-    np.testing.assert_array_equal(sharpened.shift_, 0.0)
+    np.testing.assert_array_equal(sharpened.correction_.change, 0.0)
     again = adapted.adapt(worse())
     np.testing.assert_array_equal(again.beliefs_, adapted.beliefs_)
     np.testing.assert_array_equal(adapted.prior_beliefs(), before)
@@ -137,7 +143,7 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
         results = [
             adapted.predict(*given),
             loaded.predict(*given),
-            assessment.predict(*given, beliefs=adapted.beliefs_, shift=adapted.shift_),
+            assessment.predict(*given, beliefs=adapted.beliefs_, correction=adapted.correction_),
         ]
         for field in dataclasses.fields(results[0]):
             for other in results[1:]:
@@ -156,8 +162,12 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     segments = segments_of(worse(), stride=3, shortest=10, discount=0.99, plain=False)
     before = sharpened.predict(*inputs(segments))
     after = sharpened.adapt(worse()).predict(*inputs(segments))
-    assert np.all(after.calibrated <= before.calibrated + 1e-12)
-    assert np.all(after.normalized <= before.normalized + 1e-9)
+    published, grid = (
+        getattr(after, name) - getattr(before, name) for name in ("calibrated", "normalized")
+    )
+    assert published.mean() < -0.05
+    assert grid.mean() < -0.05
+    assert np.corrcoef(published, grid)[0, 1] > 0.7
     unsafe = sharpened.adapt(worse()).beliefs_
     np.testing.assert_allclose(unsafe[..., :3].sum(axis=2), 1.0)
     np.testing.assert_allclose(unsafe[..., 3:].sum(axis=2), unsafe[..., 1], atol=1e-12)
@@ -234,54 +244,72 @@ def test_the_average_refuses_cells_that_are_not_as_many_as_beliefs():
         average_cells(np.zeros((3, 3)), np.zeros(2, dtype=int), np.zeros(4))
 
 
-def outcomes(logit, is_unsafe):
-    return adaptation.Outcomes(logit=logit, is_unsafe=is_unsafe)
+LOGIT = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), margin_slope=0.5)
+SETTINGS = AdaptationParameters()
 
 
-def test_the_shift_solves_its_own_equation():
+def outcomes(heads, is_unsafe):
+    return Outcomes(heads=heads, is_unsafe=is_unsafe, weight=np.ones(len(heads)))
+
+
+def drawn(rng, num, change=(0.0, 0.0, 0.0)):
+    """Heads, and ends that are as likely as L with a change says."""
+    heads = rng.normal(scale=1.5, size=(num, 2))
+    shifted = LOGIT.of_heads(heads) + change[0] + heads @ change[1:]
+    return outcomes(heads, rng.random(num) < sigmoid(shifted))
+
+
+def test_the_change_solves_its_own_equation():
     rng = np.random.default_rng(0)
-    logit, twin_logit = rng.normal(size=(2, 50))
-    is_unsafe, twin_is_unsafe = rng.random(50) < 0.6, rng.random(50) < 0.3
-    actual, twins = outcomes(logit, is_unsafe), outcomes(twin_logit, twin_is_unsafe)
-    b = adaptation.fitted_shift(actual, twins, prior_std=2.0)
-    surplus = np.sum(sigmoid(logit + b) - is_unsafe)
-    of_twins = np.sum(sigmoid(twin_logit) - twin_is_unsafe)
-    assert surplus - of_twins + b / 4.0 == pytest.approx(0.0, abs=1e-6)
-    assert b > 0.0
-    mirrored = adaptation.fitted_shift(
-        outcomes(-logit, ~is_unsafe), outcomes(-twin_logit, ~twin_is_unsafe), prior_std=2.0
+    actual, twins = drawn(rng, 50, (0.8, 0.2, 0.1)), drawn(rng, 50)
+    change = fitted_change(actual, twins, LOGIT, SETTINGS)
+
+    def slope(of, change):
+        phi = np.column_stack([np.ones(len(of.heads)), of.heads])
+        return phi.T @ (sigmoid(LOGIT.of_heads(of.heads) + phi @ change) - of.is_unsafe)
+
+    pull = change / np.array([SETTINGS.offset_std, *[SETTINGS.slope_std] * 2]) ** 2
+    np.testing.assert_allclose(
+        slope(actual, change) - slope(twins, np.zeros(3)) + pull, 0.0, atol=1e-4
     )
-    assert mirrored == pytest.approx(-b, abs=1e-6)
+    assert change[0] > 0.3
+
+
+def test_the_change_is_found_with_enough_feedback():
+    rng = np.random.default_rng(1)
+    truth = (-0.6, 0.3, -0.2)
+    change = fitted_change(drawn(rng, 20_000, truth), drawn(rng, 20_000), LOGIT, SETTINGS)
+    np.testing.assert_allclose(change, truth, atol=0.08)
 
 
 def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
-    rng = np.random.default_rng(1)
-    logit, truth = rng.normal(size=(2, 4000))
-    # L knows nothing and is too low; both plants are alike.
-    is_unsafe, twin_is_unsafe = rng.random((2, 4000)) < sigmoid(truth + 1.0)
-    both = (outcomes(logit, label) for label in (is_unsafe, twin_is_unsafe))
-    assert abs(adaptation.fitted_shift(*both, prior_std=2.0)) < 0.15
-    # Were L right of the twins, all of that would be the actual robot's.
-    right = outcomes(logit, rng.random(4000) < sigmoid(logit))
-    b = adaptation.fitted_shift(outcomes(logit, is_unsafe), right, prior_std=2.0)
-    assert b == pytest.approx(1.0, abs=0.15)
-
-
-def test_the_shift_finds_the_actual_robot_where_its_states_look_otherwise():
-    """A heavier robot that moves less after the same push, and fails as often."""
     rng = np.random.default_rng(2)
-    logit = rng.normal(size=4000)
-    is_unsafe = rng.random(4000) < sigmoid(logit)
-    twins, calmer = outcomes(logit, is_unsafe), outcomes(logit - 0.8, is_unsafe)
-    assert adaptation.fitted_shift(calmer, twins, prior_std=2.0) == pytest.approx(0.8, abs=0.01)
+    wrong = (1.0, 0.0, 0.0)
+    both = drawn(rng, 20_000, wrong), drawn(rng, 20_000, wrong)
+    assert np.abs(fitted_change(*both, LOGIT, SETTINGS)).max() < 0.15
+    # Were L right of the twins, all of that would be the actual robot's.
+    change = fitted_change(both[0], drawn(rng, 20_000), LOGIT, SETTINGS)
+    assert change[0] == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_shift_stays_finite_however_large_the_gap():
+def test_more_danger_never_counts_as_less():
+    rng = np.random.default_rng(3)
+    heads = rng.normal(scale=2.0, size=(5000, 2))
+    upside_down = outcomes(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
+    change = fitted_change(upside_down, drawn(rng, 5000), LOGIT, SETTINGS)
+    np.testing.assert_allclose(change[1:], [-LOGIT.safety_slope, -LOGIT.margin_slope])
+
+
+def test_the_change_stays_finite_however_large_the_gap():
+    heads = np.full((4000, 2), -4.0)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
-    low = np.full(4000, -8.0)
-    b = adaptation.fitted_shift(outcomes(low, every), outcomes(low, none), prior_std=2.0)
-    assert 8.0 < b < 1e6
-    assert np.isfinite(b)
+    change = fitted_change(outcomes(heads, every), outcomes(heads, none), LOGIT, SETTINGS)
+    assert np.isfinite(change).all()
+    assert change[0] + heads[0] @ change[1:] > 8.0
+
+
+def test_an_episode_counts_by_its_first_row_and_by_the_mean_of_all():
+    np.testing.assert_allclose(row_weights(np.array([2, 1, 4])), [1.5, 0.5, 2, 1.25, *[0.25] * 3])
 
 
 def test_the_discrepancy_is_high_where_scores_differ_and_unknown_far_away():
@@ -334,14 +362,14 @@ def test_feedback_of_another_scenario_is_refused(sharpened, change, message):
 def test_a_method_that_does_not_exist_or_does_not_fit_is_refused(sharpened, paper):
     with pytest.raises(ValueError, match="cannot adapt by 'luck'"):
         sharpened.adapt(worse(), method="luck")
-    with pytest.raises(ValueError, match="'shift' takes maps with heads"):
-        paper.adapt(worse(), method="shift")
+    with pytest.raises(ValueError, match="'recalibration' takes maps with heads"):
+        paper.adapt(worse(), method="recalibration")
 
 
 def test_the_papers_update_can_be_asked_for_in_the_sharpened_mode(sharpened):
     adapted = sharpened.adapt(worse(), method="paper")
     assert adapted.adaptation_.method == "paper"
-    np.testing.assert_array_equal(adapted.shift_, 0.0)
+    np.testing.assert_array_equal(adapted.correction_.change, 0.0)
     assert np.any(adapted.beliefs_[..., UNCERTAINTY] < 0.29)
 
 
@@ -382,7 +410,13 @@ def test_a_twin_that_has_ended_scores_one():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("gate", -1.0), ("least_uncertainty", 1.1), ("update_interval", 0), ("shift_std", 0.0)],
+    [
+        ("gate", -1.0),
+        ("least_uncertainty", 1.1),
+        ("update_interval", 0),
+        ("offset_std", 0.0),
+        ("slope_std", 0.0),
+    ],
 )
 def test_adaptation_parameters_out_of_range_are_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name):

@@ -81,7 +81,7 @@ def test_too_few_episodes_give_no_rival(assessment):
     rivals = trained_rivals(assessment, few, num_workers=1)
     assert list(rivals) == ["scratch.40"]
     assert rivals["scratch.40"].parameters == assessment.parameters
-    np.testing.assert_array_equal(rivals["scratch.40"].shift_, 0.0)
+    np.testing.assert_array_equal(rivals["scratch.40"].correction_.change, 0.0)
 
 
 def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, judged):

@@ -112,7 +112,7 @@ def test_other_beliefs_may_be_given_in_place_of_the_learned_ones(assessment, hel
     np.testing.assert_allclose(result.cause_probability[is_inside, 0], 1.0)
     one = assessment.predict_one(*inputs(held_out, 0), beliefs=beliefs)
     np.testing.assert_allclose(one.belief, result.belief[0], atol=1e-9)
-    with pytest.raises(ValueError, match="beliefs have shape"):
+    with pytest.raises(ValueError, match="the shape of beliefs is"):
         assessment.predict(*inputs(held_out), beliefs=beliefs[:, 1:])
 
 
@@ -198,9 +198,9 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
         SafetyAssessment.load(tmp_path / "foreign")
     metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
     save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match="schema version 0, this version reads 3"):
+    with pytest.raises(ValueError, match="schema version 0, this version reads 4"):
         SafetyAssessment.load(tmp_path / "old")
-    metadata["schema_version"] = "3"
+    metadata["schema_version"] = "4"
     save_file(load_file(path), tmp_path / "hollow", metadata)
     with pytest.raises(ValueError, match="damaged safety assessment"):
         SafetyAssessment.load(tmp_path / "hollow")

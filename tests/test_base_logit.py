@@ -79,7 +79,8 @@ def test_each_head_counts_for_what_it_is_worth(segments, safety_slope):
     assert found.margin_slope == pytest.approx(1.5, abs=0.3)
     assert found.safety_slope == pytest.approx(safety_slope, abs=0.06)
     alone = output._replace(unsafe_logit=np.full(held_out.shape, np.nan))
-    logit = fitted_base_logit(alone, held_out, relabelled, parameters()).of_output(alone)
+    logit = fitted_base_logit(alone, held_out, relabelled, parameters())
+    logit = logit.of_heads(logit.heads(alone))
     assert np.isfinite(logit).all()
 
 
@@ -95,7 +96,9 @@ def test_one_input_has_the_same_logit_as_many():
         np.zeros((2, 1, 2)), np.array([[1.0], [9.0]]), np.array([[[0.02, 0.5]], [[0.04, 0.5]]])
     )
     expected = -0.2 + 0.8 * np.mean([1.0, 8.0]) - 1.3 * 0.03 / 0.02
-    assert logit.of_output(output)[0] == pytest.approx(expected)
-    assert logit.of_one([1.0, 9.0], 0.03) == pytest.approx(expected)
+    heads, one = logit.heads(output), logit.heads_one([1.0, 9.0], 0.03)
+    np.testing.assert_allclose(heads, [one])
+    assert logit.of_heads(heads)[0] == pytest.approx(expected)
+    assert logit.of_one(*one) == pytest.approx(expected)
     steep = dataclasses.replace(logit, safety_slope=10.0)
-    assert steep.of_output(output)[0] == steep.of_one([1.0, 9.0], 0.03) == 8.0
+    assert steep.of_heads(heads)[0] == steep.of_one(*one) == 8.0

@@ -75,10 +75,11 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         adapted = load(adapted_folder(folder, files[0].stem), mode)
         assert not np.allclose(adapted.beliefs_, load(folder, mode).beliefs_, atol=0.01)
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
-        np.testing.assert_allclose(adapted.shift_, unwritten[mode].shift_, atol=1e-6)
+        change = adapted.correction_.change
+        np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
         np.testing.assert_allclose(adapted.beliefs_, directly[mode].beliefs_, atol=3e-3)
-        np.testing.assert_allclose(adapted.shift_, directly[mode].shift_, atol=0.05)
+        np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 
 
 def test_a_log_that_is_given_twice_or_without_a_map_is_refused(folder, capsys, monkeypatch):

@@ -8,6 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from drake_safety.learning.prediction import Correction
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 PERIOD_S = 0.04
@@ -26,21 +27,20 @@ class AssessmentDouble:
             horizon=2,
         )
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
-        self.shift_ = np.zeros((1, 6))
+        self.correction_ = Correction.none(1, 6)
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
         self.asked = []
 
-    def predict_row(self, state, desired_preview, features, beliefs, shift):
+    def predict_row(self, state, desired_preview, features, beliefs, correction):
         self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
         if not np.isfinite(state).all():
             safe, belief = 0.0, [0.0, 0.0, 1.0]
         else:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
-        return np.array(
-            [safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan, safe + shift[0, 0]]
-        )
+        calibrated = safe + correction.change[1] * correction.guard[0, 5]
+        return np.array([safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan, calibrated])
 
 
 def running(assessment=None, features=FEATURES):
@@ -157,22 +157,28 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     simulator.AdvanceTo(0.01)
     adapted = AssessmentDouble()
     adapted.embedding_ = assessment.embedding_
-    adapted.beliefs_, adapted.shift_ = 2 * assessment.beliefs_, np.full((1, 6), 0.125)
+    adapted.beliefs_ = 2 * assessment.beliefs_
+    adapted.correction_ = Correction(change=np.array([0.0, 0.125, 0.0]), guard=np.ones((1, 6)))
     assessor.adopt(context, adapted)
     assert value(assessor, context, "safety_probability")[0] == 0.25
     simulator.AdvanceTo(PERIOD_S + 0.001)
     assert value(assessor, context, "safety_probability")[0] == 0.5
     assert value(assessor, context, "calibrated_safety_probability")[0] == 0.625
-    np.testing.assert_array_equal(assessor.get_shift(context), adapted.shift_)
-    assert np.all(assessor.get_shift(assessor.CreateDefaultContext()) == 0.0)
+    found = assessor.get_correction(context)
+    np.testing.assert_array_equal(found.change, adapted.correction_.change)
+    np.testing.assert_array_equal(found.guard, adapted.correction_.guard)
+    assert np.all(assessor.get_correction(assessor.CreateDefaultContext()).change == 0.0)
 
 
-def test_beliefs_over_other_maps_and_shifts_of_another_shape_are_refused():
+def test_beliefs_over_other_maps_and_corrections_of_another_shape_are_refused():
     _, assessor, _, context = running()
     with pytest.raises(ValueError, match="has other maps"):
         assessor.adopt(context, AssessmentDouble())
     with pytest.raises(ValueError, match=r"must have shape \(1, 6\); got \(6,\)"):
-        assessor.set_shift(context, np.zeros(6))
+        assessor.set_correction(context, Correction(change=np.ones(3), guard=np.zeros(6)))
+    with pytest.raises(ValueError, match=r"change must have shape \(3,\); got \(2,\)"):
+        assessor.set_correction(context, Correction(change=np.ones(2), guard=np.zeros((1, 6))))
+    np.testing.assert_array_equal(assessor.get_correction(context).change, 0.0)
 
 
 def test_beliefs_of_another_shape_are_refused_with_both_named():

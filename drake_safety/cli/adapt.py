@@ -139,7 +139,7 @@ def adapt(
         "seed": seed,
         "feedback_sets": num_pairs,
         "differing_pairs": differing,
-        "shift": {mode: one.adaptation_.shift for mode, one in adapted.items() if one.adaptation_},
+        "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
         **{
             f"{mode}.{key}": figure.to_json()
@@ -272,14 +272,17 @@ def _adaptation_table(
     table = new_table(
         "mode",
         "method",
-        "shift b",
+        "added to the offset",
+        "safety slope",
+        "margin slope",
         title=f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently",
     )
     for mode, one in adapted.items():
         found = one.adaptation_
         if found is not None:
-            shift = f"{found.shift:+.2f}" if found.method == "shift" else "-"
-            table.add_row(mode, found.method, shift)
+            is_changed = found.method == "recalibration"
+            change = [f"{value:+.2f}" if is_changed else "-" for value in one.correction_.change]
+            table.add_row(mode, found.method, *change)
     return table
 
 

@@ -1,4 +1,4 @@
-"""How feedback changes beliefs: the paper's update, and the paired shift of the sharpened mode."""
+"""How feedback changes beliefs by the paper's update; `recalibration` has the sharpened mode's."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from drake_safety.learning.assessment_parameters import AdaptationParameters, As
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import sigmoid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,18 +18,16 @@ class Adaptation:
     """What an assessment was adapted to.
 
     Attributes:
-        method: "paper" or "shift".
+        method: "paper" or "recalibration".
         variation: Of the actual episodes.
         num_sets: How many feedback sets there were.
         num_differing: How many of them had a twin that ended differently.
-        shift: b, what was added to the logit of an unsafe end (shift).
     """
 
     method: str
     variation: str
     num_sets: int
     num_differing: int
-    shift: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,14 +38,14 @@ class TrainingScores:
         points: Psi(x), (K, N, 2).
         score: lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        logit: L, (N,); none where the maps have no heads.
+        heads: What L is made of, see `BaseLogit.heads`, (N, 2); none where the maps have no heads.
         nearest: Column of the constraint that is predicted to be nearest its violation, (N,).
     """
 
     points: np.ndarray
     score: np.ndarray
     cause: np.ndarray
-    logit: np.ndarray | None
+    heads: np.ndarray | None
     nearest: np.ndarray | None
 
 
@@ -169,116 +166,3 @@ def combined(prior: np.ndarray, feedback: np.ndarray) -> np.ndarray:
     )
     has_feedback = feedback[:, belief_masses.UNCERTAINTY] < 1.0
     return np.where(has_feedback[:, None], both, prior)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Outcomes:
-    """How episodes were judged when they began, and how they ended.
-
-    Attributes:
-        logit: L of each, (M,).
-        is_unsafe: Whether it ended unsafely, (M,).
-    """
-
-    logit: np.ndarray
-    is_unsafe: np.ndarray
-
-    def surplus(self, shift: float = 0.0) -> float:
-        """Unsafe ends that sigma(L + shift) expects beyond those that there were."""
-        from scipy.special import expit
-
-        return float(np.sum(expit(self.logit + shift) - self.is_unsafe))
-
-
-def fitted_shift(actual: Outcomes, nominal: Outcomes, *, prior_std: float) -> float:
-    """The one number b for which sigma(L + b) is as right of the actual robot as L of the twins.
-
-    On average sigma(L + b) exceeds the actual episodes' outcomes by as much as sigma(L) exceeds
-    their twins'. What is hard to tell of a start is so for both of a pair and cancels, and so does
-    what L is wrong about on the nominal plant, too. Only how pairs begin is compared: later a twin
-    is in another state, and its end says nothing of where the actual robot is.
-
-    Args:
-        actual: The actual episodes.
-        nominal: Their twins.
-        prior_std: Standard deviation of b before any feedback.
-    """
-    from scipy.optimize import brentq
-
-    expected = nominal.surplus()
-
-    def slope(b: float) -> float:
-        return actual.surplus(b) - expected + b / prior_std**2
-
-    # The slope of the negative log posterior rises throughout; out there it has the sign of b.
-    bound = 2.0 * (len(actual.logit) + len(nominal.logit)) * prior_std**2
-    return float(brentq(slope, -bound, bound, xtol=1e-10))
-
-
-def cell_shift(
-    shift: float, feedback: FeedbackSegments, points: np.ndarray, grid: Grid
-) -> np.ndarray:
-    """b of every map's cells, (K, R*R): nowhere safer where most of the feedback was unsafe.
-
-    Args:
-        shift: b.
-        feedback: The feedback.
-        points: Psi(x) of it, (K, M, 2).
-        grid: The grid.
-    """
-    cells = np.full((len(points), grid.num_cells), shift)
-    if shift < 0.0:
-        for row, member_points in zip(cells, points, strict=True):
-            located = grid.locate(member_points)
-            # Safe counts against unsafe: a majority of unsafe segments is above zero.
-            vote = np.where(feedback.is_unsafe, 1.0, -1.0)[located >= 0]
-            majority = np.bincount(located[located >= 0], vote, minlength=grid.num_cells)
-            row[majority > 0.0] = 0.0
-    return cells
-
-
-def shifted_beliefs(
-    training: TrainingScores,
-    shift: np.ndarray,
-    grid: Grid,
-    parameters: AssessmentParameters,
-    num_causes: int,
-) -> np.ndarray:
-    """Beliefs from training scores that are shifted as the logit is, (K, R*R, 3 + n_c).
-
-    Departure: the paper learns where the nominal scores are unreliable and trusts them less there.
-    That hardly moves the safe share of a cell, as F keeps the ratio of its masses, and the
-    discrepancy has no sign. Shifting every score by sigma(L + b) - sigma(L) moves the boundary
-    between safe and unsafe itself, and needs few pairs, as it is one number.
-
-    Args:
-        training: The training segments.
-        shift: b of every map's cells, (K, R*R).
-        grid: The grid.
-        parameters: Of the assessment.
-        num_causes: n_c.
-    """
-    if training.logit is None or training.nearest is None:
-        raise ValueError("shifted_beliefs: the maps have no heads, and so no logit to shift")
-    base = sigmoid(training.logit)
-    fused = []
-    for points, member_shift in zip(training.points, shift, strict=True):
-        cells = grid.locate(points)
-        is_inside = cells >= 0
-        b = member_shift[cells[is_inside]]
-        logit, score = training.logit[is_inside], training.score[is_inside]
-        # Without a shift the difference is zero to the bit, and so are the scores the same.
-        score = np.clip(score + (sigmoid(logit + b) - base[is_inside]), 0.0, 1.0)
-        cause = training.cause[is_inside]
-        # What has become possible has the cause that is nearest.
-        cause = np.where(cause >= 0, cause, training.nearest[is_inside])
-        masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
-        fused.append(
-            belief_masses.fuse_cells(
-                masses,
-                cells[is_inside],
-                num_cells=grid.num_cells,
-                min_count=parameters.min_count,
-            )
-        )
-    return np.stack(fused)

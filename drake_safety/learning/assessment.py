@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.learning import adaptation, assessment_file, prediction
+from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
     MODES,
@@ -27,7 +27,7 @@ from drake_safety.learning.feedback import (
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import check_width, input_parts, num_inputs
-from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit
+from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 from drake_safety.learning.training import fitted_base_logit, learned_maps, segments_for
@@ -41,7 +41,7 @@ __all__ = [
     "SafetyAssessment",
 ]
 
-ADAPTATION_METHODS = ("shift", "paper")
+ADAPTATION_METHODS = ("recalibration", "paper")
 
 
 class SafetyAssessment:
@@ -56,10 +56,10 @@ class SafetyAssessment:
       prediction takes other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
       segments in the cells, (K, N, 2), (N,), (N,), which adaptation starts from; where the maps
-      have heads also `training_logit_` and `training_nearest_`, the `BaseLogit` L of the segments
-      and the constraint that is predicted to be nearest, (N,), (N,).
+      have heads also `training_heads_` and `training_nearest_`, what the `BaseLogit` L of the
+      segments is made of and the constraint that is predicted to be nearest, (N, 2), (N,).
     - `base_logit_`: L, which scales the maps' heads to one logit; None without heads.
-    - `shift_`: what feedback adds to L in every map's cells, (K, R*R); zero before any.
+    - `correction_`: the `Correction`, what feedback adds to L; nothing before any.
     - `adaptation_`: the `Adaptation` to feedback; None before any.
     - `calibrations_`: the `Calibration` by its kind, of these maps and `beliefs_`; empty until it
       is set.
@@ -122,11 +122,11 @@ class SafetyAssessment:
         self.training_score_ = _single(segments.score)
         self.training_cause_ = segments.cause
         self.base_logit_: BaseLogit | None = None
-        self.training_logit_ = self.training_nearest_ = None
+        self.training_heads_ = self.training_nearest_ = None
         if self.embedding_.has_heads:
             margins = output.margins.mean(axis=0)
             self.base_logit_ = fitted_base_logit(output, is_held_out, segments, parameters)
-            self.training_logit_ = _single(self.base_logit_.of_output(output))
+            self.training_heads_ = _single(self.base_logit_.heads(output))
             self.training_nearest_ = (
                 margins.argmin(axis=1)
                 if margins.shape[1]
@@ -134,7 +134,7 @@ class SafetyAssessment:
             )
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
-        self.shift_ = np.zeros((self.embedding_.num_members, self.grid_.num_cells))
+        self.correction_ = Correction.none(self.embedding_.num_members, self.grid_.num_cells)
         self.beliefs_ = adaptation.prior_beliefs(
             self._training, self.grid_, parameters, self.num_causes
         )
@@ -155,7 +155,7 @@ class SafetyAssessment:
             points=self.training_points_,
             score=self.training_score_,
             cause=self.training_cause_,
-            logit=self.training_logit_,
+            heads=self.training_heads_,
             nearest=self.training_nearest_,
         )
 
@@ -167,28 +167,29 @@ class SafetyAssessment:
         Every adaptation starts from the nominal episodes, as F is not associative: give all
         feedback there is, not only what is new.
 
-        Departure ("shift"): see `adaptation.shifted_beliefs`.
+        Departure ("recalibration"): see `recalibration.recalibrated_beliefs`.
 
         Args:
             feedback: Pairs of actual episodes and their nominal twins.
-            method: "shift" moves logit and scores by one number; "paper" is the paper's update, by
-                a discrepancy function and feedback beliefs. By default what the mode is called
-                for: "paper" in the paper's mode and without heads, else "shift".
+            method: "recalibration" changes the three numbers of L, and scores with it; "paper" is
+                the paper's update, by a discrepancy function and feedback beliefs. By default what
+                the mode is called for: "paper" in the paper's mode and without heads, else
+                "recalibration".
 
         Returns:
             Another assessment with the same maps.
 
         Raises:
-            ValueError: Unknown method, maps without heads for "shift", no feedback, or feedback of
-                another scenario.
+            ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
+                feedback of another scenario.
         """
         self._check_fitted()
         has_heads = self.base_logit_ is not None
-        method = method or ("shift" if has_heads else "paper")
-        if method not in ADAPTATION_METHODS or (method == "shift" and not has_heads):
+        method = method or ("recalibration" if has_heads else "paper")
+        if method not in ADAPTATION_METHODS or (method == "recalibration" and not has_heads):
             raise ValueError(
                 f"SafetyAssessment of '{self.info_.scenario}': cannot adapt by '{method}'; the "
-                f"methods are {list(ADAPTATION_METHODS)}, and 'shift' takes maps with heads"
+                f"methods are {list(ADAPTATION_METHODS)}, and 'recalibration' takes maps with heads"
             )
         check_feedback(feedback, self.info_)
         segments = self.feedback_segments(feedback)
@@ -200,8 +201,7 @@ class SafetyAssessment:
         # What was promised was promised of other beliefs.
         adapted.calibrations_ = {}
         arguments = (self.grid_, self.parameters, self.num_causes)
-        b = 0.0
-        adapted.shift_ = np.zeros_like(self.shift_)
+        adapted.correction_ = Correction.none(len(points), self.grid_.num_cells)
         if method == "paper":
             adapted.beliefs_ = adaptation.paper_beliefs(
                 self._training, segments, points, *arguments
@@ -209,35 +209,46 @@ class SafetyAssessment:
         elif self.base_logit_ is not None:
             # Outcomes are what counts: with the same ones on both sides there is no evidence.
             if any(one.differs for one in feedback):
-                b = self._fitted_shift(feedback)
-            adapted.shift_ = adaptation.cell_shift(b, segments, points, self.grid_)
-            adapted.beliefs_ = adaptation.shifted_beliefs(
-                self._training, adapted.shift_, *arguments
+                adapted.correction_ = Correction(
+                    change=self._fitted_change(feedback, self.base_logit_),
+                    guard=recalibration.guarded_cells(segments, points, self.grid_),
+                )
+            adapted.beliefs_ = recalibration.recalibrated_beliefs(
+                self._training, self.base_logit_, adapted.correction_, *arguments
             )
         adapted.adaptation_ = Adaptation(
             method=method,
             variation=feedback[0].info.variation,
             num_sets=len(feedback),
             num_differing=sum(one.differs for one in feedback),
-            shift=b,
         )
         return adapted
 
-    def _fitted_shift(self, feedback: Sequence[FeedbackSet]) -> float:
-        assert self.base_logit_ is not None
-        actual = [(one.state[0], one.desired_preview[0], one.features[0]) for one in feedback]
-        twins = [(one.twin_state, one.twin_desired_preview, one.twin_features) for one in feedback]
-        logit, twin_logit = (
-            self.base_logit_.of_output(self.embedding_.evaluate(self._inputs(*map(np.array, x))))
-            for x in (zip(*actual, strict=True), zip(*twins, strict=True))
-        )
-        return adaptation.fitted_shift(
-            adaptation.Outcomes(logit=logit, is_unsafe=np.array([o.is_unsafe for o in feedback])),
-            adaptation.Outcomes(
-                logit=twin_logit, is_unsafe=np.array([o.nominal_is_unsafe for o in feedback])
+    def _fitted_change(self, feedback: Sequence[FeedbackSet], base_logit: BaseLogit) -> np.ndarray:
+        def heads(*x: np.ndarray) -> np.ndarray:
+            return base_logit.heads(self.embedding_.evaluate(self._inputs(*x)))
+
+        num_rows = np.array([len(one) for one in feedback])
+        is_unsafe = np.array([one.is_unsafe for one in feedback])
+        actual = recalibration.Outcomes(
+            heads=heads(
+                np.concatenate([one.state for one in feedback]),
+                np.concatenate([one.desired_preview for one in feedback]),
+                np.concatenate([one.features for one in feedback]),
             ),
-            prior_std=self.parameters.adaptation.shift_std,
+            is_unsafe=np.repeat(is_unsafe, num_rows),
+            weight=recalibration.row_weights(num_rows),
         )
+        twins = recalibration.Outcomes(
+            heads=heads(
+                np.array([one.twin_state for one in feedback]),
+                np.array([one.twin_desired_preview for one in feedback]),
+                np.array([one.twin_features for one in feedback]),
+            ),
+            is_unsafe=np.array([one.nominal_is_unsafe for one in feedback]),
+            weight=np.ones(len(feedback)),
+        )
+        return recalibration.fitted_change(actual, twins, base_logit, self.parameters.adaptation)
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
         """The segments of feedback sets, cut as the training episodes were."""
@@ -266,28 +277,30 @@ class SafetyAssessment:
         if not hasattr(self, "beliefs_"):
             raise ValueError("SafetyAssessment: it has not been fitted or loaded yet")
 
-    def _cells(
-        self, beliefs: np.ndarray | None, shift: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _learned(
+        self, beliefs: np.ndarray | None, correction: Correction | None
+    ) -> tuple[np.ndarray, Correction]:
         beliefs = self.beliefs_ if beliefs is None else beliefs
-        shift = self.shift_ if shift is None else shift
+        correction = self.correction_ if correction is None else correction
         for name, given, own in (
             ("beliefs", beliefs, self.beliefs_),
-            ("shifts", shift, self.shift_),
+            ("the correction's change", correction.change, self.correction_.change),
+            ("the correction's guard", correction.guard, self.correction_.guard),
         ):
             if given.shape != own.shape:
                 raise ValueError(
-                    f"SafetyAssessment: {name} have shape {given.shape}, expected {own.shape}"
+                    f"SafetyAssessment: the shape of {name} is {given.shape}, expected {own.shape}"
                 )
-        return beliefs, shift
+        return beliefs, correction
 
     def predict(
         self,
         state: np.ndarray,
         desired_preview: np.ndarray,
         features: np.ndarray | None = None,
+        *,
         beliefs: np.ndarray | None = None,
-        shift: np.ndarray | None = None,
+        correction: Correction | None = None,
     ) -> Assessments:
         """Assesses N inputs.
 
@@ -296,7 +309,7 @@ class SafetyAssessment:
             desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
             features: Features, (N, n_f); the paper's mode has no use for them.
             beliefs: Beliefs of the cells instead of `beliefs_`, (K, R*R, 3 + n_c).
-            shift: Shifts of the cells instead of `shift_`, (K, R*R).
+            correction: What is added to L instead of `correction_`.
 
         Returns:
             The assessments. An input that is not finite is empty: Gamma is 0 there.
@@ -305,7 +318,7 @@ class SafetyAssessment:
             ValueError: The widths or a shape are wrong, or there is nothing learned yet.
         """
         self._check_fitted()
-        beliefs, shift = self._cells(beliefs, shift)
+        beliefs, correction = self._learned(beliefs, correction)
         x = self._inputs(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
@@ -317,7 +330,7 @@ class SafetyAssessment:
             embedding=self.embedding_,
             grid=self.grid_,
             beliefs=beliefs,
-            shift=shift,
+            correction=correction,
             base_logit=self.base_logit_,
             is_sharpened=self.parameters.is_sharpened,
         )
@@ -327,12 +340,14 @@ class SafetyAssessment:
         state: np.ndarray,
         desired_preview: np.ndarray,
         features: np.ndarray | None = None,
+        *,
         beliefs: np.ndarray | None = None,
-        shift: np.ndarray | None = None,
+        correction: Correction | None = None,
     ) -> Assessment:
         """Assesses one input; the arguments are those of `predict` without the axis N."""
         self._check_fitted()
-        row = self.predict_row(state, desired_preview, features, *self._cells(beliefs, shift))
+        learned = self._learned(beliefs, correction)
+        row = self.predict_row(state, desired_preview, features, *learned)
         num_columns = self.beliefs_.shape[2]
         return Assessment(
             safety_probability=float(row[0]),
@@ -350,7 +365,7 @@ class SafetyAssessment:
         desired_preview: np.ndarray,
         features: np.ndarray | None,
         beliefs: np.ndarray,
-        shift: np.ndarray,
+        correction: Correction,
     ) -> np.ndarray:
         """`predict_one` as one vector, for the online run.
 
@@ -366,7 +381,7 @@ class SafetyAssessment:
             embedding=self.embedding_,
             grid=self.grid_,
             beliefs=beliefs,
-            shift=shift,
+            correction=correction,
             base_logit=self.base_logit_,
             is_sharpened=self.parameters.is_sharpened,
         )
@@ -379,13 +394,14 @@ class SafetyAssessment:
         }
         tensors |= {
             "beliefs": self.beliefs_,
-            "shift": self.shift_,
+            "correction.change": self.correction_.change,
+            "correction.guard": self.correction_.guard.astype(np.uint8),
             "training_points": self.training_points_,
             "training_score": self.training_score_.astype(np.float32),
             "training_cause": self.training_cause_.astype(np.int16),
         }
-        if self.training_logit_ is not None and self.training_nearest_ is not None:
-            tensors["training_logit"] = self.training_logit_.astype(np.float32)
+        if self.training_heads_ is not None and self.training_nearest_ is not None:
+            tensors["training_heads"] = self.training_heads_.astype(np.float32)
             tensors["training_nearest"] = self.training_nearest_.astype(np.int16)
         assessment_file.write(
             Path(path),
@@ -438,8 +454,8 @@ class SafetyAssessment:
         self.training_points_ = tensors["training_points"]
         self.training_score_ = _single(tensors["training_score"])
         self.training_cause_ = tensors["training_cause"].astype(np.int64)
-        logit, nearest = tensors.get("training_logit"), tensors.get("training_nearest")
-        self.training_logit_ = None if logit is None else _single(logit)
+        heads, nearest = tensors.get("training_heads"), tensors.get("training_nearest")
+        self.training_heads_ = None if heads is None else _single(heads)
         self.training_nearest_ = None if nearest is None else nearest.astype(np.int64)
         self.base_logit_ = None
         if base_logit is not None:
@@ -448,16 +464,17 @@ class SafetyAssessment:
         stored = [Calibration(**one) for one in calibrations]
         self.calibrations_ = {one.kind: one for one in stored}
         self.beliefs_ = tensors["beliefs"]
-        self.shift_ = tensors["shift"]
-        expected = (
-            self.embedding_.num_members,
-            self.grid_.num_cells,
-            3 + len(info.constraint_names),
+        self.correction_ = Correction(
+            change=tensors["correction.change"], guard=tensors["correction.guard"].astype(float)
         )
-        if self.beliefs_.shape != expected:
-            raise ValueError(f"its beliefs have shape {self.beliefs_.shape}, expected {expected}")
-        if self.shift_.shape != expected[:2]:
-            raise ValueError(f"its shifts have shape {self.shift_.shape}, expected {expected[:2]}")
+        num_members, num_cells = self.embedding_.num_members, self.grid_.num_cells
+        for name, shape, expected in (
+            ("beliefs", self.beliefs_.shape, (num_members, num_cells, 3 + self.num_causes)),
+            ("correction's change", self.correction_.change.shape, (3,)),
+            ("correction's guard", self.correction_.guard.shape, (num_members, num_cells)),
+        ):
+            if shape != expected:
+                raise ValueError(f"the shape of its {name} is {shape}, expected {expected}")
 
 
 def _single(values: np.ndarray) -> np.ndarray:

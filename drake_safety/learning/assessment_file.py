@@ -18,7 +18,7 @@ from drake_safety.learning.assessment_parameters import AdaptationParameters, As
 from drake_safety.learning.segments import EpisodesInfo
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 def write(

@@ -19,7 +19,8 @@ class AdaptationParameters:
         update_interval: k_u, feedback sets from one update to the next.
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
             its own cell, or literally the number of all feedback sets (paper).
-        shift_std: Standard deviation of the shift's prior (sharpened) [logit].
+        offset_std: Standard deviation of the prior of what changes in L's offset (sharpened).
+        slope_std: The same of either slope of L (sharpened).
     """
 
     gate: float = 0.3
@@ -28,14 +29,16 @@ class AdaptationParameters:
     first_uncertainty: float = 0.3
     update_interval: int = 40
     counts_per_cell: bool = True
-    shift_std: float = 2.0
+    offset_std: float = 2.0
+    slope_std: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("least_uncertainty", "first_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
+        for name in ("offset_std", "slope_std"):
+            self._expect(name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
             self._expect(name, getattr(self, name) >= 0.0, ">= 0")
-        self._expect("shift_std", self.shift_std > 0.0, "> 0")
         self._expect("update_interval", self.update_interval >= 1, ">= 1")
 
     def _expect(self, name: str, holds: bool, expected: str) -> None:

@@ -29,7 +29,7 @@ class Assessments:
             margins], (N, n_c); NaN for inputs that are not finite, without a margin head, and
             always in the paper's mode.
         unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN where there is none.
-        calibrated: Safety probability by the maps' heads, shifted by what feedback of the actual
+        calibrated: Safety probability by the maps' heads, corrected by what feedback of the actual
             robot has shown, (N,); 0 where nothing is known. Without heads it is `normalized`.
     """
 
@@ -87,26 +87,58 @@ class BaseLogit:
             found[:, 1] = -np.clip(smallest, *self.margin_range) / self.margin_unit
         return found
 
-    def of_output(self, output: EmbeddingOutput) -> np.ndarray:
-        """L of all inputs of an `EmbeddingOutput`, (N,); NaN without heads."""
-        logit = self.offset + self.heads(output) @ (self.safety_slope, self.margin_slope)
+    def of_heads(self, heads: np.ndarray) -> np.ndarray:
+        """L, (N,), of what `heads` gave."""
+        logit = self.offset + heads @ (self.safety_slope, self.margin_slope)
         return np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
-    def of_one(self, logits: list[float], margin: float | None) -> float:
-        """L in plain floats, for the online run.
+    def heads_one(self, logits: list[float], margin: float | None) -> tuple[float, float]:
+        """`heads` of one input in plain floats, for the online run.
 
         Args:
             logits: Of each member's safety head; none without heads.
             margin: Smallest predicted margin, if there is a margin head.
         """
-        logit = self.offset
+        z = nearness = 0.0
         if logits:
-            clipped = [min(max(z, -LOGIT_LIMIT), LOGIT_LIMIT) for z in logits]
-            logit += self.safety_slope * sum(clipped) / len(clipped)
+            z = sum([min(max(one, -LOGIT_LIMIT), LOGIT_LIMIT) for one in logits]) / len(logits)
         if margin is not None:
             low, high = self.margin_range
-            logit -= self.margin_slope * min(max(margin, low), high) / self.margin_unit
+            nearness = -min(max(margin, low), high) / self.margin_unit
+        return z, nearness
+
+    def of_one(self, z: float, nearness: float) -> float:
+        """L of what `heads_one` gave."""
+        logit = self.offset + self.safety_slope * z + self.margin_slope * nearness
         return min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Correction:
+    """What feedback adds to L: ``offset + safety_slope z - margin_slope m / margin_unit``.
+
+    Attributes:
+        change: What is added to L's offset, safety slope and margin slope, (3,).
+        guard: 1 in cells of each map where L must not fall, else 0, (K, R*R).
+    """
+
+    change: np.ndarray
+    guard: np.ndarray
+
+    @classmethod
+    def none(cls, num_members: int, num_cells: int) -> Correction:
+        """No correction, as before any feedback."""
+        return cls(change=np.zeros(3), guard=np.zeros((num_members, num_cells)))
+
+    def shift(self, heads: np.ndarray, guard: np.ndarray) -> np.ndarray:
+        """What is added to L, (N,).
+
+        Args:
+            heads: z and -m / margin_unit, (N, 2).
+            guard: What is read from the cells' guard, (N,).
+        """
+        shift = self.change[0] + heads @ self.change[1:]
+        return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
@@ -130,7 +162,7 @@ def predict(
     embedding: Embedding,
     grid: Grid,
     beliefs: np.ndarray,
-    shift: np.ndarray,
+    correction: Correction,
     base_logit: BaseLogit | None,
     is_sharpened: bool,
 ) -> Assessments:
@@ -141,19 +173,19 @@ def predict(
         embedding: The maps.
         grid: The grid of their cells.
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        shift: What is added to L in each cell, (K, R*R).
+        correction: What feedback adds to L.
         base_logit: L; None without heads.
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)
     num_members, _, num_columns = beliefs.shape
-    columns = np.concatenate([beliefs, shift[..., None]], axis=2)
+    columns = np.concatenate([beliefs, correction.guard[..., None]], axis=2)
     masses = np.zeros((len(x), num_columns))
-    total_shift = np.zeros(len(x))
+    guard = np.zeros(len(x))
     num_inside = np.zeros(len(x), dtype=int)
     for values, points in zip(columns, output.embedding, strict=True):
         read, is_outside = _read(values, points, grid, is_sharpened)
-        total_shift += read[:, -1]
+        guard += read[:, -1]
         num_inside += ~is_outside
         read = read[:, :-1]
         read[is_outside] = belief_masses.empty((), num_columns - 3)
@@ -166,8 +198,9 @@ def predict(
     calibrated = normalized.copy()
     if base_logit is not None:
         is_known = known > 0.0
-        logit = base_logit.of_output(output)[is_known]
-        calibrated[is_known] = sigmoid(-logit - total_shift[is_known] / num_inside[is_known])
+        heads = base_logit.heads(output)[is_known]
+        shift = correction.shift(heads, guard[is_known] / num_inside[is_known])
+        calibrated[is_known] = sigmoid(-base_logit.of_heads(heads) - shift)
     margins = np.full((len(x), num_columns - 3), np.nan)
     if output.margins.shape[2]:
         margins = output.margins.mean(axis=0)
@@ -202,7 +235,7 @@ def predict_row(
     embedding: Embedding,
     grid: Grid,
     beliefs: np.ndarray,
-    shift: np.ndarray,
+    correction: Correction,
     base_logit: BaseLogit | None,
     is_sharpened: bool,
 ) -> np.ndarray:
@@ -213,7 +246,7 @@ def predict_row(
         embedding: The maps.
         grid: The grid of their cells.
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        shift: What is added to L in each cell, (K, R*R).
+        correction: What feedback adds to L.
         base_logit: L; None without heads.
         is_sharpened: Whether beliefs are interpolated between cell centres.
 
@@ -260,10 +293,14 @@ def predict_row(
             np.add.reduce(output[:, 2:], out=margins)
             margins /= num_members
         if known > 0.0 and base_logit is not None:
-            logit = base_logit.of_one(
+            z, nearness = base_logit.heads_one(
                 embedding.unsafe_logit_one(output[:, :2]) if embedding.has_safety_head else [],
                 float(margins.min()) if embedding.num_margins else None,
             )
-            logit += float(np.dot(weights, shift.ravel().take(rows))) / sum(weights)
-            row[-1] = 1.0 / (1.0 + math.exp(logit))
+            offset, safety_slope, margin_slope = correction.change.tolist()
+            shift = offset + safety_slope * z + margin_slope * nearness
+            if shift < 0.0:
+                guard = float(np.dot(weights, correction.guard.ravel().take(rows)))
+                shift *= 1.0 - guard / sum(weights)
+            row[-1] = 1.0 / (1.0 + math.exp(base_logit.of_one(z, nearness) + shift))
     return row

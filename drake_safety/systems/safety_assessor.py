@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.prediction import Correction
 
 
 class SafetyAssessor(LeafSystem):
@@ -30,10 +31,10 @@ class SafetyAssessor(LeafSystem):
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
     b_safe / (1 - μ), 0 where nothing is known; ``calibrated_safety_probability`` is what the maps'
-    heads say, shifted by what feedback has shown. The beliefs of the grid and the shift are numeric
-    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
-    between simulations and during them. The embedding is immutable. A state, preview or feature
-    that is not finite has the EMPTY belief (0, 0, 1).
+    heads say, corrected by what feedback has shown. The beliefs of the grid and the correction are
+    numeric parameters of the Context: :meth:`adopt` replaces them by those of an adapted
+    assessment, between simulations and during them. The embedding is immutable. A state, preview or
+    feature that is not finite has the EMPTY belief (0, 0, 1).
 
     Args:
         assessment: A fitted assessment.
@@ -45,15 +46,15 @@ class SafetyAssessor(LeafSystem):
         info = assessment.info_
         self._assessment = assessment
         self._shape = assessment.beliefs_.shape
-        self._shift_shape = assessment.shift_.shape
         self._uses_features = assessment.uses_features
         self.constraint_names = list(info.constraint_names)
         n_c = len(self.constraint_names)
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        self._shift_index = self.DeclareNumericParameter(
-            BasicVector(np.asarray(assessment.shift_, dtype=float).ravel())
+        self._change_index, self._guard_index = (
+            self.DeclareNumericParameter(BasicVector(np.asarray(values, dtype=float).ravel()))
+            for values in (assessment.correction_.change, assessment.correction_.guard)
         )
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
@@ -100,27 +101,35 @@ class SafetyAssessor(LeafSystem):
         Raises:
             ValueError: Another shape.
         """
-        _replace(context, self._belief_index, "beliefs", beliefs, self._shape)
+        _check_shape("beliefs", beliefs, self._shape)
+        _replace(context, self._belief_index, beliefs)
 
-    def get_shift(self, context: Context) -> np.ndarray:
-        """The shift in a Context, shaped as the assessment's ``shift_``."""
-        values = context.get_numeric_parameter(self._shift_index).get_value()
-        return values.reshape(self._shift_shape)
+    def get_correction(self, context: Context) -> Correction:
+        """The correction in a Context."""
+        change, guard = (
+            context.get_numeric_parameter(index).get_value()
+            for index in (self._change_index, self._guard_index)
+        )
+        return Correction(change=change, guard=guard.reshape(self._shape[:2]))
 
-    def set_shift(self, context: Context, shift: np.ndarray) -> None:
-        """Replaces what is added to the maps' logit in every cell.
+    def set_correction(self, context: Context, correction: Correction) -> None:
+        """Replaces what is added to the maps' logit.
 
         Args:
             context: This system's Context.
-            shift: Shaped as the assessment's ``shift_``.
+            correction: With a guard for every cell of the assessment's maps.
 
         Raises:
-            ValueError: Another shape.
+            ValueError: Another shape; nothing is replaced.
         """
-        _replace(context, self._shift_index, "shifts", shift, self._shift_shape)
+        guard_shape = self._shape[:2]
+        _check_shape("the correction's change", correction.change, (3,))
+        _check_shape("the correction's guard", correction.guard, guard_shape)
+        _replace(context, self._change_index, correction.change)
+        _replace(context, self._guard_index, correction.guard)
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over beliefs and shift of an assessment that was adapted from this system's own.
+        """Takes over beliefs and correction of an assessment adapted from this system's own.
 
         Args:
             context: This system's Context.
@@ -136,7 +145,7 @@ class SafetyAssessor(LeafSystem):
                 "safety assessor: the assessment to adopt has other maps; build the diagram anew"
             )
         self.set_beliefs(context, adapted.beliefs_)
-        self.set_shift(context, adapted.shift_)
+        self.set_correction(context, adapted.correction_)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(
@@ -145,15 +154,16 @@ class SafetyAssessor(LeafSystem):
                 self._preview_port.Eval(context),
                 self._features_port.Eval(context) if self._uses_features else None,
                 self.get_beliefs(context),
-                self.get_shift(context),
+                self.get_correction(context),
             )
         )
 
 
-def _replace(
-    context: Context, index: int, what: str, values: np.ndarray, shape: tuple[int, ...]
-) -> None:
+def _check_shape(what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+    if np.shape(values) != shape:
+        raise ValueError(f"safety assessor: {what} must have shape {shape}; got {np.shape(values)}")
+
+
+def _replace(context: Context, index: int, values: np.ndarray) -> None:
     values = np.asarray(values, dtype=float)
-    if values.shape != shape:
-        raise ValueError(f"safety assessor: {what} must have shape {shape}; got {values.shape}")
     context.get_mutable_numeric_parameter(index).SetFromVector(values.ravel())
