@@ -17,6 +17,7 @@ from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.recalibration import (
     Outcomes,
+    cell_means,
     fitted_change,
     guarded_cells,
     recalibrated_beliefs,
@@ -69,12 +70,16 @@ def test_one_update(benchmark: Any, report: Callable[..., None], method: str) ->
     points = rng.uniform(-65.0, 65.0, (num_members, NUM_FEEDBACK, 2))
     base_logit = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1))
     heads = rng.normal(0.0, 3.0, (NUM_FEEDBACK, 2))
+    activations = np.maximum(rng.normal(size=(num_members, NUM_FEEDBACK, 128)), 0.0)
     num_rows = np.bincount(segments.set_index)
     weight = row_weights(num_rows)
-    actual = Outcomes(heads=heads, is_unsafe=segments.is_unsafe, weight=weight)
+    actual = Outcomes(
+        heads=heads, activations=activations, is_unsafe=segments.is_unsafe, weight=weight
+    )
     first = weight > 1.0
     twins = Outcomes(
         heads=heads[first],
+        activations=activations[:, first],
         is_unsafe=segments.nominal_is_unsafe[first],
         weight=np.ones(len(num_rows)),
     )
@@ -84,11 +89,13 @@ def test_one_update(benchmark: Any, report: Callable[..., None], method: str) ->
         if method == "paper":
             paper_beliefs(scores, segments, points, grid, parameters, NUM_CAUSES)
         else:
-            correction = Correction(
-                change=fitted_change(actual, twins, base_logit, parameters.adaptation),
-                guard=guarded_cells(segments, points, grid),
+            change, hidden = fitted_change(actual, twins, base_logit, parameters.adaptation)
+            guard = guarded_cells(segments, points, grid)
+            correction = Correction(change=change, hidden=hidden, guard=guard)
+            residual = cell_means(np.einsum("kni,ki->n", activations, hidden[:, :-1]), points, grid)
+            recalibrated_beliefs(
+                scores, base_logit, correction, residual, grid, parameters, NUM_CAUSES
             )
-            recalibrated_beliefs(scores, base_logit, correction, grid, parameters, NUM_CAUSES)
         return time.process_time() - started
 
     with threadpool_limits(1):

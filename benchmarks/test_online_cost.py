@@ -157,7 +157,9 @@ def test_one_evaluation_inside_a_diagram(
             eager = EagerNetworks(assessment.embedding_)
             # Γ is really evaluated, and torch does the same.
             assert running.output("safety_probability")[0] > 0.0
-            ours = assessment.embedding_.evaluate_one(x)
+            evaluated = assessment.embedding_.evaluate_one(x)
+            assert evaluated is not None
+            ours, _ = evaluated
             theirs = np.stack([z.numpy() for z in eager.evaluate(x)])
             np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-3)
             costs: dict[str, list[float]] = {"ours": [], "empty": [], "torch": []}

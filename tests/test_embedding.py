@@ -141,10 +141,13 @@ def test_a_sample_weight_draws_the_map_towards_its_samples(data):
 
 def test_one_input_alone_gives_what_it_gives_among_many(data, embedding):
     output = embedding.evaluate(data.x)
+    activations = embedding.activations(data.x)
     for row in (0, 17, 599):
-        one = embedding.evaluate_one(data.x[row].astype(np.float32))
+        one, hidden = embedding.evaluate_one(data.x[row].astype(np.float32))
         np.testing.assert_allclose(one[:, :2], output.embedding[:, row], rtol=1e-4, atol=1e-3)
         np.testing.assert_allclose(one[:, 2:], output.margins[:, row], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(hidden[:, :-1], activations[:, row], rtol=1e-4, atol=1e-4)
+        np.testing.assert_array_equal(hidden[:, -1], 1.0)
 
 
 def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):

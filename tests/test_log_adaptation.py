@@ -73,12 +73,15 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
     assert not call(monkeypatch, "adapt", folder / "short.yaml", *logs, *options)
     for mode in MODES:
         adapted = load(adapted_folder(folder, files[0].stem), mode)
-        assert not np.allclose(adapted.beliefs_, load(folder, mode).beliefs_, atol=0.01)
+        changed = np.abs(adapted.beliefs_ - load(folder, mode).beliefs_).max()
+        assert changed > 0.05
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
         change = adapted.correction_.change
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
-        np.testing.assert_allclose(adapted.beliefs_, directly[mode].beliefs_, atol=3e-3)
+        np.testing.assert_allclose(
+            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.01)
+        )
         np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 
 

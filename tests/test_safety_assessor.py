@@ -1,5 +1,7 @@
 """SafetyAssessor: Γ inside a diagram, evaluated on time, with beliefs that live in the Context."""
 
+import dataclasses
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +17,11 @@ PERIOD_S = 0.04
 STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0, 8.0, 9.0])
 
 
+def correction(size):
+    """One of maps with three activations, for six cells."""
+    return Correction(change=np.full(3, size), hidden=np.full((1, 4), size), guard=np.ones((1, 6)))
+
+
 class AssessmentDouble:
     """b_safe is the state's first entry times the first belief; it keeps what it was asked."""
 
@@ -27,7 +34,7 @@ class AssessmentDouble:
             horizon=2,
         )
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
-        self.correction_ = Correction.none(1, 6)
+        self.correction_ = correction(0.0)
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
         self.asked = []
@@ -39,7 +46,7 @@ class AssessmentDouble:
         else:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
-        calibrated = safe + correction.change[1] * correction.guard[0, 5]
+        calibrated = safe + correction.hidden[0, 3] * correction.guard[0, 5]
         return np.array([safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan, calibrated])
 
 
@@ -158,27 +165,30 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     adapted = AssessmentDouble()
     adapted.embedding_ = assessment.embedding_
     adapted.beliefs_ = 2 * assessment.beliefs_
-    adapted.correction_ = Correction(change=np.array([0.0, 0.125, 0.0]), guard=np.ones((1, 6)))
+    adapted.correction_ = correction(0.125)
     assessor.adopt(context, adapted)
     assert value(assessor, context, "safety_probability")[0] == 0.25
     simulator.AdvanceTo(PERIOD_S + 0.001)
     assert value(assessor, context, "safety_probability")[0] == 0.5
     assert value(assessor, context, "calibrated_safety_probability")[0] == 0.625
     found = assessor.get_correction(context)
-    np.testing.assert_array_equal(found.change, adapted.correction_.change)
-    np.testing.assert_array_equal(found.guard, adapted.correction_.guard)
-    assert np.all(assessor.get_correction(assessor.CreateDefaultContext()).change == 0.0)
+    for name in ("change", "hidden", "guard"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(adapted.correction_, name))
+    assert np.all(assessor.get_correction(assessor.CreateDefaultContext()).hidden == 0.0)
 
 
 def test_beliefs_over_other_maps_and_corrections_of_another_shape_are_refused():
     _, assessor, _, context = running()
     with pytest.raises(ValueError, match="has other maps"):
         assessor.adopt(context, AssessmentDouble())
-    with pytest.raises(ValueError, match=r"must have shape \(1, 6\); got \(6,\)"):
-        assessor.set_correction(context, Correction(change=np.ones(3), guard=np.zeros(6)))
-    with pytest.raises(ValueError, match=r"change must have shape \(3,\); got \(2,\)"):
-        assessor.set_correction(context, Correction(change=np.ones(2), guard=np.zeros((1, 6))))
-    np.testing.assert_array_equal(assessor.get_correction(context).change, 0.0)
+    wrong = {"guard": np.zeros(6), "change": np.ones(2), "hidden": np.ones((2, 4))}
+    expected = {"guard": "(1, 6)", "change": "(3,)", "hidden": "(1, 4)"}
+    for name, values in wrong.items():
+        asked = dataclasses.replace(correction(1.0), **{name: values})
+        message = f"correction's {name} must have shape {expected[name]}; got {values.shape}"
+        with pytest.raises(ValueError, match=re.escape(message)):
+            assessor.set_correction(context, asked)
+    np.testing.assert_array_equal(assessor.get_correction(context).hidden, 0.0)
 
 
 def test_beliefs_of_another_shape_are_refused_with_both_named():

@@ -134,7 +134,7 @@ class SafetyAssessment:
             )
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
-        self.correction_ = Correction.none(self.embedding_.num_members, self.grid_.num_cells)
+        self.correction_ = Correction.none(self.embedding_, self.grid_)
         self.beliefs_ = adaptation.prior_beliefs(
             self._training, self.grid_, parameters, self.num_causes
         )
@@ -171,7 +171,7 @@ class SafetyAssessment:
 
         Args:
             feedback: Pairs of actual episodes and their nominal twins.
-            method: "recalibration" changes the three numbers of L, and scores with it; "paper" is
+            method: "recalibration" changes L, and scores with it; "paper" is
                 the paper's update, by a discrepancy function and feedback beliefs. By default what
                 the mode is called for: "paper" in the paper's mode and without heads, else
                 "recalibration".
@@ -193,15 +193,13 @@ class SafetyAssessment:
             )
         check_feedback(feedback, self.info_)
         segments = self.feedback_segments(feedback)
-        output = self.embedding_.evaluate(
-            self._inputs(segments.state, segments.desired_preview, segments.features)
-        )
-        points = output.embedding
+        x = self._inputs(segments.state, segments.desired_preview, segments.features)
+        points = self.embedding_.embed(x)
         adapted = copy.copy(self)
         # What was promised was promised of other beliefs.
         adapted.calibrations_ = {}
         arguments = (self.grid_, self.parameters, self.num_causes)
-        adapted.correction_ = Correction.none(len(points), self.grid_.num_cells)
+        adapted.correction_ = Correction.none(self.embedding_, self.grid_)
         if method == "paper":
             adapted.beliefs_ = adaptation.paper_beliefs(
                 self._training, segments, points, *arguments
@@ -209,12 +207,16 @@ class SafetyAssessment:
         elif self.base_logit_ is not None:
             # Outcomes are what counts: with the same ones on both sides there is no evidence.
             if any(one.differs for one in feedback):
-                adapted.correction_ = Correction(
-                    change=self._fitted_change(feedback, self.base_logit_),
-                    guard=recalibration.guarded_cells(segments, points, self.grid_),
-                )
+                change, hidden = self._fitted_change(feedback, self.base_logit_)
+                guard = recalibration.guarded_cells(segments, points, self.grid_)
+                adapted.correction_ = Correction(change=change, hidden=hidden, guard=guard)
+            residual = adapted.correction_.residual(self.embedding_, x)
             adapted.beliefs_ = recalibration.recalibrated_beliefs(
-                self._training, self.base_logit_, adapted.correction_, *arguments
+                self._training,
+                self.base_logit_,
+                adapted.correction_,
+                recalibration.cell_means(residual, points, self.grid_),
+                *arguments,
             )
         adapted.adaptation_ = Adaptation(
             method=method,
@@ -224,29 +226,37 @@ class SafetyAssessment:
         )
         return adapted
 
-    def _fitted_change(self, feedback: Sequence[FeedbackSet], base_logit: BaseLogit) -> np.ndarray:
-        def heads(*x: np.ndarray) -> np.ndarray:
-            return base_logit.heads(self.embedding_.evaluate(self._inputs(*x)))
+    def _fitted_change(
+        self, feedback: Sequence[FeedbackSet], base_logit: BaseLogit
+    ) -> tuple[np.ndarray, np.ndarray]:
+        def outcomes(
+            x: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray
+        ) -> recalibration.Outcomes:
+            return recalibration.Outcomes(
+                heads=base_logit.heads(self.embedding_.evaluate(x)),
+                activations=self.embedding_.activations(x),
+                is_unsafe=is_unsafe,
+                weight=weight,
+            )
 
         num_rows = np.array([len(one) for one in feedback])
-        is_unsafe = np.array([one.is_unsafe for one in feedback])
-        actual = recalibration.Outcomes(
-            heads=heads(
+        actual = outcomes(
+            self._inputs(
                 np.concatenate([one.state for one in feedback]),
                 np.concatenate([one.desired_preview for one in feedback]),
                 np.concatenate([one.features for one in feedback]),
             ),
-            is_unsafe=np.repeat(is_unsafe, num_rows),
-            weight=recalibration.row_weights(num_rows),
+            np.repeat([one.is_unsafe for one in feedback], num_rows),
+            recalibration.row_weights(num_rows),
         )
-        twins = recalibration.Outcomes(
-            heads=heads(
+        twins = outcomes(
+            self._inputs(
                 np.array([one.twin_state for one in feedback]),
                 np.array([one.twin_desired_preview for one in feedback]),
                 np.array([one.twin_features for one in feedback]),
             ),
-            is_unsafe=np.array([one.nominal_is_unsafe for one in feedback]),
-            weight=np.ones(len(feedback)),
+            np.array([one.nominal_is_unsafe for one in feedback]),
+            np.ones(len(feedback)),
         )
         return recalibration.fitted_change(actual, twins, base_logit, self.parameters.adaptation)
 
@@ -285,6 +295,7 @@ class SafetyAssessment:
         for name, given, own in (
             ("beliefs", beliefs, self.beliefs_),
             ("the correction's change", correction.change, self.correction_.change),
+            ("the correction's hidden", correction.hidden, self.correction_.hidden),
             ("the correction's guard", correction.guard, self.correction_.guard),
         ):
             if given.shape != own.shape:
@@ -395,6 +406,7 @@ class SafetyAssessment:
         tensors |= {
             "beliefs": self.beliefs_,
             "correction.change": self.correction_.change,
+            "correction.hidden": self.correction_.hidden,
             "correction.guard": self.correction_.guard.astype(np.uint8),
             "training_points": self.training_points_,
             "training_score": self.training_score_.astype(np.float32),
@@ -465,12 +477,19 @@ class SafetyAssessment:
         self.calibrations_ = {one.kind: one for one in stored}
         self.beliefs_ = tensors["beliefs"]
         self.correction_ = Correction(
-            change=tensors["correction.change"], guard=tensors["correction.guard"].astype(float)
+            change=tensors["correction.change"],
+            hidden=tensors["correction.hidden"],
+            guard=tensors["correction.guard"].astype(float),
         )
         num_members, num_cells = self.embedding_.num_members, self.grid_.num_cells
         for name, shape, expected in (
             ("beliefs", self.beliefs_.shape, (num_members, num_cells, 3 + self.num_causes)),
             ("correction's change", self.correction_.change.shape, (3,)),
+            (
+                "correction's hidden",
+                self.correction_.hidden.shape,
+                (num_members, self.embedding_.num_activations + 1),
+            ),
             ("correction's guard", self.correction_.guard.shape, (num_members, num_cells)),
         ):
             if shape != expected:

@@ -21,6 +21,8 @@ class AdaptationParameters:
             its own cell, or literally the number of all feedback sets (paper).
         offset_std: Standard deviation of the prior of what changes in L's offset (sharpened).
         slope_std: The same of either slope of L (sharpened).
+        hidden_std: The same of what the maps' last hidden layer adds to L, where its activations
+            are as far from their mean as they are in feedback (sharpened).
     """
 
     gate: float = 0.3
@@ -31,11 +33,12 @@ class AdaptationParameters:
     counts_per_cell: bool = True
     offset_std: float = 2.0
     slope_std: float = 0.5
+    hidden_std: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("least_uncertainty", "first_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
-        for name in ("offset_std", "slope_std"):
+        for name in ("offset_std", "slope_std", "hidden_std"):
             self._expect(name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
             self._expect(name, getattr(self, name) >= 0.0, ">= 0")

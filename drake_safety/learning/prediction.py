@@ -115,29 +115,44 @@ class BaseLogit:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correction:
-    """What feedback adds to L: ``offset + safety_slope z - margin_slope m / margin_unit``.
+    """What feedback adds to L: a change of its three numbers, and of what else the maps know.
 
     Attributes:
         change: What is added to L's offset, safety slope and margin slope, (3,).
+        hidden: What each activation of the maps' last hidden layer, and a last entry of 1, adds to
+            L, (K, num_activations + 1).
         guard: 1 in cells of each map where L must not fall, else 0, (K, R*R).
     """
 
     change: np.ndarray
+    hidden: np.ndarray
     guard: np.ndarray
 
     @classmethod
-    def none(cls, num_members: int, num_cells: int) -> Correction:
+    def none(cls, embedding: Embedding, grid: Grid) -> Correction:
         """No correction, as before any feedback."""
-        return cls(change=np.zeros(3), guard=np.zeros((num_members, num_cells)))
+        return cls(
+            change=np.zeros(3),
+            hidden=np.zeros((embedding.num_members, embedding.num_activations + 1)),
+            guard=np.zeros((embedding.num_members, grid.num_cells)),
+        )
 
-    def shift(self, heads: np.ndarray, guard: np.ndarray) -> np.ndarray:
+    def residual(self, embedding: Embedding, x: np.ndarray) -> np.ndarray:
+        """What the hidden layer adds to L at finite inputs (N, n_x), (N,)."""
+        if not self.hidden.any():
+            return np.zeros(len(x))
+        added = np.einsum("kni,ki->n", embedding.activations(x), self.hidden[:, :-1])
+        return added + self.hidden[:, -1].sum()
+
+    def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
         """What is added to L, (N,).
 
         Args:
             heads: z and -m / margin_unit, (N, 2).
+            residual: What the hidden layer adds, (N,).
             guard: What is read from the cells' guard, (N,).
         """
-        shift = self.change[0] + heads @ self.change[1:]
+        shift = self.change[0] + heads @ self.change[1:] + residual
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
 
 
@@ -199,7 +214,8 @@ def predict(
     if base_logit is not None:
         is_known = known > 0.0
         heads = base_logit.heads(output)[is_known]
-        shift = correction.shift(heads, guard[is_known] / num_inside[is_known])
+        residual = correction.residual(embedding, x[is_known])
+        shift = correction.shift(heads, residual, guard[is_known] / num_inside[is_known])
         calibrated[is_known] = sigmoid(-base_logit.of_heads(heads) - shift)
     margins = np.full((len(x), num_columns - 3), np.nan)
     if output.margins.shape[2]:
@@ -257,7 +273,8 @@ def predict_row(
     row = np.empty(2 + 2 * num_columns)
     masses = row[2 : 2 + num_columns]
     margins = row[4 + num_columns : -1]
-    output = embedding.evaluate_one(*parts)
+    evaluated = embedding.evaluate_one(*parts)
+    output = None if evaluated is None else evaluated[0]
     rows: list[int] = []
     weights: list[float] = []
     if output is None:
@@ -286,7 +303,8 @@ def predict_row(
     known = safe + unsafe
     row[0] = safe
     row[1] = row[-1] = safe / known if known > 0.0 else 0.0
-    if output is not None:
+    if evaluated is not None:
+        output, activations = evaluated
         row[2 + num_columns : 4 + num_columns] = output[0, :2]
         margins[:] = np.nan
         if embedding.num_margins:
@@ -299,6 +317,7 @@ def predict_row(
             )
             offset, safety_slope, margin_slope = correction.change.tolist()
             shift = offset + safety_slope * z + margin_slope * nearness
+            shift += float(np.vdot(activations, correction.hidden))
             if shift < 0.0:
                 guard = float(np.dot(weights, correction.guard.ravel().take(rows)))
                 shift *= 1.0 - guard / sum(weights)

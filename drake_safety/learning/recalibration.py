@@ -20,69 +20,107 @@ class Outcomes:
 
     Attributes:
         heads: What L is made of, see `BaseLogit.heads`, (M, 2).
+        activations: Of the maps' last hidden layer, (K, M, n).
         is_unsafe: Whether the row's episode ended unsafely, (M,).
         weight: What the row counts for, (M,).
     """
 
     heads: np.ndarray
+    activations: np.ndarray
     is_unsafe: np.ndarray
     weight: np.ndarray
 
 
 def row_weights(num_rows: np.ndarray) -> np.ndarray:
-    """What rows of episodes count for: one for an episode's first row, and one for the mean of all.
+    """What rows of episodes count for: one for an episode's first row, and two for all together.
+
+    Rows of an episode share their end: an episode is worth a few samples, not one for each row.
 
     Args:
         num_rows: Rows of each episode; they follow each other.
     """
     first = np.cumsum(num_rows) - num_rows
-    weight = np.repeat(1.0 / num_rows, num_rows)
+    weight = np.repeat(2.0 / num_rows, num_rows)
     weight[first] += 1.0
     return weight
 
 
 def fitted_change(
     actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
-) -> np.ndarray:
-    """What is added to the offset, the safety slope and the margin slope of L, (3,).
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is added to L, by its own three numbers and by the maps' last hidden layer.
 
-    The change w minimises the log loss of sigma(L + w . phi) on the actual episodes, phi = (1, z,
-    -m / margin_unit), with a normal prior, and less what L itself is wrong about at the start of
-    the twins: w . sum phi (sigma(L) - label). What is hard to tell of a start is so for both of a
-    pair and cancels, and so does what L is wrong about on the nominal plant, too. Later a twin is
-    in another state, and its end says nothing of where the actual robot is: those rows of the
-    actual episodes count without one. Both slopes of L + w . phi stay >= 0.
+    With phi = (1, z, -m / margin_unit, activations), w minimises the log loss of
+    sigma(L + w . phi) on the actual episodes, with a normal prior, and less what L itself is wrong
+    about at the start of the twins: w . sum phi (sigma(L) - label). What is hard to tell of a start
+    is so for both of a pair and cancels, and so does what L is wrong about on the nominal plant,
+    too. Later a twin is in another state, and its end says nothing of where the actual robot is:
+    those rows of the actual episodes count without one. Activations are taken from their mean in
+    units of their mean distance from it, so that all of them together add as much as `hidden_std`
+    says. What the slopes of L change by leaves them >= 0.
 
     Args:
         actual: Rows of the actual episodes.
         twins: The twins' first rows.
         base_logit: L.
         settings: Standard deviations of the prior.
+
+    Returns:
+        `change` (3,) and `hidden` (K, n + 1) of a `Correction`.
     """
     from scipy.optimize import minimize
 
+    num_members, _, num_activations = actual.activations.shape
+    mean = actual.activations.mean(axis=1, keepdims=True)
+    unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
+    unit = max(float(unit), 1e-12)  # One row alone is its own mean.
+
     def columns(outcomes: Outcomes) -> np.ndarray:
-        return np.column_stack([np.ones(len(outcomes.heads)), outcomes.heads])
+        hidden = (outcomes.activations - mean).transpose(1, 0, 2).reshape(len(outcomes.heads), -1)
+        return np.column_stack([np.ones(len(hidden)), outcomes.heads, hidden / unit])
 
     phi, logit = columns(actual), base_logit.of_heads(actual.heads)
     label = actual.is_unsafe.astype(float)
     error = sigmoid(base_logit.of_heads(twins.heads)) - twins.is_unsafe
     expected = columns(twins).T @ (twins.weight * error)
-    precision = np.array([settings.offset_std, settings.slope_std, settings.slope_std]) ** -2.0
+    deviation = np.full(phi.shape[1], settings.hidden_std)
+    deviation[:3] = settings.offset_std, settings.slope_std, settings.slope_std
+    precision = deviation**-2.0
 
-    def loss(change: np.ndarray) -> tuple[float, np.ndarray]:
-        shifted = logit + phi @ change
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        shifted = logit + phi @ w
         value = actual.weight @ (np.logaddexp(0.0, shifted) - label * shifted)
         residual = actual.weight * (np.exp(-np.logaddexp(0.0, -shifted)) - label)
-        pull = precision * change
-        return float(value - expected @ change + 0.5 * pull @ change), (
-            phi.T @ residual - expected + pull
-        )
+        pull = precision * w
+        slope = phi.T @ residual - expected + pull
+        return float(value - expected @ w + 0.5 * pull @ w), slope
 
-    bounds = [(None, None), (-base_logit.safety_slope, None), (-base_logit.margin_slope, None)]
-    options = {"ftol": 1e-14, "gtol": 1e-9, "maxiter": 1000}
-    found = minimize(loss, np.zeros(3), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return np.asarray(found.x)
+    bounds: list[tuple[float | None, None]] = [(None, None)] * phi.shape[1]
+    bounds[1:3] = [(-base_logit.safety_slope, None), (-base_logit.margin_slope, None)]
+    options = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxfun": 4000, "maxcor": 30}
+    start = np.zeros(phi.shape[1])
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    weights = found[3:].reshape(num_members, num_activations) / unit
+    constant = -np.sum(weights * mean[:, 0], axis=1)
+    return found[:3], np.column_stack([weights, constant])
+
+
+def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+    """Mean of values (M,) in every map's cells, (K, R*R); 0 where there are none.
+
+    Args:
+        values: One a point.
+        points: Psi(x), (K, M, 2).
+        grid: The grid.
+    """
+    means = []
+    for member_points in points:
+        cells = grid.locate(member_points)
+        inside = cells >= 0
+        count = np.bincount(cells[inside], minlength=grid.num_cells)
+        total = np.bincount(cells[inside], values[inside], minlength=grid.num_cells)
+        means.append(total / np.maximum(count, 1))
+    return np.array(means)
 
 
 def guarded_cells(feedback: FeedbackSegments, points: np.ndarray, grid: Grid) -> np.ndarray:
@@ -95,18 +133,14 @@ def guarded_cells(feedback: FeedbackSegments, points: np.ndarray, grid: Grid) ->
     """
     # Safe counts against unsafe: a majority of unsafe segments is above zero.
     vote = np.where(feedback.is_unsafe, 1.0, -1.0)
-    guard = []
-    for member_points in points:
-        cells = grid.locate(member_points)
-        inside = cells >= 0
-        guard.append(np.bincount(cells[inside], vote[inside], minlength=grid.num_cells) > 0.0)
-    return np.array(guard, dtype=float)
+    return (cell_means(vote, points, grid) > 0.0).astype(float)
 
 
 def recalibrated_beliefs(
     training: TrainingScores,
     base_logit: BaseLogit,
     correction: Correction,
+    residual: np.ndarray,
     grid: Grid,
     parameters: AssessmentParameters,
     num_causes: int,
@@ -116,12 +150,14 @@ def recalibrated_beliefs(
     Departure: the paper learns where the nominal scores are unreliable and trusts them less there.
     That hardly moves the safe share of a cell, as F keeps the ratio of its masses, and the
     discrepancy has no sign. Adding sigma(L + shift) - sigma(L) to every score moves the boundary
-    between safe and unsafe itself, and needs few pairs, as it is three numbers.
+    between safe and unsafe itself. What the hidden layer adds is known where feedback was: its
+    mean in a cell holds for all that the cell was trained on.
 
     Args:
         training: The training segments.
         base_logit: L.
         correction: What is added to L.
+        residual: What the hidden layer adds to L in every map's cells, (K, R*R).
         grid: The grid.
         parameters: Of the assessment.
         num_causes: n_c.
@@ -130,11 +166,12 @@ def recalibrated_beliefs(
         raise ValueError("recalibrated_beliefs: the maps have no heads, and so no logit to move")
     all_logit = base_logit.of_heads(training.heads)
     fused = []
-    for points, guard in zip(training.points, correction.guard, strict=True):
+    for points, added, guard in zip(training.points, residual, correction.guard, strict=True):
         cells = grid.locate(points)
         inside = cells >= 0
         logit, score = all_logit[inside], training.score[inside]
-        shift = correction.shift(training.heads[inside], guard[cells[inside]])
+        here = cells[inside]
+        shift = correction.shift(training.heads[inside], added[here], guard[here])
         # Without a shift the difference is zero to the bit, and so are the scores the same.
         score = np.clip(score + (sigmoid(logit + shift) - sigmoid(logit)), 0.0, 1.0)
         cause = training.cause[inside]
@@ -144,7 +181,7 @@ def recalibrated_beliefs(
         fused.append(
             belief_masses.fuse_cells(
                 masses,
-                cells[inside],
+                here,
                 num_cells=grid.num_cells,
                 min_count=parameters.min_count,
             )

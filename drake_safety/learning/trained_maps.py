@@ -71,6 +71,7 @@ class Embedding:
                     f"Embedding: a layer of shape {w.shape} is followed by one of {next_w.shape}"
                 )
         self.num_members, self.num_inputs, width = self._layers[0][0].shape
+        self.num_activations = self._layers[-1][0].shape[1]
         if self._layers[-1][0].shape[2] != 2 + num_margins:
             raise ValueError(
                 f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
@@ -117,11 +118,7 @@ class Embedding:
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
-        x = np.asarray(x, dtype=np.float32)
-        if x.ndim != 2 or x.shape[1] != self.num_inputs:
-            raise ValueError(
-                f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})"
-            )
+        x = self._checked(x)
         shape = (self.num_members, len(x))
         output = EmbeddingOutput(
             np.empty((*shape, 2)),
@@ -133,11 +130,7 @@ class Embedding:
             is_finite = np.all(np.isfinite(x[rows]), axis=1)
             chunk = np.where(is_finite[:, None], x[rows], np.float32(0.0))
             for member in range(self.num_members):
-                z = chunk
-                for weight, bias in self._layers[:-1]:
-                    z = z @ weight[member]
-                    z += bias[member]
-                    np.maximum(z, 0.0, out=z)
+                z = self._activations(chunk, member)
                 weight, bias = self._layers[-1]
                 z = z @ weight[member]
                 z += bias[member]
@@ -148,18 +141,40 @@ class Embedding:
                     output.unsafe_logit[member, rows] = self._logit(z[None, :, :2], member)
         return output
 
+    def activations(self, x: np.ndarray) -> np.ndarray:
+        """Of the members' last hidden layer at finite inputs (N, n_x), (K, N, num_activations)."""
+        x = self._checked(x)
+        return np.stack([self._activations(x, member) for member in range(self.num_members)])
+
+    def _checked(self, x: np.ndarray) -> np.ndarray:
+        x = np.asarray(x, dtype=np.float32)
+        if x.ndim != 2 or x.shape[1] != self.num_inputs:
+            raise ValueError(
+                f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})"
+            )
+        return x
+
+    def _activations(self, x: np.ndarray, member: int) -> np.ndarray:
+        for weight, bias in self._layers[:-1]:
+            x = x @ weight[member]
+            x += bias[member]
+            np.maximum(x, 0.0, out=x)
+        return x
+
     def embed(self, x: np.ndarray) -> np.ndarray:
         """Psi: inputs (N, n_x) to points (K, N, 2)."""
         return self.evaluate(x).embedding
 
-    def evaluate_one(self, *parts: np.ndarray) -> np.ndarray | None:
-        """y and margins of one input by every member, (K, 2 + n_c).
+    def evaluate_one(self, *parts: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """What every member makes of one input.
 
         Args:
             parts: Vectors that x consists of, in their order, (n_x,) together.
 
         Returns:
-            None for an input that is not finite, or too large for single precision.
+            y and margins, (K, 2 + n_c), and the activations of the last hidden layer with a last
+            entry of 1, (K, num_activations + 1); None for an input that is not finite, or too
+            large for single precision.
         """
         x = np.empty(self.num_inputs + 1, dtype=np.float32)
         start, square = 0, 0.0
@@ -172,9 +187,11 @@ class Embedding:
             start = stop
         x[start:] = 1.0
         z = x.dot(self._first).reshape(self._stacked)
+        hidden = z
         for zero, weight in self._following:
-            z = self._product(np.maximum(z, zero, out=z), weight)
-        return z.reshape(self.num_members, -1)
+            hidden = np.maximum(z, zero, out=z)
+            z = self._product(hidden, weight)
+        return z.reshape(self.num_members, -1), hidden.reshape(self.num_members, -1)
 
     def unsafe_logit_one(self, points: np.ndarray) -> list[float]:
         """Logit of every member's safety head at its own point of one input.

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import Correction
+
+_CORRECTION = tuple(field.name for field in fields(Correction))
 
 
 class SafetyAssessor(LeafSystem):
@@ -52,10 +56,15 @@ class SafetyAssessor(LeafSystem):
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        self._change_index, self._guard_index = (
-            self.DeclareNumericParameter(BasicVector(np.asarray(values, dtype=float).ravel()))
-            for values in (assessment.correction_.change, assessment.correction_.guard)
-        )
+        self._correction_shapes = {
+            name: getattr(assessment.correction_, name).shape for name in _CORRECTION
+        }
+        self._correction_indices = {
+            name: self.DeclareNumericParameter(
+                BasicVector(getattr(assessment.correction_, name).ravel())
+            )
+            for name in _CORRECTION
+        }
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
             "desired_preview", info.horizon * len(info.output_names)
@@ -106,27 +115,29 @@ class SafetyAssessor(LeafSystem):
 
     def get_correction(self, context: Context) -> Correction:
         """The correction in a Context."""
-        change, guard = (
-            context.get_numeric_parameter(index).get_value()
-            for index in (self._change_index, self._guard_index)
+        return Correction(
+            **{
+                name: context.get_numeric_parameter(self._correction_indices[name])
+                .get_value()
+                .reshape(shape)
+                for name, shape in self._correction_shapes.items()
+            }
         )
-        return Correction(change=change, guard=guard.reshape(self._shape[:2]))
 
     def set_correction(self, context: Context, correction: Correction) -> None:
         """Replaces what is added to the maps' logit.
 
         Args:
             context: This system's Context.
-            correction: With a guard for every cell of the assessment's maps.
+            correction: Of the shapes that the assessment's own has.
 
         Raises:
             ValueError: Another shape; nothing is replaced.
         """
-        guard_shape = self._shape[:2]
-        _check_shape("the correction's change", correction.change, (3,))
-        _check_shape("the correction's guard", correction.guard, guard_shape)
-        _replace(context, self._change_index, correction.change)
-        _replace(context, self._guard_index, correction.guard)
+        for name, shape in self._correction_shapes.items():
+            _check_shape(f"the correction's {name}", getattr(correction, name), shape)
+        for name, index in self._correction_indices.items():
+            _replace(context, index, getattr(correction, name))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over beliefs and correction of an assessment adapted from this system's own.
