@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.adaptation_figure import adaptation_figure, study_figure
+from drake_safety.evaluation.adaptation_losses import STEPS, losses
 from drake_safety.evaluation.adaptation_study import TestSet, scores, study, trained_rivals
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.segments import Episodes
 from lip_episodes import make_episodes
 from test_adaptation import pairs_with, worse
 from test_assessment import QUICK
@@ -103,3 +105,22 @@ def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, j
 def test_too_little_feedback_for_an_update_gives_no_picture(assessment):
     with pytest.raises(ValueError, match="fewer than the 40 of update 1"):
         adaptation_figure(assessment, worse()[:39])
+
+
+def test_what_is_lost_is_told_step_by_step(assessment, judged):
+    learned = make_episodes(200, seed=11, noise=0.002)
+    found = losses(assessment, worse(), learned, judged)
+    brier = [found[f"losses.{name}.brier"].value for name in STEPS]
+    assert all(0.0 < value < 1.0 for value in brier)
+    # Neighbours know what x is worth, and a cell of many does not know more than they do.
+    assert brier[STEPS.index("psi")] < brier[STEPS.index("grid")] + 0.01
+    # Feedback that contradicts what the fresh episodes do can but harm.
+    assert brier[STEPS.index("update")] > brier[STEPS.index("grid")]
+    assert found["losses.x.brier"].n == len(judged.episodes)
+
+
+def test_episodes_that_all_end_alike_tell_of_no_loss(assessment, judged):
+    learned = make_episodes(200, seed=11, noise=0.002)
+    safe = Episodes(learned.info, [one for one in learned if one.is_safe])
+    with pytest.raises(ValueError, match="unsafe"):
+        losses(assessment, worse(), safe, judged)

@@ -153,6 +153,8 @@ def adapt(
     for mode, found in studies.items():
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             console.print(_study_table(found, mode, published, variation))
+        if "losses.x.brier" in found.figures:
+            console.print(_losses_table(found, mode))
     for path in files:
         print_path("assessment", path)
     print_path("figures   ", file)
@@ -237,6 +239,7 @@ class _Judge:
         has_scratch: bool,
     ) -> dict[str, AdaptationStudy]:
         """One study a mode."""
+        from drake_safety.evaluation.adaptation_losses import losses
         from drake_safety.evaluation.adaptation_study import TestSet, study, trained_rivals
 
         fresh = self._run("fresh actual episodes", num_test, 1)
@@ -254,15 +257,18 @@ class _Judge:
                 rivals = trained_rivals(
                     prior, learned_from, num_workers=self._workers, progress=self._stages
                 )
+            test = TestSet.of(fresh, prior.parameters.shortest)
             found[mode] = study(
                 prior,
                 pairs.feedback(),
-                TestSet.of(fresh, prior.parameters.shortest),
+                test,
                 num_orders=num_orders,
                 seed=self._seed,
                 rivals=rivals,
                 progress=self._stages,
             )
+            if mode == "paper" and "oracle" in learned_from:
+                found[mode].figures |= losses(prior, pairs.feedback(), learned_from["oracle"], test)
         return found
 
 
@@ -283,6 +289,23 @@ def _adaptation_table(
             is_changed = found.method == "recalibration"
             change = [f"{value:+.2f}" if is_changed else "-" for value in one.correction_.change]
             table.add_row(mode, found.method, *change)
+    return table
+
+
+def _losses_table(found: AdaptationStudy, mode: str) -> Table:
+    brier = {
+        name: found.figures[f"losses.{name}.brier"].value
+        for name in ("x", "psi", "grid", "update", "update_without_gpr")
+    }
+    table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
+    table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
+    for name, before, label in (
+        ("psi", "x", "Ψ: their nearest in the embedding"),
+        ("grid", "psi", "the grid: their share in the cell"),
+        ("update", "grid", "the update, from all feedback"),
+        ("update_without_gpr", "grid", "the update without the discrepancy function"),
+    ):
+        table.add_row(label, f"{brier[name]:.3f}", f"{brier[name] - brier[before]:+.3f}")
     return table
 
 

@@ -1,0 +1,89 @@
+"""Where an adapted assessment loses: at its maps, at its grid, or at the update from feedback."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_safety.evaluation.adaptation_study import TestSet
+from drake_safety.evaluation.baselines import DirectClassifier
+from drake_safety.evaluation.metrics import Figure
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.segments import Episodes, split
+
+NUM_NEIGHBOURS = 50
+STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
+"""From what could be known to what is, the Brier score of each; see `losses`."""
+
+
+def losses(
+    prior: SafetyAssessment, feedback: Sequence[FeedbackSet], learned: Episodes, test: TestSet
+) -> dict[str, Figure]:
+    """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
+
+    - "x": gradient boosting on x, learned from many actual episodes: what can be known of x.
+    - "psi": the share of unsafe ends among the nearest of those episodes' segments in the
+      embedding: what Psi has kept of it.
+    - "grid": the share of unsafe ends among their segments in the same cell: what the grid has.
+    - "update": the grid as the paper's update makes it of the feedback.
+    - "update_without_gpr": the same, with no discrepancy function.
+
+    From each step to the next is the loss of Psi, of the grid and of the update. It is of one map:
+    of an ensemble, "psi" and "grid" are the first one's.
+
+    Args:
+        prior: The assessment before any feedback.
+        feedback: All feedback.
+        learned: Many actual episodes, other than the fresh ones.
+        test: The fresh episodes.
+
+    Raises:
+        ValueError: The actual episodes all end alike.
+    """
+    from sklearn.neighbors import KNeighborsClassifier
+
+    parameters = prior.parameters
+    known = split(learned, stride=1, discount=1.0, shortest=parameters.shortest)
+    judged = test.segments
+    boosting = DirectClassifier(
+        "gradient_boosting", uses_features=prior.uses_features, shortest=parameters.shortest
+    ).fit(learned)
+    here, there = (
+        prior.predict(
+            one.state, one.desired_preview, one.features if prior.uses_features else None
+        ).embedding
+        for one in (judged, known)
+    )
+    neighbours = KNeighborsClassifier(min(NUM_NEIGHBOURS, len(known)))
+    neighbours.fit(there, known.is_unsafe.astype(int))
+    share = neighbours.predict_proba(here)[:, 1]
+    cells, own = prior.grid_.locate(there), prior.grid_.locate(here)
+    inside = cells >= 0
+    count = np.bincount(cells[inside], minlength=prior.grid_.num_cells)
+    unsafe = np.bincount(cells[inside], known.is_unsafe[inside], minlength=prior.grid_.num_cells)
+    overall = known.is_unsafe.mean()
+    by_cell = np.divide(unsafe, count, out=np.full(len(count), overall), where=count > 0)
+    without_gpr = copy.copy(prior)
+    without_gpr.parameters = copy.deepcopy(parameters)
+    without_gpr.parameters.adaptation.gate = 0.0
+    probability = {
+        "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),
+        "psi": share,
+        "grid": np.where(own >= 0, by_cell[own], overall),
+        "update": _grid(prior.adapt(feedback, method="paper"), test),
+        "update_without_gpr": _grid(without_gpr.adapt(feedback, method="paper"), test),
+    }
+    found = {}
+    for name in STEPS:
+        value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
+        found[f"losses.{name}.brier"] = Figure(value, value, value, len(test.episodes))
+    return found
+
+
+def _grid(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
+    judged = test.segments
+    features = judged.features if assessment.uses_features else None
+    return 1.0 - assessment.predict(judged.state, judged.desired_preview, features).normalized
