@@ -5,9 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,10 +24,10 @@ from drake_safety.learning.feedback import (
     segments_of,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import check_width, input_parts, num_inputs
+from drake_safety.learning.inputs import check_width, input_parts
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.segments import Episodes
-from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
+from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.training import fitted_base_logit, learned_maps, segments_for
 
 __all__ = [
@@ -119,14 +117,14 @@ class SafetyAssessment:
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
-        self.training_score_ = _single(segments.score)
+        self.training_score_ = assessment_file.single(segments.score)
         self.training_cause_ = segments.cause
         self.base_logit_: BaseLogit | None = None
         self.training_heads_ = self.training_nearest_ = None
         if self.embedding_.has_heads:
             margins = output.margins.mean(axis=0)
             self.base_logit_ = fitted_base_logit(output, is_held_out, segments, parameters)
-            self.training_heads_ = _single(self.base_logit_.heads(output))
+            self.training_heads_ = assessment_file.single(self.base_logit_.heads(output))
             self.training_nearest_ = (
                 margins.argmin(axis=1)
                 if margins.shape[1]
@@ -207,7 +205,13 @@ class SafetyAssessment:
         elif self.base_logit_ is not None:
             # Outcomes are what counts: with the same ones on both sides there is no evidence.
             if any(one.differs for one in feedback):
-                change, hidden = self._fitted_change(feedback, self.base_logit_)
+                change, hidden = recalibration.fitted_change(
+                    *recalibration.outcomes(
+                        feedback, self._inputs, self.embedding_, self.base_logit_
+                    ),
+                    self.base_logit_,
+                    self.parameters.adaptation,
+                )
                 guard = recalibration.guarded_cells(segments, points, self.grid_)
                 adapted.correction_ = Correction(change=change, hidden=hidden, guard=guard)
             residual = adapted.correction_.residual(self.embedding_, x)
@@ -225,40 +229,6 @@ class SafetyAssessment:
             num_differing=sum(one.differs for one in feedback),
         )
         return adapted
-
-    def _fitted_change(
-        self, feedback: Sequence[FeedbackSet], base_logit: BaseLogit
-    ) -> tuple[np.ndarray, np.ndarray]:
-        def outcomes(
-            x: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray
-        ) -> recalibration.Outcomes:
-            return recalibration.Outcomes(
-                heads=base_logit.heads(self.embedding_.evaluate(x)),
-                activations=self.embedding_.activations(x),
-                is_unsafe=is_unsafe,
-                weight=weight,
-            )
-
-        num_rows = np.array([len(one) for one in feedback])
-        actual = outcomes(
-            self._inputs(
-                np.concatenate([one.state for one in feedback]),
-                np.concatenate([one.desired_preview for one in feedback]),
-                np.concatenate([one.features for one in feedback]),
-            ),
-            np.repeat([one.is_unsafe for one in feedback], num_rows),
-            recalibration.row_weights(num_rows),
-        )
-        twins = outcomes(
-            self._inputs(
-                np.array([one.twin_state for one in feedback]),
-                np.array([one.twin_desired_preview for one in feedback]),
-                np.array([one.twin_features for one in feedback]),
-            ),
-            np.array([one.nominal_is_unsafe for one in feedback]),
-            np.ones(len(feedback)),
-        )
-        return recalibration.fitted_change(actual, twins, base_logit, self.parameters.adaptation)
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
         """The segments of feedback sets, cut as the training episodes were."""
@@ -400,33 +370,7 @@ class SafetyAssessment:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one safetensors file, first under a temporary name: it is whole or absent."""
         self._check_fitted()
-        tensors: dict[str, np.ndarray] = {
-            f"embedding.{name}": w for name, w in self.embedding_.weights.items()
-        }
-        tensors |= {
-            "beliefs": self.beliefs_,
-            "correction.change": self.correction_.change,
-            "correction.hidden": self.correction_.hidden,
-            "correction.guard": self.correction_.guard.astype(np.uint8),
-            "training_points": self.training_points_,
-            "training_score": self.training_score_.astype(np.float32),
-            "training_cause": self.training_cause_.astype(np.int16),
-        }
-        if self.training_heads_ is not None and self.training_nearest_ is not None:
-            tensors["training_heads"] = self.training_heads_.astype(np.float32)
-            tensors["training_nearest"] = self.training_nearest_.astype(np.int16)
-        assessment_file.write(
-            Path(path),
-            parameters=self.parameters,
-            info=self.info_,
-            adaptation=self.adaptation_,
-            numbers={
-                "num_margins": self.embedding_.num_margins,
-                "base_logit": None if self.base_logit_ is None else asdict(self.base_logit_),
-                "calibrations": [one.to_json() for one in self.calibrations_.values()],
-            },
-            tensors=tensors,
-        )
+        assessment_file.save(self, Path(path))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
@@ -440,62 +384,7 @@ class SafetyAssessment:
         try:
             assessment.info_ = entries["info"]
             assessment.adaptation_ = entries["adaptation"]
-            assessment._restore(tensors, **entries["numbers"])
+            assessment_file.restore(assessment, tensors, **entries["numbers"])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
         return assessment
-
-    def _restore(
-        self,
-        tensors: dict[str, np.ndarray],
-        *,
-        num_margins: int,
-        base_logit: dict[str, Any] | None,
-        calibrations: list[dict[str, Any]],
-    ) -> None:
-        parameters, info = self.parameters, self.info_
-        self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-        prefix = "embedding."
-        weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-        self.embedding_ = Embedding(weights, num_margins=num_margins)
-        if self.embedding_.num_inputs != num_inputs(info, parameters):
-            raise ValueError(
-                f"its maps take {self.embedding_.num_inputs} inputs, "
-                f"its names amount to {num_inputs(info, parameters)}"
-            )
-        self.training_points_ = tensors["training_points"]
-        self.training_score_ = _single(tensors["training_score"])
-        self.training_cause_ = tensors["training_cause"].astype(np.int64)
-        heads, nearest = tensors.get("training_heads"), tensors.get("training_nearest")
-        self.training_heads_ = None if heads is None else _single(heads)
-        self.training_nearest_ = None if nearest is None else nearest.astype(np.int64)
-        self.base_logit_ = None
-        if base_logit is not None:
-            low, high = base_logit["margin_range"]
-            self.base_logit_ = BaseLogit(**base_logit | {"margin_range": (low, high)})
-        stored = [Calibration(**one) for one in calibrations]
-        self.calibrations_ = {one.kind: one for one in stored}
-        self.beliefs_ = tensors["beliefs"]
-        self.correction_ = Correction(
-            change=tensors["correction.change"],
-            hidden=tensors["correction.hidden"],
-            guard=tensors["correction.guard"].astype(float),
-        )
-        num_members, num_cells = self.embedding_.num_members, self.grid_.num_cells
-        for name, shape, expected in (
-            ("beliefs", self.beliefs_.shape, (num_members, num_cells, 3 + self.num_causes)),
-            ("correction's change", self.correction_.change.shape, (3,)),
-            (
-                "correction's hidden",
-                self.correction_.hidden.shape,
-                (num_members, self.embedding_.num_activations + 1),
-            ),
-            ("correction's guard", self.correction_.guard.shape, (num_members, num_cells)),
-        ):
-            if shape != expected:
-                raise ValueError(f"the shape of its {name} is {shape}, expected {expected}")
-
-
-def _single(values: np.ndarray) -> np.ndarray:
-    """Values that single precision holds, as doubles: files keep one number for every segment."""
-    return values.astype(np.float32).astype(float)

@@ -9,13 +9,21 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
+from drake_safety.learning.calibration import Calibration
+from drake_safety.learning.grid import Grid
+from drake_safety.learning.inputs import num_inputs
+from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.segments import EpisodesInfo
+from drake_safety.learning.trained_maps import Embedding
+
+if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
 
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 4
@@ -97,6 +105,112 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         }, tensors
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
+
+
+def save(assessment: SafetyAssessment, path: Path) -> None:
+    """Writes a fitted assessment.
+
+    Args:
+        assessment: The assessment.
+        path: The file.
+    """
+    base_logit, correction = assessment.base_logit_, assessment.correction_
+    tensors: dict[str, np.ndarray] = {
+        f"embedding.{name}": w for name, w in assessment.embedding_.weights.items()
+    }
+    tensors |= {
+        "beliefs": assessment.beliefs_,
+        "correction.change": correction.change,
+        "correction.hidden": correction.hidden,
+        "correction.guard": correction.guard.astype(np.uint8),
+        "training_points": assessment.training_points_,
+        "training_score": assessment.training_score_.astype(np.float32),
+        "training_cause": assessment.training_cause_.astype(np.int16),
+    }
+    if assessment.training_heads_ is not None and assessment.training_nearest_ is not None:
+        tensors["training_heads"] = assessment.training_heads_.astype(np.float32)
+        tensors["training_nearest"] = assessment.training_nearest_.astype(np.int16)
+    write(
+        path,
+        parameters=assessment.parameters,
+        info=assessment.info_,
+        adaptation=assessment.adaptation_,
+        numbers={
+            "num_margins": assessment.embedding_.num_margins,
+            "base_logit": None if base_logit is None else asdict(base_logit),
+            "calibrations": [one.to_json() for one in assessment.calibrations_.values()],
+        },
+        tensors=tensors,
+    )
+
+
+def restore(
+    assessment: SafetyAssessment,
+    tensors: dict[str, np.ndarray],
+    *,
+    num_margins: int,
+    base_logit: dict[str, Any] | None,
+    calibrations: list[dict[str, Any]],
+) -> None:
+    """Gives an assessment, whose parameters and info are known, the rest of what `save` wrote.
+
+    Args:
+        assessment: The assessment.
+        tensors: Arrays by name.
+        num_margins: n_c of the maps; 0 without a margin head.
+        base_logit: L; None without heads.
+        calibrations: Of each kind.
+
+    Raises:
+        KeyError: An array is missing.
+        ValueError: Shapes do not fit each other.
+    """
+    parameters, info = assessment.parameters, assessment.info_
+    assessment.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
+    prefix = "embedding."
+    weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    assessment.embedding_ = Embedding(weights, num_margins=num_margins)
+    if assessment.embedding_.num_inputs != num_inputs(info, parameters):
+        raise ValueError(
+            f"its maps take {assessment.embedding_.num_inputs} inputs, "
+            f"its names amount to {num_inputs(info, parameters)}"
+        )
+    assessment.training_points_ = tensors["training_points"]
+    assessment.training_score_ = single(tensors["training_score"])
+    assessment.training_cause_ = tensors["training_cause"].astype(np.int64)
+    heads, nearest = tensors.get("training_heads"), tensors.get("training_nearest")
+    assessment.training_heads_ = None if heads is None else single(heads)
+    assessment.training_nearest_ = None if nearest is None else nearest.astype(np.int64)
+    assessment.base_logit_ = None
+    if base_logit is not None:
+        low, high = base_logit["margin_range"]
+        assessment.base_logit_ = BaseLogit(**base_logit | {"margin_range": (low, high)})
+    stored = [Calibration(**one) for one in calibrations]
+    assessment.calibrations_ = {one.kind: one for one in stored}
+    assessment.beliefs_ = tensors["beliefs"]
+    assessment.correction_ = Correction(
+        change=tensors["correction.change"],
+        hidden=tensors["correction.hidden"],
+        guard=tensors["correction.guard"].astype(float),
+    )
+    num_members, num_cells = assessment.embedding_.num_members, assessment.grid_.num_cells
+    for name, shape, expected in (
+        ("beliefs", assessment.beliefs_.shape, (num_members, num_cells, 3 + assessment.num_causes)),
+        ("correction's change", assessment.correction_.change.shape, (3,)),
+        (
+            "correction's hidden",
+            assessment.correction_.hidden.shape,
+            (num_members, assessment.embedding_.num_activations + 1),
+        ),
+        ("correction's guard", assessment.correction_.guard.shape, (num_members, num_cells)),
+    ):
+        if shape != expected:
+            raise ValueError(f"the shape of its {name} is {shape}, expected {expected}")
+
+
+def single(values: np.ndarray) -> np.ndarray:
+    """Values that single precision holds, as doubles: files keep one number for every segment."""
+    return values.astype(np.float32).astype(float)
 
 
 def file_hash(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.adaptation import TrainingScores
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
-from drake_safety.learning.feedback import FeedbackSegments
+from drake_safety.learning.feedback import FeedbackSegments, FeedbackSet
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import BaseLogit, Correction, sigmoid
+from drake_safety.learning.trained_maps import Embedding
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +45,51 @@ def row_weights(num_rows: np.ndarray) -> np.ndarray:
     weight = np.repeat(2.0 / num_rows, num_rows)
     weight[first] += 1.0
     return weight
+
+
+def outcomes(
+    feedback: Sequence[FeedbackSet],
+    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    embedding: Embedding,
+    base_logit: BaseLogit,
+) -> tuple[Outcomes, Outcomes]:
+    """All rows of the actual episodes, and the first ones of their twins.
+
+    Args:
+        feedback: The feedback sets.
+        inputs: x from states, previews and features.
+        embedding: The maps.
+        base_logit: L.
+    """
+    num_rows = np.array([len(one) for one in feedback])
+    sides = (
+        (
+            [one.state for one in feedback],
+            [one.desired_preview for one in feedback],
+            [one.features for one in feedback],
+            np.repeat([one.is_unsafe for one in feedback], num_rows),
+            row_weights(num_rows),
+        ),
+        (
+            [one.twin_state[None] for one in feedback],
+            [one.twin_desired_preview[None] for one in feedback],
+            [one.twin_features[None] for one in feedback],
+            np.array([one.nominal_is_unsafe for one in feedback]),
+            np.ones(len(feedback)),
+        ),
+    )
+    found = []
+    for state, preview, features, is_unsafe, weight in sides:
+        x = inputs(np.concatenate(state), np.concatenate(preview), np.concatenate(features))
+        found.append(
+            Outcomes(
+                heads=base_logit.heads(embedding.evaluate(x)),
+                activations=embedding.activations(x),
+                is_unsafe=is_unsafe,
+                weight=weight,
+            )
+        )
+    return found[0], found[1]
 
 
 def fitted_change(
