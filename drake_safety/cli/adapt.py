@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -333,6 +334,8 @@ def _study_table(found: AdaptationStudy, mode: str, published: str, variation: s
             label,
             *(interval(figures[f"{key}.{column}"]) for column in columns),
             f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
-            f"{100 * closed.value:.0f} %" if closed is not None else "",
+            f"{100 * closed.value:.0f} %"
+            if closed is not None and math.isfinite(closed.value)
+            else "",
         )
     return table
