@@ -14,7 +14,7 @@ from drake_safety.learning.adaptation import TrainingScores, paper_beliefs
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import BaseLogit, Correction
+from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum
 from drake_safety.learning.recalibration import (
     Outcomes,
     cell_means,
@@ -89,10 +89,14 @@ def test_one_update(benchmark: Any, report: Callable[..., None], method: str) ->
         if method == "paper":
             paper_beliefs(scores, segments, points, grid, parameters, NUM_CAUSES)
         else:
-            change, hidden = fitted_change(actual, twins, base_logit, parameters.adaptation)
+            change, hidden, hidden_range = fitted_change(
+                actual, twins, base_logit, parameters.adaptation
+            )
             guard = guarded_cells(segments, points, grid)
-            correction = Correction(change=change, hidden=hidden, guard=guard)
-            residual = cell_means(np.einsum("kni,ki->n", activations, hidden[:, :-1]), points, grid)
+            correction = Correction(
+                change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
+            )
+            residual = cell_means(hidden_sum(activations, hidden), points, grid)
             recalibrated_beliefs(
                 scores, base_logit, correction, residual, grid, parameters, NUM_CAUSES
             )

@@ -120,6 +120,18 @@ def test_gamma_never_rises_in_a_cell_whose_feedback_was_unsafe(sharpened, make):
     assert np.all(held <= sharpened.predict(*x).calibrated + 1e-12)
 
 
+def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(sharpened):
+    correction = sharpened.adapt(worse()).correction_
+    least, most = correction.hidden_range
+    assert least < 0.0 < most
+    one = worse()[0]
+    x = sharpened._inputs(one.state, one.desired_preview, one.features)
+    for factor in (1.0, -30.0, 30.0):
+        added = correction.residual(sharpened.embedding_, factor * x)
+        assert np.all((added >= least) & (added <= most))
+    assert np.ptp(correction.residual(sharpened.embedding_, x)) > 0.0
+
+
 def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_it(sharpened):
     before = sharpened.beliefs_.copy()
     adapted = sharpened.adapt(worse())
@@ -272,7 +284,9 @@ def test_the_change_solves_its_own_equation():
     actual, twins = drawn(rng, 50, (0.8, 0.2, 0.1)), drawn(rng, 50)
     mean = actual.activations.mean(axis=1, keepdims=True)
     unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
-    change, hidden = fitted_change(actual, twins, LOGIT, SETTINGS)
+    change, hidden, hidden_range = fitted_change(actual, twins, LOGIT, SETTINGS)
+    added = np.einsum("kni,ki->n", actual.activations, hidden[:, :-1]) + hidden[:, -1].sum()
+    np.testing.assert_allclose(hidden_range, [added.min(), added.max()])
     np.testing.assert_allclose(hidden[:, -1], -np.sum(hidden[:, :-1] * mean[:, 0], axis=1))
     w = np.concatenate([change, unit * hidden[:, :-1].ravel()])
 
@@ -291,14 +305,14 @@ def test_what_the_hidden_layer_knows_of_the_actual_robot_is_found():
     rng = np.random.default_rng(4)
     truth = np.array([[1.0, -1.0, 0.5], [0.0, 0.8, -0.6]])
     actual = drawn(rng, 20_000, hidden=truth)
-    _, hidden = fitted_change(actual, drawn(rng, 20_000), LOGIT, SETTINGS)
+    _, hidden, _ = fitted_change(actual, drawn(rng, 20_000), LOGIT, SETTINGS)
     np.testing.assert_allclose(hidden[:, :-1], truth, atol=0.15)
 
 
 def test_the_change_is_found_with_enough_feedback():
     rng = np.random.default_rng(1)
     truth = (-0.6, 0.3, -0.2)
-    change, _ = fitted_change(drawn(rng, 20_000, truth), drawn(rng, 20_000), LOGIT, SETTINGS)
+    change, *_ = fitted_change(drawn(rng, 20_000, truth), drawn(rng, 20_000), LOGIT, SETTINGS)
     np.testing.assert_allclose(change, truth, atol=0.08)
 
 
@@ -308,7 +322,7 @@ def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
     both = drawn(rng, 20_000, wrong), drawn(rng, 20_000, wrong)
     assert np.abs(fitted_change(*both, LOGIT, SETTINGS)[0]).max() < 0.15
     # Were L right of the twins, all of that would be the actual robot's.
-    change, _ = fitted_change(both[0], drawn(rng, 20_000), LOGIT, SETTINGS)
+    change, *_ = fitted_change(both[0], drawn(rng, 20_000), LOGIT, SETTINGS)
     assert change[0] == pytest.approx(1.0, abs=0.1)
 
 
@@ -317,14 +331,14 @@ def test_more_danger_never_counts_as_less():
     heads = rng.normal(scale=2.0, size=(5000, 2))
     upside_down = outcomes(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
     right = outcomes(heads, rng.random(5000) < sigmoid(LOGIT.of_heads(heads)))
-    change, _ = fitted_change(upside_down, right, LOGIT, SETTINGS)
+    change, *_ = fitted_change(upside_down, right, LOGIT, SETTINGS)
     np.testing.assert_allclose(change[1:], [-LOGIT.safety_slope, -LOGIT.margin_slope])
 
 
 def test_the_change_stays_finite_however_large_the_gap():
     heads = np.full((4000, 2), -4.0)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
-    change, _ = fitted_change(outcomes(heads, every), outcomes(heads, none), LOGIT, SETTINGS)
+    change, *_ = fitted_change(outcomes(heads, every), outcomes(heads, none), LOGIT, SETTINGS)
     assert np.isfinite(change).all()
     assert change[0] + heads[0] @ change[1:] > 8.0
 

@@ -19,7 +19,12 @@ STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0,
 
 def correction(size):
     """One of maps with three activations, for six cells."""
-    return Correction(change=np.full(3, size), hidden=np.full((1, 4), size), guard=np.ones((1, 6)))
+    return Correction(
+        change=np.full(3, size),
+        hidden=np.full((1, 4), size),
+        hidden_range=np.array([-size, size]),
+        guard=np.ones((1, 6)),
+    )
 
 
 class AssessmentDouble:
@@ -172,7 +177,7 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     assert value(assessor, context, "safety_probability")[0] == 0.5
     assert value(assessor, context, "calibrated_safety_probability")[0] == 0.625
     found = assessor.get_correction(context)
-    for name in ("change", "hidden", "guard"):
+    for name in ("change", "hidden", "hidden_range", "guard"):
         np.testing.assert_array_equal(getattr(found, name), getattr(adapted.correction_, name))
     assert np.all(assessor.get_correction(assessor.CreateDefaultContext()).hidden == 0.0)
 

@@ -205,7 +205,7 @@ class SafetyAssessment:
         elif self.base_logit_ is not None:
             # Outcomes are what counts: with the same ones on both sides there is no evidence.
             if any(one.differs for one in feedback):
-                change, hidden = recalibration.fitted_change(
+                change, hidden, hidden_range = recalibration.fitted_change(
                     *recalibration.outcomes(
                         feedback, self._inputs, self.embedding_, self.base_logit_
                     ),
@@ -213,7 +213,9 @@ class SafetyAssessment:
                     self.parameters.adaptation,
                 )
                 guard = recalibration.guarded_cells(segments, points, self.grid_)
-                adapted.correction_ = Correction(change=change, hidden=hidden, guard=guard)
+                adapted.correction_ = Correction(
+                    change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
+                )
             residual = adapted.correction_.residual(self.embedding_, x)
             adapted.beliefs_ = recalibration.recalibrated_beliefs(
                 self._training,
@@ -266,6 +268,11 @@ class SafetyAssessment:
             ("beliefs", beliefs, self.beliefs_),
             ("the correction's change", correction.change, self.correction_.change),
             ("the correction's hidden", correction.hidden, self.correction_.hidden),
+            (
+                "the correction's hidden_range",
+                correction.hidden_range,
+                self.correction_.hidden_range,
+            ),
             ("the correction's guard", correction.guard, self.correction_.guard),
         ):
             if given.shape != own.shape:

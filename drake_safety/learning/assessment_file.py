@@ -122,6 +122,7 @@ def save(assessment: SafetyAssessment, path: Path) -> None:
         "beliefs": assessment.beliefs_,
         "correction.change": correction.change,
         "correction.hidden": correction.hidden,
+        "correction.hidden_range": correction.hidden_range,
         "correction.guard": correction.guard.astype(np.uint8),
         "training_points": assessment.training_points_,
         "training_score": assessment.training_score_.astype(np.float32),
@@ -191,6 +192,7 @@ def restore(
     assessment.correction_ = Correction(
         change=tensors["correction.change"],
         hidden=tensors["correction.hidden"],
+        hidden_range=tensors["correction.hidden_range"],
         guard=tensors["correction.guard"].astype(float),
     )
     num_members, num_cells = assessment.embedding_.num_members, assessment.grid_.num_cells
@@ -202,6 +204,7 @@ def restore(
             assessment.correction_.hidden.shape,
             (num_members, assessment.embedding_.num_activations + 1),
         ),
+        ("correction's hidden_range", assessment.correction_.hidden_range.shape, (2,)),
         ("correction's guard", assessment.correction_.guard.shape, (num_members, num_cells)),
     ):
         if shape != expected:

@@ -121,11 +121,14 @@ class Correction:
         change: What is added to L's offset, safety slope and margin slope, (3,).
         hidden: What each activation of the maps' last hidden layer, and a last entry of 1, adds to
             L, (K, num_activations + 1).
+        hidden_range: Least and most that they add together, (2,): what they added in feedback, for
+            beyond it nobody knows.
         guard: 1 in cells of each map where L must not fall, else 0, (K, R*R).
     """
 
     change: np.ndarray
     hidden: np.ndarray
+    hidden_range: np.ndarray
     guard: np.ndarray
 
     @classmethod
@@ -134,6 +137,7 @@ class Correction:
         return cls(
             change=np.zeros(3),
             hidden=np.zeros((embedding.num_members, embedding.num_activations + 1)),
+            hidden_range=np.zeros(2),
             guard=np.zeros((embedding.num_members, grid.num_cells)),
         )
 
@@ -141,8 +145,8 @@ class Correction:
         """What the hidden layer adds to L at finite inputs (N, n_x), (N,)."""
         if not self.hidden.any():
             return np.zeros(len(x))
-        added = np.einsum("kni,ki->n", embedding.activations(x), self.hidden[:, :-1])
-        return added + self.hidden[:, -1].sum()
+        added = hidden_sum(embedding.activations(x), self.hidden)
+        return np.clip(added, *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
         """What is added to L, (N,).
@@ -154,6 +158,11 @@ class Correction:
         """
         shift = self.change[0] + heads @ self.change[1:] + residual
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
+
+
+def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """What activations (K, N, n) amount to by weights (K, n + 1), the last one constant, (N,)."""
+    return np.einsum("kni,ki->n", activations, hidden[:, :-1]) + hidden[:, -1].sum()
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
@@ -317,7 +326,8 @@ def predict_row(
             )
             offset, safety_slope, margin_slope = correction.change.tolist()
             shift = offset + safety_slope * z + margin_slope * nearness
-            shift += float(np.vdot(activations, correction.hidden))
+            least, most = correction.hidden_range.tolist()
+            shift += min(max(float(np.vdot(activations, correction.hidden)), least), most)
             if shift < 0.0:
                 guard = float(np.dot(weights, correction.guard.ravel().take(rows)))
                 shift *= 1.0 - guard / sum(weights)

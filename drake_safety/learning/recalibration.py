@@ -12,7 +12,7 @@ from drake_safety.learning.adaptation import TrainingScores
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
 from drake_safety.learning.feedback import FeedbackSegments, FeedbackSet
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import BaseLogit, Correction, sigmoid
+from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum, sigmoid
 from drake_safety.learning.trained_maps import Embedding
 
 
@@ -94,7 +94,7 @@ def outcomes(
 
 def fitted_change(
     actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What is added to L, by its own three numbers and by the maps' last hidden layer.
 
     With phi = (1, z, -m / margin_unit, activations), w minimises the log loss of
@@ -113,7 +113,7 @@ def fitted_change(
         settings: Standard deviations of the prior.
 
     Returns:
-        `change` (3,) and `hidden` (K, n + 1) of a `Correction`.
+        `change` (3,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
     """
     from scipy.optimize import minimize
 
@@ -149,7 +149,9 @@ def fitted_change(
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     weights = found[3:].reshape(num_members, num_activations) / unit
     constant = -np.sum(weights * mean[:, 0], axis=1)
-    return found[:3], np.column_stack([weights, constant])
+    hidden = np.column_stack([weights, constant])
+    added = hidden_sum(actual.activations, hidden)
+    return found[:3], hidden, np.array([added.min(), added.max()])
 
 
 def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
