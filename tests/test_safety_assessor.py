@@ -40,6 +40,7 @@ class AssessmentDouble:
         )
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
         self.correction_ = correction(0.0)
+        self.base_logit_ = object()
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
         self.asked = []

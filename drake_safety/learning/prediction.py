@@ -113,7 +113,7 @@ class BaseLogit:
         return min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Correction:
     """What feedback adds to L: a change of its three numbers, and of what else the maps know.
 

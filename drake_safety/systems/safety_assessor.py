@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 
 import numpy as np
@@ -56,15 +57,11 @@ class SafetyAssessor(LeafSystem):
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        self._correction_shapes = {
-            name: getattr(assessment.correction_, name).shape for name in _CORRECTION
-        }
-        self._correction_indices = {
-            name: self.DeclareNumericParameter(
-                BasicVector(getattr(assessment.correction_, name).ravel())
-            )
-            for name in _CORRECTION
-        }
+        correction = assessment.correction_
+        self._correction_shapes = [getattr(correction, name).shape for name in _CORRECTION]
+        self._correction_index = self.DeclareNumericParameter(BasicVector(_packed(correction)))
+        # Where there are no heads there is no logit to correct.
+        self._has_heads = assessment.base_logit_ is not None
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
             "desired_preview", info.horizon * len(info.output_names)
@@ -115,14 +112,13 @@ class SafetyAssessor(LeafSystem):
 
     def get_correction(self, context: Context) -> Correction:
         """The correction in a Context."""
-        return Correction(
-            **{
-                name: context.get_numeric_parameter(self._correction_indices[name])
-                .get_value()
-                .reshape(shape)
-                for name, shape in self._correction_shapes.items()
-            }
-        )
+        values = context.get_numeric_parameter(self._correction_index).get_value()
+        parts, start = [], 0
+        for shape in self._correction_shapes:
+            stop = start + math.prod(shape)
+            parts.append(values[start:stop].reshape(shape))
+            start = stop
+        return Correction(*parts)
 
     def set_correction(self, context: Context, correction: Correction) -> None:
         """Replaces what is added to the maps' logit.
@@ -134,10 +130,9 @@ class SafetyAssessor(LeafSystem):
         Raises:
             ValueError: Another shape; nothing is replaced.
         """
-        for name, shape in self._correction_shapes.items():
+        for name, shape in zip(_CORRECTION, self._correction_shapes, strict=True):
             _check_shape(f"the correction's {name}", getattr(correction, name), shape)
-        for name, index in self._correction_indices.items():
-            _replace(context, index, getattr(correction, name))
+        _replace(context, self._correction_index, _packed(correction))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over beliefs and correction of an assessment adapted from this system's own.
@@ -165,9 +160,13 @@ class SafetyAssessor(LeafSystem):
                 self._preview_port.Eval(context),
                 self._features_port.Eval(context) if self._uses_features else None,
                 self.get_beliefs(context),
-                self.get_correction(context),
+                self.get_correction(context) if self._has_heads else self._assessment.correction_,
             )
         )
+
+
+def _packed(correction: Correction) -> np.ndarray:
+    return np.concatenate([np.ravel(getattr(correction, name)) for name in _CORRECTION])
 
 
 def _check_shape(what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
