@@ -29,7 +29,7 @@ from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
 _GRAVITY = 9.81
-_NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
+_NUM_OUTLOOK = 41  # Samples of the plan from now to its end that the features see.
 _VARIED = ("mass_scale", "joint_damping")  # What a variation can change of this plant.
 
 
@@ -94,13 +94,16 @@ class PendulumSafeSet:
 
     Args:
         parameters: The task's numbers.
+        preview_step_s: Time between two points that the features are given of a plan [s].
     """
 
     names = ("front", "back")
 
-    def __init__(self, parameters: PendulumParameters):
+    def __init__(self, parameters: PendulumParameters, preview_step_s: float):
+        self._step_s = preview_step_s
         self._largest = parameters.largest_angle_rad
         self._hold = parameters.hold_angle_rad
+        self._effort_share = parameters.effort_share
         self._time_s = math.sqrt(parameters.length_m / _GRAVITY)
         self.feature_names = [
             f"{point}_{limit}_{side}"
@@ -109,6 +112,8 @@ class PendulumSafeSet:
                 ("capture", "reserve"),
                 ("goal", "reserve"),
                 ("plan", "reserve"),
+                ("plan_capture", "reserve"),
+                ("plan_effort", "reserve"),
             )
             for side in self.names
         ] + ["tracking_error", "goal_from_capture"]
@@ -127,7 +132,8 @@ class PendulumSafeSet:
         """The margins now, and what the motor has in reserve along the plan.
 
         The capture angle φ + φ̇ √(l/g) is where a small pendulum that is left alone goes to;
-        beyond the angle that the motor can hold there is no way back.
+        beyond the angle that the motor can hold there is no way back. Following the plan takes the
+        torque (l/g) φ̈ - sin φ, in units of what holds the pendulum when it is horizontal.
 
         Args:
             q: The angle, (1,) [rad].
@@ -135,12 +141,15 @@ class PendulumSafeSet:
             preview: Points that are to be followed, from now to the end, (M, 3) [m].
 
         Returns:
-            Features, in the order of :attr:`feature_names` [rad].
+            Features, in the order of :attr:`feature_names` [rad], those of the effort in its unit.
         """
         angle = q[0]
         capture = angle + self._time_s * v[0]
         planned = np.arctan2(preview[:, 0], preview[:, 2])
         goal = planned[-1]
+        rate = np.gradient(planned, self._step_s)
+        plan_capture = planned + self._time_s * rate
+        effort = self._time_s**2 * np.gradient(rate, self._step_s) - np.sin(planned)
         return np.array(
             [
                 *self.margins(q, v),
@@ -150,6 +159,11 @@ class PendulumSafeSet:
                 self._hold + goal,
                 self._hold - planned.max(),
                 self._hold + planned.min(),
+                self._hold - plan_capture.max(),
+                self._hold + plan_capture.min(),
+                # What keeps it from falling to the front pulls it to the back.
+                self._effort_share + effort.min(),
+                self._effort_share - effort.max(),
                 planned[0] - angle,
                 goal - capture,
             ]
@@ -285,7 +299,7 @@ class Pendulum(ClosedLoop):
         self._planner = planner
         self._add_controller(builder, parameters, plant_state)
 
-        safe_set = PendulumSafeSet(parameters)
+        safe_set = PendulumSafeSet(parameters, scenario.episode_duration_s / (_NUM_OUTLOOK - 1))
         monitor = builder.AddNamedSystem(
             "safety_monitor",
             SafetyMonitor(safe_set, 1, 1, period_s=scenario.control_period_s),

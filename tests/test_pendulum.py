@@ -92,6 +92,29 @@ def test_features_are_worked_by_hand(loop):
     assert values["tracking_error"] == pytest.approx(-0.1)
 
 
+def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
+    context = loop.CreateDefaultContext()
+    plan = loop.plan(-0.24, 0.24, 1.0)
+    loop.reset_to(context, None, EpisodeStart(q=np.zeros(1), v=np.zeros(1), plan=plan))
+    values = dict(
+        zip(loop.feature_names, loop.GetOutputPort("features").Eval(context), strict=True)
+    )
+    length_m, sine = 0.5, math.sin(0.24)
+    t = np.linspace(0.0, 1.0, 2001)
+    x = length_m * sine * (2.0 * (10 * t**3 - 15 * t**4 + 6 * t**5) - 1.0)
+    z = length_m * math.cos(0.24)
+    angle = np.arctan2(x, z)
+    rate = np.gradient(angle, t)
+    time_s = math.sqrt(length_m / 9.81)
+    capture = angle + time_s * rate
+    effort = time_s**2 * np.gradient(rate, t) - np.sin(angle)
+    hold = math.asin(0.35)
+    assert values["plan_capture_reserve_front"] == pytest.approx(hold - capture.max(), abs=0.005)
+    assert values["plan_capture_reserve_back"] == pytest.approx(hold + capture.min(), abs=0.005)
+    assert values["plan_effort_reserve_front"] == pytest.approx(0.35 + effort.min(), abs=0.01)
+    assert values["plan_effort_reserve_back"] == pytest.approx(0.35 - effort.max(), abs=0.01)
+
+
 def test_a_variation_that_asks_for_what_a_pendulum_has_not_is_refused():
     text = (
         "task: drake_safety.diagrams.pendulum:Pendulum\n"
