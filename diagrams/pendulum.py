@@ -1,23 +1,28 @@
 """Pendulum: an inverted pendulum with a weak motor follows a point; its true safe set is known."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
 from pydrake.examples import PendulumGeometry, PendulumParams, PendulumPlant
 from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DiagramBuilder,
-    LeafSystem,
     OutputPort,
 )
 from pydrake.systems.primitives import Saturation, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.robot import PlantVariation
+from drake_safety.diagrams.pendulum_parameters import GRAVITY, PendulumParameters
+from drake_safety.diagrams.pendulum_systems import (
+    PendulumController,
+    PendulumObserver,
+    PendulumSafeSet,
+    bob_position,
+)
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -28,224 +33,8 @@ from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
-_GRAVITY = 9.81
 _NUM_OUTLOOK = 41  # Samples of the plan from now to its end that the features see.
 _VARIED = ("mass_scale", "joint_damping")  # What a variation can change of this plant.
-
-
-@dataclass(kw_only=True)
-class PendulumParameters:
-    """The task's part of the scenario file. Angles are from upright, positive to the front."""
-
-    mass_kg: float = 1.0
-    length_m: float = 0.5
-    damping: float = 0.05
-    """Of the hinge [N·m·s/rad]."""
-    effort_share: float = 0.35
-    """The motor's torque, as a share of what holds the pendulum when it is horizontal."""
-    stiffness: float = 20.0
-    """Gain of the angle's error [N·m/rad]."""
-    rate_gain: float = 3.0
-    """Gain of the rate's error [N·m·s/rad]."""
-    largest_angle_rad: float = 0.6
-    """Beyond this angle the pendulum has left the safe set."""
-    start_angle_rad: float = 0.6
-    """Half-width of the angles at which episodes begin."""
-    start_rate_rad_s: float = 2.0
-    """Half-width of the rates at which episodes begin."""
-    plan_angle_rad: float = 0.3
-    """Half-width of the angles at which plans begin and end."""
-    plan_duration_s: list[float] = field(default_factory=lambda: [0.5, 1.5])
-    """Shortest and longest duration of the planned motion."""
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not np.all(np.isfinite(value)) or np.min(value) <= 0:
-                raise ValueError(f"pendulum: {entry.name} must be finite and positive; got {value}")
-        if len(self.plan_duration_s) != 2 or self.plan_duration_s[0] > self.plan_duration_s[1]:
-            raise ValueError(
-                f"pendulum: plan_duration_s must be [shortest, longest]; got {self.plan_duration_s}"
-            )
-        if self.start_angle_rad > self.largest_angle_rad:
-            raise ValueError(
-                f"pendulum: start_angle_rad must not exceed largest_angle_rad "
-                f"{self.largest_angle_rad}, or episodes begin outside the safe set; got "
-                f"{self.start_angle_rad}"
-            )
-        if not self.effort_share < 1:
-            raise ValueError(
-                f"pendulum: effort_share must be below 1, or nothing can go wrong; got "
-                f"{self.effort_share}"
-            )
-
-    @property
-    def hold_angle_rad(self) -> float:
-        """The largest angle that the motor can hold."""
-        return math.asin(self.effort_share)
-
-    def effort_limit(self) -> float:
-        """The motor's largest torque [N·m]."""
-        return self.effort_share * self.mass_kg * _GRAVITY * self.length_m
-
-
-class PendulumSafeSet:
-    """The pendulum leans less than its largest angle to the front and to the back.
-
-    Args:
-        parameters: The task's numbers.
-        preview_step_s: Time between two points that the features are given of a plan [s].
-    """
-
-    names = ("front", "back")
-
-    def __init__(self, parameters: PendulumParameters, preview_step_s: float):
-        self._step_s = preview_step_s
-        self._largest = parameters.largest_angle_rad
-        self._hold = parameters.hold_angle_rad
-        self._effort_share = parameters.effort_share
-        self._time_s = math.sqrt(parameters.length_m / _GRAVITY)
-        self.feature_names = [
-            f"{point}_{limit}_{side}"
-            for point, limit in (
-                ("now", "margin"),
-                ("capture", "reserve"),
-                ("goal", "reserve"),
-                ("plan", "reserve"),
-                ("plan_capture", "reserve"),
-                ("plan_effort", "reserve"),
-            )
-            for side in self.names
-        ] + ["tracking_error", "goal_from_capture"]
-
-    def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Angle left to either side, (2,) [rad].
-
-        Args:
-            q: The angle, (1,) [rad].
-            v: Its rate, unused by these constraints.
-        """
-        del v
-        return np.array([self._largest - q[0], self._largest + q[0]])
-
-    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins now, and what the motor has in reserve along the plan.
-
-        The capture angle φ + φ̇ √(l/g) is where a small pendulum that is left alone goes to;
-        beyond the angle that the motor can hold there is no way back. Following the plan takes the
-        torque (l/g) φ̈ - sin φ, in units of what holds the pendulum when it is horizontal.
-
-        Args:
-            q: The angle, (1,) [rad].
-            v: Its rate, (1,) [rad/s].
-            preview: Points that are to be followed, from now to the end, (M, 3) [m].
-
-        Returns:
-            Features, in the order of :attr:`feature_names` [rad], those of the effort in its unit.
-        """
-        angle = q[0]
-        capture = angle + self._time_s * v[0]
-        planned = np.arctan2(preview[:, 0], preview[:, 2])
-        goal = planned[-1]
-        rate = np.gradient(planned, self._step_s)
-        plan_capture = planned + self._time_s * rate
-        effort = self._time_s**2 * np.gradient(rate, self._step_s) - np.sin(planned)
-        return np.array(
-            [
-                *self.margins(q, v),
-                self._hold - capture,
-                self._hold + capture,
-                self._hold - goal,
-                self._hold + goal,
-                self._hold - planned.max(),
-                self._hold + planned.min(),
-                self._hold - plan_capture.max(),
-                self._hold + plan_capture.min(),
-                # What keeps it from falling to the front pulls it to the back.
-                self._effort_share + effort.min(),
-                self._effort_share - effort.max(),
-                planned[0] - angle,
-                goal - capture,
-            ]
-        )
-
-
-class PendulumObserver(LeafSystem):
-    """Tells the pendulum's state from upright, and where the bob is.
-
-    .. pydrake_system::
-
-        name: PendulumObserver
-        input_ports:
-        - pendulum_state
-        output_ports:
-        - plant_state
-        - output
-
-    ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
-    rad/s], and ``output`` the bob over the hinge, (3,) [m].
-
-    Args:
-        length_m: From the hinge to the bob.
-    """
-
-    def __init__(self, length_m: float):
-        super().__init__()
-        port = self.DeclareVectorInputPort("pendulum_state", 2)
-
-        def calc_state(context: Context, output: BasicVector) -> None:
-            theta, rate = port.Eval(context)
-            output.SetFromVector([theta - math.pi, rate])
-
-        def calc_output(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(bob_position(port.Eval(context)[0] - math.pi, length_m))
-
-        self.DeclareVectorOutputPort("plant_state", BasicVector(2), calc_state)
-        self.DeclareVectorOutputPort("output", BasicVector(3), calc_output)
-
-
-class PendulumController(LeafSystem):
-    """A PD controller on the angle, with the weight compensated; its torque knows no limit.
-
-    .. pydrake_system::
-
-        name: PendulumController
-        input_ports:
-        - plant_state
-        - desired_output
-        - desired_output_rate
-        output_ports:
-        - torque
-
-    Args:
-        parameters: The task's numbers.
-    """
-
-    def __init__(self, parameters: PendulumParameters):
-        super().__init__()
-        weight = parameters.mass_kg * _GRAVITY * parameters.length_m
-        state_port = self.DeclareVectorInputPort("plant_state", 2)
-        point_port = self.DeclareVectorInputPort("desired_output", 3)
-        velocity_port = self.DeclareVectorInputPort("desired_output_rate", 3)
-
-        def calc_torque(context: Context, output: BasicVector) -> None:
-            angle, rate = state_port.Eval(context)
-            x, _, z = point_port.Eval(context)
-            vx, _, vz = velocity_port.Eval(context)
-            desired_rate = (vx * z - vz * x) / (x * x + z * z)
-            torque = (
-                parameters.stiffness * (math.atan2(x, z) - angle)
-                + parameters.rate_gain * (desired_rate - rate)
-                - weight * math.sin(angle)
-            )
-            output.SetAtIndex(0, torque)
-
-        self.DeclareVectorOutputPort("torque", BasicVector(1), calc_torque)
-
-
-def bob_position(angle: float, length_m: float) -> np.ndarray:
-    """The bob over the hinge, (3,) [m]; an angle to the front is positive."""
-    return length_m * np.array([math.sin(angle), 0.0, math.cos(angle)])
 
 
 class Pendulum(ClosedLoop):
@@ -437,7 +226,7 @@ def _pendulum_parameters(parameters: PendulumParameters, variation: PlantVariati
     values.set_mass(variation.mass_scale * parameters.mass_kg)
     values.set_length(parameters.length_m)
     values.set_damping(parameters.damping + variation.joint_damping)
-    values.set_gravity(_GRAVITY)
+    values.set_gravity(GRAVITY)
     return values.get_value()
 
 
