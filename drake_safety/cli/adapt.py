@@ -294,10 +294,9 @@ def _adaptation_table(
 
 
 def _losses_table(found: AdaptationStudy, mode: str) -> Table:
-    brier = {
-        name: found.figures[f"losses.{name}.brier"].value
-        for name in ("x", "psi", "grid", "update", "update_without_gpr")
-    }
+    from drake_safety.evaluation.adaptation_losses import STEPS
+
+    brier = {name: found.figures[f"losses.{name}.brier"].value for name in STEPS}
     table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
     table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
     for name, before, label in (
