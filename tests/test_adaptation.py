@@ -130,6 +130,18 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
     assert np.ptp(correction.residual(sharpened.embedding_, x)) > 0.0
 
 
+@pytest.mark.parametrize(("offset", "expected"), [(1e5, 0.0), (-1e5, 1.0)])
+def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, offset, expected):
+    own = sharpened.correction_
+    extreme = dataclasses.replace(own, change=np.array([offset, 0.0, 0.0]))
+    one = worse()[0]
+    x = one.state, one.desired_preview, one.features
+    many = sharpened.predict(*x, correction=extreme).calibrated
+    single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).calibrated
+    assert many[0] == pytest.approx(expected, abs=1e-9)
+    assert single == pytest.approx(expected, abs=1e-9)
+
+
 def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_it(sharpened):
     before = sharpened.beliefs_.copy()
     adapted = sharpened.adapt(worse())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -169,10 +170,9 @@ class SafetyAssessment:
 
         Args:
             feedback: Pairs of actual episodes and their nominal twins.
-            method: "recalibration" changes L, and scores with it; "paper" is
-                the paper's update, by a discrepancy function and feedback beliefs. By default what
-                the mode is called for: "paper" in the paper's mode and without heads, else
-                "recalibration".
+            method: "recalibration" changes L, and scores with it; "paper" is the paper's update, by
+                a discrepancy function and feedback beliefs. By default "paper" in the paper's mode
+                and without heads, else "recalibration".
 
         Returns:
             Another assessment with the same maps.
@@ -259,22 +259,16 @@ class SafetyAssessment:
         if not hasattr(self, "beliefs_"):
             raise ValueError("SafetyAssessment: it has not been fitted or loaded yet")
 
-    def _learned(
+    def _or_own(
         self, beliefs: np.ndarray | None, correction: Correction | None
     ) -> tuple[np.ndarray, Correction]:
         beliefs = self.beliefs_ if beliefs is None else beliefs
         correction = self.correction_ if correction is None else correction
-        for name, given, own in (
-            ("beliefs", beliefs, self.beliefs_),
-            ("the correction's change", correction.change, self.correction_.change),
-            ("the correction's hidden", correction.hidden, self.correction_.hidden),
-            (
-                "the correction's hidden_range",
-                correction.hidden_range,
-                self.correction_.hidden_range,
-            ),
-            ("the correction's guard", correction.guard, self.correction_.guard),
-        ):
+        pairs = [("beliefs", beliefs, self.beliefs_)]
+        for field in fields(Correction):
+            sides = (getattr(one, field.name) for one in (correction, self.correction_))
+            pairs.append((f"the correction's {field.name}", *sides))
+        for name, given, own in pairs:
             if given.shape != own.shape:
                 raise ValueError(
                     f"SafetyAssessment: the shape of {name} is {given.shape}, expected {own.shape}"
@@ -306,7 +300,7 @@ class SafetyAssessment:
             ValueError: The widths or a shape are wrong, or there is nothing learned yet.
         """
         self._check_fitted()
-        beliefs, correction = self._learned(beliefs, correction)
+        beliefs, correction = self._or_own(beliefs, correction)
         x = self._inputs(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
@@ -334,7 +328,7 @@ class SafetyAssessment:
     ) -> Assessment:
         """Assesses one input; the arguments are those of `predict` without the axis N."""
         self._check_fitted()
-        learned = self._learned(beliefs, correction)
+        learned = self._or_own(beliefs, correction)
         row = self.predict_row(state, desired_preview, features, *learned)
         num_columns = self.beliefs_.shape[2]
         return Assessment(

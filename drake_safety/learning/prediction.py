@@ -13,6 +13,8 @@ from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 LOGIT_LIMIT = 8.0
 """Largest logit that a head is believed."""
+SHIFT_LIMIT = 100.0
+"""Largest shift of L: beyond it sigma is 0 or 1 anyway, and exp must not overflow."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -157,6 +159,7 @@ class Correction:
             guard: What is read from the cells' guard, (N,).
         """
         shift = self.change[0] + heads @ self.change[1:] + residual
+        shift = np.clip(shift, -SHIFT_LIMIT, SHIFT_LIMIT)
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
 
 
@@ -328,6 +331,7 @@ def predict_row(
             shift = offset + safety_slope * z + margin_slope * nearness
             least, most = correction.hidden_range.tolist()
             shift += min(max(float(np.vdot(activations, correction.hidden)), least), most)
+            shift = min(max(shift, -SHIFT_LIMIT), SHIFT_LIMIT)
             if shift < 0.0:
                 guard = float(np.dot(weights, correction.guard.ravel().take(rows)))
                 shift *= 1.0 - guard / sum(weights)
