@@ -85,8 +85,9 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, run):
         "front_margin",
         "smallest_margin",
     }
-    pushed = report["monitoring.motions.leave_safe_set"]
-    assert pushed["n"] == 30 and 0 < pushed["value"] < 1
+    pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
+    assert refused["n"] == 30 and pushed["n"] == 30 - round(30 * refused["value"])
+    assert 0 < pushed["value"] < 1
     assert "Watching while it moves: pushes" in printed
     assert (folder / "monitoring.png").is_file()
     # The motions are kept, as the fresh episodes are: the second time nothing is simulated.

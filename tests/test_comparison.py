@@ -16,6 +16,7 @@ from drake_safety.evaluation.comparison import (
 )
 from drake_safety.evaluation.metrics import Figure
 from drake_safety.simulation.scenario import load_scenario
+from shuttle_task import shuttling
 
 NAME = "laikago_balancing"
 ROW = {
@@ -70,8 +71,19 @@ def test_a_finished_row_is_read_again_and_another_effort_makes_another(tmp_path,
         compare_scenario(scenario, tmp_path, more, progress=progress)
 
 
-def test_a_task_without_recovery_is_refused(tmp_path):
-    scenario = load_scenario("atlas_reaching")
-    effort = Effort(num_episodes=20, num_fresh=20, num_throws=1, seed=0)
-    with pytest.raises(ValueError, match="'atlas_reaching' has no recovery"):
-        compare_scenario(scenario, tmp_path, effort, progress=lambda *_: None)
+def test_a_task_without_recovery_has_a_row_without_falls(tmp_path):
+    effort = Effort(num_episodes=120, num_fresh=40, num_throws=5, seed=0)
+    stages = []
+    row = compare_scenario(
+        shuttling(),
+        tmp_path,
+        effort,
+        num_workers=1,
+        progress=lambda stage, done, total: stages.append(stage),
+    )
+    assert row["throws"] == 0 and row["auc"]["n"] == 40
+    assert 0.5 < row["auc"]["value"] <= 1.0
+    assert not any(name.startswith("falls") for name in row)
+    assert {"shuttling: training", "shuttling: t-SNE"} <= set(stages)
+    cells = to_markdown([row]).splitlines()[-1].split(" | ")
+    assert cells[-1].startswith("–")

@@ -9,6 +9,7 @@ from scipy.stats import poisson
 from drake_safety.evaluation.alarms import Alarm, threshold_alarms, tilt
 from drake_safety.evaluation.monitoring_figure import monitoring_figure
 from drake_safety.evaluation.monitoring_study import (
+    begun,
     equal_share_threshold,
     evaluate_alarms,
     first_alarm,
@@ -17,6 +18,7 @@ from drake_safety.evaluation.monitoring_study import (
 )
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.verdicts import alarm_table
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
@@ -213,3 +215,15 @@ def test_the_figure_marks_the_threshold_on_its_own_curve():
     # At zero the right panel says what is noticed in time.
     times, noticed = lead.lines[0].get_data()
     assert noticed[times >= 1e-9].max() == 2 / 4
+
+
+def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():
+    scorer = Scorer(name="x", probability=lambda state, preview, features: state[:, 0])
+    motions = [
+        motion_of(0, {0.0: 0.7, 1.0: 0.1}),
+        motion_of(1, {0.0: 0.5}, leaves=True),
+        motion_of(2, {0.0: 0.49, 0.1: 1.0}),
+        motion_of(3, {0.0: math.nan, 0.1: 1.0}),
+    ]
+    assert [motion.index for motion in begun(motions, scorer, 0.5)] == [0, 1]
+    assert begun([], scorer, 0.5) == []

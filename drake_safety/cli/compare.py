@@ -15,12 +15,14 @@ from drake_safety.cli.provenance import command_line, versions
 
 def compare(
     scenarios: Annotated[
-        list[str], typer.Argument(help="Names of scenarios with recovery, or paths of YAML files.")
+        list[str], typer.Argument(help="Names of scenarios, or paths of YAML files.")
     ],
     out: Annotated[Path, typer.Option(help="Folder: one inside it a scenario, and the table.")],
     episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=20)] = 2048,
     fresh: Annotated[int, typer.Option(help="Fresh nominal episodes to judge by.", min=20)] = 500,
-    throws: Annotated[int, typer.Option(help="Fresh balls at the actual plant.", min=1)] = 300,
+    throws: Annotated[
+        int, typer.Option(help="Fresh balls at the actual plant, where it can recover.", min=1)
+    ] = 300,
     seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
     workers: WorkersOption = None,
 ) -> None:

@@ -202,7 +202,14 @@ def evaluate(
             findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
         if pushes:
             findings.add(
-                evaluate_pushes(judged, pushes, pushes, seed=seed + 1, calibration_seed=seed + 2)
+                evaluate_pushes(
+                    judged,
+                    pushes,
+                    pushes,
+                    threshold=findings.figures["plans.sharpened.threshold"].value,
+                    seed=seed + 1,
+                    calibration_seed=seed + 2,
+                )
             )
         if loop.state_planes and truth_resolution:
             findings.add(evaluate_truth(judged, list(loop.state_planes), truth_resolution))

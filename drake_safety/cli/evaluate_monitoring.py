@@ -20,19 +20,29 @@ _PLANT = "actual"  # Which is pushed.
 
 
 def evaluate_pushes(
-    judged: Judged, num_motions: int, num_calibration: int, *, seed: int, calibration_seed: int
+    judged: Judged,
+    num_motions: int,
+    num_calibration: int,
+    *,
+    threshold: float,
+    seed: int,
+    calibration_seed: int,
 ) -> Findings:
-    """Pushes a robot on its way to goals that it reaches safely by itself.
+    """Pushes a robot on its way to goals that it accepts, and reaches safely by itself.
 
-    The motions are kept with the run, as other fresh sets are.
+    The motions are kept with the run, as other fresh sets are; those to goals that Γ refuses, too.
 
     Args:
         judged: What is judged.
         num_motions: Fresh motions, each undisturbed and pushed.
         num_calibration: Other motions, for thresholds.
+        threshold: From which the calibrated Γ accepts a goal.
         seed: Of the motions.
         calibration_seed: Of the others.
     """
+    from drake_safety.evaluation.metrics import proportion
+    from drake_safety.evaluation.monitoring_study import begun
+    from drake_safety.evaluation.scorers import assessment_scorer
     from drake_safety.simulation.pushed_motions import run_pushed_motions
 
     scenario = judged.scenario
@@ -51,9 +61,15 @@ def evaluate_pushes(
             progress=partial(judged.stages, what),
         )
 
+    verdict = assessment_scorer("sharpened", judged.sharpened, "calibrated")
     test = run("pushes", num_motions, seed)
     calibration = run("calibration pushes", num_calibration, calibration_seed)
-    return evaluate_monitoring(judged, calibration, test)
+    accepted = begun(test, verdict, threshold)
+    findings = Findings(
+        figures={"monitoring.motions.refused": proportion(len(test) - len(accepted), len(test))}
+    )
+    findings.add(evaluate_monitoring(judged, begun(calibration, verdict, threshold), accepted))
+    return findings
 
 
 def evaluate_monitoring(

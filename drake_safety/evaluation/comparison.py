@@ -1,4 +1,4 @@
-"""One row a scenario: how well Γ judges its plans beforehand, and what recovery saves."""
+"""One row a scenario: how well Γ judges plans beforehand, and what recovery saves, if any."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ class Effort:
     num_fresh: int
     """To judge by; half as many others choose the threshold."""
     num_throws: int
+    """At robots that can recover."""
     seed: int
 
 
@@ -56,8 +57,11 @@ def compare_scenario(
 ) -> dict[str, Any]:
     """Learns a scenario's Γ and judges it; what the folder already holds is not done again.
 
+    A task without recovery is not thrown at: its row says how its plans are judged, no more. Plans
+    are judged as ``evaluate`` judges them, undisturbed.
+
     Args:
-        scenario: A scenario with balls and recovery.
+        scenario: A scenario.
         folder: Where its episodes, its assessment and its row are kept.
         effort: How much is simulated.
         num_workers: Processes.
@@ -67,10 +71,9 @@ def compare_scenario(
         The row: names and numbers, and for each figure its value, interval and n.
 
     Raises:
-        ValueError: The task has no recovery, or the folder holds another scenario's episodes.
+        ValueError: The folder holds another scenario's episodes.
     """
-    if not hasattr(scenario.parameters, "recovery"):
-        raise ValueError(f"compare: task '{scenario.task}' of '{scenario.name}' has no recovery")
+    recovery = getattr(scenario.parameters, "recovery", None)
     made_by = {
         "scenario": scenario.to_yaml(),
         "simulation_hash": scenario.simulation_hash(),
@@ -83,7 +86,8 @@ def compare_scenario(
         if stored["made_by"] == made_by:
             return stored["row"]
     run = partial(run_episodes, scenario, num_workers=num_workers)
-    seed = effort.seed
+    seed, robot = effort.seed, scenario.robot
+    judging = dict(scenario.task_class().judging_options)
     training = run(
         effort.num_episodes,
         seed=seed,
@@ -96,34 +100,41 @@ def compare_scenario(
             seed=seed + offset,
             path=folder / name,
             progress=partial(progress, f"{scenario.name}: {name}"),
+            **judging,
         )
         for name, number, offset in (
             ("fresh", effort.num_fresh, 1_000_000),
             ("calibration", max(effort.num_fresh // 2, 20), 1_000_001),
         )
     )
-    assessment = SafetyAssessment(scenario.assessment).fit(training)
+    assessment = SafetyAssessment(scenario.assessment).fit(
+        training,
+        lambda stage, share: progress(f"{scenario.name}: {stage}", round(100 * share), 100),
+    )
     assessment.save(folder / "sharpened.safetensors")
-    recovery = scenario.parameters.recovery
-    published = "normalized" if recovery.is_normalized else "safety_probability"
+    published = "calibrated"
+    if recovery is not None:
+        published = "normalized" if recovery.is_normalized else "safety_probability"
     scorer = assessment_scorer("sharpened", assessment, published)
     figures, _, _ = evaluate_episodes([scorer], calibration, fresh)
-    study = evaluate_throws(
-        scenario,
-        [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
-        num_throws=effort.num_throws,
-        num_calibration=0,
-        seed=seed + 1_000_002,
-        calibration_seed=seed + 1_000_003,
-        num_workers=num_workers,
-        progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
-    )
-    figures |= study.figures
+    if recovery is not None:
+        study = evaluate_throws(
+            scenario,
+            [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
+            num_throws=effort.num_throws,
+            num_calibration=0,
+            seed=seed + 1_000_002,
+            calibration_seed=seed + 1_000_003,
+            num_workers=num_workers,
+            progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
+        )
+        figures |= study.figures
     row = {
         "scenario": scenario.name,
-        "robot": load_robot(scenario.robot).name,
+        # A task of one's own may call its robot as it likes.
+        "robot": load_robot(robot).name if Path(robot).suffix else robot,
         "episodes": effort.num_episodes,
-        "throws": effort.num_throws,
+        "throws": effort.num_throws if recovery is not None else 0,
         **{name: figures[key].to_json() for name, key in _FIGURES.items() if key in figures},
     }
     folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,8 @@ import numpy as np
 
 from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Figure, auc, median, proportion
-from drake_safety.simulation.watched_motion import WatchedMotion
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 
 FALSE_ALARM_SHARE = 0.05
 """Share of the calibration motions that stay safe in which everyone may give a false alarm."""
@@ -40,6 +41,23 @@ class MonitoringStudy:
     unsafe_score: dict[str, np.ndarray]
     is_unsafe: np.ndarray
     lead_s: dict[str, np.ndarray]
+
+
+def begun(
+    motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
+) -> list[WatchedMotion]:
+    """The motions that a robot begins: those whose plan is accepted at their first row.
+
+    Args:
+        motions: Motions, pushed or not.
+        scorer: What the verdict is read from.
+        threshold: From which safety probability on a plan is accepted.
+    """
+    if not motions:
+        return []
+    first_rows = (np.stack([getattr(motion, name)[0] for motion in motions]) for name in SEEN)
+    is_accepted = scorer.probability(*first_rows) >= threshold
+    return [motion for motion, begins in zip(motions, is_accepted, strict=True) if begins]
 
 
 def first_alarm(

@@ -339,6 +339,13 @@ def alarm_table(results: Results) -> Table:
     meaning = (
         "Everyone may give as many false alarms on other motions: thresholds are chosen for that."
     )
+    refused = results.figures.get("monitoring.motions.refused")
+    if refused is not None and refused.n:
+        meaning += (
+            f" Of {refused.n} motions that would be safe if nobody pushed, "
+            f"{share.value_text(refused)} lead to goals that sharpened refuses beforehand: they "
+            "are not begun, whoever watches."
+        )
     left = results.figures.get("monitoring.motions.leave_safe_set")
     hours = results.figures.get("monitoring.motions.safe_hours")
     if left is not None and hours is not None:
