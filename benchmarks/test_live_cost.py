@@ -1,0 +1,79 @@
+"""How fast the live pages run: simulating, Γ and drawing, against the clock."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import load_assessment, load_scenario
+from drake_safety.simulation.balls import Throw
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.live_session import TICK_S, LiveGoals, LiveSession, LiveThrows
+
+DURATION_S, ROUNDS = 3.0, 3
+BALL = Throw(mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.3)  # One that it has to step for.
+TARGET = np.array([0.7, 0.3, 1.0])
+
+
+def begin_throws(meshcat: Meshcat, scenario_name: str) -> tuple[ClosedLoop, LiveSession]:
+    scenario = load_scenario(scenario_name)
+    gamma = load_assessment(scenario_name)
+    loop = scenario.make_loop("actual", assessment=gamma, meshcat=meshcat, ball=True)
+    threshold = scenario.parameters.recovery.threshold
+    session = LiveThrows(loop, meshcat, threshold=threshold)
+    loop.throw_ball(session.context, BALL, 0.2)
+    return loop, session
+
+
+def begin_goals(meshcat: Meshcat, scenario_name: str) -> tuple[ClosedLoop, LiveSession]:
+    scenario = load_scenario(scenario_name)
+    gamma = load_assessment(scenario_name)
+    loop = scenario.make_loop("actual", assessment=gamma, meshcat=meshcat)
+    session = LiveGoals(loop, meshcat, threshold=gamma.calibrations_["plan"].threshold)
+    for name, value in zip(session.AXES, TARGET, strict=True):
+        meshcat.SetSliderValue(name, float(value))
+    # What the browser sends when its button Go is clicked, as MessagePack.
+    meshcat._InjectWebsocketMessage(b"\x82\xa4type\xa6button\xa4name\xa2" + session.GO.encode())
+    session.tick()
+    return loop, session
+
+
+@pytest.mark.parametrize(
+    ("scenario_name", "begin"),
+    [("laikago_balancing", begin_throws), ("atlas_reaching", begin_goals)],
+)
+def test_live_page_keeps_up_with_the_clock(
+    benchmark: Any,
+    report: Callable[..., None],
+    scenario_name: str,
+    begin: Callable[[Meshcat, str], tuple[ClosedLoop, LiveSession]],
+) -> None:
+    factors, bare_factors = [], []
+
+    def run() -> None:
+        meshcat = Meshcat()
+        loop, session = begin(meshcat, scenario_name)
+        start_s = session.context.get_time()
+        # The same motion, with neither Γ's board nor controls.
+        bare = Simulator(loop, session.context.Clone())
+        start = time.perf_counter()
+        bare.AdvanceTo(start_s + DURATION_S)
+        bare_factors.append(DURATION_S / (time.perf_counter() - start))
+        start = time.perf_counter()
+        for _ in range(round(DURATION_S / TICK_S)):
+            assert session.tick()
+        factors.append(DURATION_S / (time.perf_counter() - start))
+
+    benchmark.pedantic(run, rounds=ROUNDS)
+    report(
+        f"live page, real-time factor, {scenario_name}",
+        np.median(factors),
+        "x",
+        at_least=1.0,
+        peers={"without controls and board": float(np.median(bare_factors))},
+        note=f"{DURATION_S:g} s of the actual plant, lowest of {ROUNDS}: {min(factors):.2f}",
+    )
