@@ -1,5 +1,7 @@
 """Known truth: overlap, confident errors and their distance from the boundary, worked by hand."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,11 +9,14 @@ from drake_safety.evaluation.known_truth import (
     KnownTruth,
     agreement,
     boundary_distance,
+    random_plan_figures,
     simulate_truth,
 )
 from drake_safety.evaluation.known_truth_figure import known_truth_figure
+from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.state_plane import StatePlane
 from shuttle_task import shuttling
+from test_dataset import make_episode, make_info
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
 HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)
@@ -89,3 +94,31 @@ def test_the_picture_marks_each_confident_error_once():
     figure = known_truth_figure([(truth, says, agreement(HALF, says))], "a title")
     (marks,) = figure.axes[0].lines
     np.testing.assert_allclose(marks.get_xydata(), [[1.0, 0.5]])
+
+
+class SaysTheState:
+    """An assessment that takes the first number of a state for the probability of safety."""
+
+    uses_features = True
+
+    def predict(self, state, desired_preview, features):
+        return SimpleNamespace(normalized=state[:, 0])
+
+
+def test_random_plans_are_judged_by_their_first_rows_alone():
+    # (what is said first, whether it stays safe); later rows say the opposite.
+    said = [(0.95, True), (0.6, True), (0.3, True), (0.95, False), (0.6, False), (0.05, False)]
+    info = make_info()
+    episodes = []
+    for index, (first, stays_safe) in enumerate(said):
+        cause = "" if stays_safe else info.constraint_names[0]
+        episode = make_episode(index, first_step=0, is_safe=stays_safe, cause=cause)
+        episode.state[:, 0] = 1.0 - first
+        episode.state[0, 0] = first
+        episodes.append(episode)
+    found = random_plan_figures(SaysTheState(), Episodes(info, episodes))
+    assert found["safe_share"].value == 0.5
+    # Two of the five that are safe, or said to be.
+    assert found["intersection_over_union"].value == pytest.approx(2 / 5)
+    assert found["intersection_over_union"].n == 5
+    assert found["confident_errors"].value == pytest.approx(1 / 6)

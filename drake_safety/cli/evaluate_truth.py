@@ -6,12 +6,12 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from drake_safety.cli.console import new_table
+from drake_safety.cli.console import interval, new_table
 from drake_safety.cli.findings import Findings, Judged
 
 
 def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findings:
-    """Γ of either mode beside the truth on every state plane, at k = 0.
+    """Γ of either mode beside the truth on every state plane, and on random plans, at k = 0.
 
     Args:
         judged: What is judged.
@@ -19,7 +19,11 @@ def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findin
         resolution: Points along either variable.
     """
     from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.known_truth import agreement, simulate_truth
+    from drake_safety.evaluation.known_truth import (
+        agreement,
+        random_plan_figures,
+        simulate_truth,
+    )
     from drake_safety.evaluation.known_truth_figure import known_truth_figure
 
     truths = [
@@ -43,6 +47,7 @@ def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findin
     )
     pictures = []
     entries: dict[str, Any] = {}
+    figures = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
         panels = []
         for truth in truths:
@@ -61,6 +66,18 @@ def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findin
                 f"{100 * found.confident_errors:.2f}",
                 f"{100 * found.band:.1f}",
             )
+        random = random_plan_figures(gamma, judged.test_set)
+        table.add_row(
+            mode,
+            f"{len(judged.test_set)} random ones",
+            interval(random["safe_share"], 100, 1),
+            interval(random["intersection_over_union"]),
+            interval(random["confident_errors"], 100, 2),
+            "–",
+        )
+        figures |= {f"known_truth.{mode}.random.{key}": value for key, value in random.items()}
         figure = known_truth_figure(panels, f"{judged.scenario.name}, {mode}")
         pictures += save(figure, judged.folder / f"known_truth_{mode}")
-    return Findings(entries={"known_truth": entries}, pictures=pictures, tables=[table])
+    return Findings(
+        figures=figures, entries={"known_truth": entries}, pictures=pictures, tables=[table]
+    )

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drake_safety.evaluation.metrics import Figure, proportion
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
@@ -165,6 +167,31 @@ def agreement(is_safe: np.ndarray, probability: np.ndarray, threshold: float = 0
         confident_errors=float(wrong.mean()),
         band=float(depth[wrong].max()) if wrong.any() else 0.0,
     )
+
+
+def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Figure]:
+    """How far Γ and the truth agree at k = 0 on random starts and plans, not on chosen ones.
+
+    Args:
+        assessment: Γ.
+        episodes: Fresh episodes, drawn as those that were learned from.
+
+    Returns:
+        "safe_share", "intersection_over_union" and "confident_errors", as in `Agreement`.
+    """
+    segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
+    first = segments.take(segments.is_first)
+    state = first.state if assessment.uses_features else first.true_state
+    probability = assessment.predict(state, first.desired_preview, first.features).normalized
+    is_safe, says_safe = ~first.is_unsafe, probability >= 0.5
+    wrong = np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
+    return {
+        "safe_share": proportion(int(is_safe.sum()), len(first)),
+        "intersection_over_union": proportion(
+            int(np.sum(is_safe & says_safe)), int(np.sum(is_safe | says_safe))
+        ),
+        "confident_errors": proportion(int(wrong.sum()), len(first)),
+    }
 
 
 def boundary_distance(is_safe: np.ndarray) -> np.ndarray:
