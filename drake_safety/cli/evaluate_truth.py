@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drake_safety.cli.console import interval, new_table
 from drake_safety.cli.findings import Findings, Judged
+
+if TYPE_CHECKING:
+    from drake_safety.evaluation.metrics import Figure
 
 
 def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findings:
@@ -47,7 +50,7 @@ def evaluate_truth(judged: Judged, planes: list[str], resolution: int) -> Findin
     )
     pictures = []
     entries: dict[str, Any] = {}
-    figures = {}
+    figures: dict[str, Figure] = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
         panels = []
         for truth in truths:
