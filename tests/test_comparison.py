@@ -4,6 +4,7 @@ import csv
 import io
 import json
 
+import numpy as np
 import pytest
 
 from drake_safety.evaluation import comparison
@@ -14,9 +15,11 @@ from drake_safety.evaluation.comparison import (
     to_csv,
     to_markdown,
 )
+from drake_safety.evaluation.comparison_figure import comparison_figure, standing_still
 from drake_safety.evaluation.metrics import Figure
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import shuttling
+from shuttle_task import SCENARIO, shuttling
+from test_ablate import call
 
 NAME = "laikago_balancing"
 ROW = {
@@ -71,19 +74,42 @@ def test_a_finished_row_is_read_again_and_another_effort_makes_another(tmp_path,
         compare_scenario(scenario, tmp_path, more, progress=progress)
 
 
-def test_a_task_without_recovery_has_a_row_without_falls(tmp_path):
-    effort = Effort(num_episodes=120, num_fresh=40, num_throws=5, seed=0)
-    stages = []
-    row = compare_scenario(
-        shuttling(),
-        tmp_path,
-        effort,
-        num_workers=1,
-        progress=lambda stage, done, total: stages.append(stage),
-    )
+def test_a_task_without_recovery_has_a_row_without_falls(tmp_path, monkeypatch, capsys):
+    file, out = tmp_path / "shuttling.yaml", tmp_path / "table"
+    file.write_text(SCENARIO)
+    options = ("--out", out, "--episodes", 120, "--fresh", 40, "--throws", 5, "--workers", 1)
+    assert call(monkeypatch, "compare", file, *options) in (0, None)
+    printed = capsys.readouterr().out
+    (row,) = json.loads((out / "comparison.json").read_text())["rows"]
     assert row["throws"] == 0 and row["auc"]["n"] == 40
     assert 0.5 < row["auc"]["value"] <= 1.0
     assert not any(name.startswith("falls") for name in row)
-    assert {"shuttling: training", "shuttling: t-SNE"} <= set(stages)
-    cells = to_markdown([row]).splitlines()[-1].split(" | ")
-    assert cells[-1].startswith("–")
+    assert (out / "comparison.md").read_text() == to_markdown([row])
+    assert to_markdown([row]).splitlines()[-1].split(" | ")[-1].startswith("–")
+    assert "shuttling: training" in printed and "shuttling: t-SNE" in printed
+    assert "picture" not in printed  # There is no robot to show.
+    # Called again, it reads what it finished.
+    monkeypatch.setattr(comparison, "run_episodes", None)
+    assert call(monkeypatch, "compare", file, *options) in (0, None)
+    assert json.loads((out / "comparison.json").read_text())["rows"] == [row]
+
+
+def test_the_picture_shows_each_robot_with_what_its_row_says():
+    falls = {
+        "falls_without_recovery": Figure(0.4, 0.25, 0.55, 40).to_json(),
+        "falls_with_recovery": Figure(0.025, 0.0, 0.1, 40).to_json(),
+    }
+    rows = [ROW | falls, {"scenario": "no_robot"}]
+    picture = np.zeros((4, 5, 3), dtype=np.uint8)
+    (axes,) = comparison_figure(rows, {NAME: picture}).axes
+    assert axes.get_title(loc="left") == "laikago balancing"
+    assert axes.texts[0].get_text() == "AUC at planning time 0.950\nfalls 40 % → 2.5 %"
+    assert axes.images[0].get_array().shape == (4, 5, 3)
+
+
+def test_a_robot_is_seen_standing_and_a_task_without_one_has_no_picture():
+    assert standing_still(shuttling().make_loop()) is None
+    still = standing_still(load_scenario(NAME).make_loop())
+    height, width, _ = still.shape
+    middle, corner = still[height // 2, width // 2], still[2, 2]
+    assert np.abs(middle.astype(int) - corner).max() > 20

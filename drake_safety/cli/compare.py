@@ -28,6 +28,8 @@ def compare(
 ) -> None:
     """Train several scenarios alike and write one table: recalls, falls with and without recovery.
 
+    Where nothing recovers plans alone are judged. A picture shows the robots beside the table.
+
     A comparison that was stopped goes on when it is called again; finished rows are kept.
     """
     from drake_safety.evaluation.comparison import (
@@ -38,6 +40,8 @@ def compare(
         to_csv,
         to_markdown,
     )
+    from drake_safety.evaluation.comparison_figure import comparison_figure, standing_still
+    from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = [load_scenario(name) for name in scenarios]
@@ -62,6 +66,11 @@ def compare(
     console.print(table)
     for suffix in ("json", "csv", "md"):
         print_path("table", out / f"comparison.{suffix}")
+    found = {scenario.name: standing_still(scenario.make_loop()) for scenario in loaded}
+    stills = {name: still for name, still in found.items() if still is not None}
+    if stills:
+        for picture in save(comparison_figure(rows, stills), out / "comparison"):
+            print_path("picture", picture)
 
 
 def _write(out: Path, rows: list[dict[str, object]], csv: str, markdown: str) -> None:
