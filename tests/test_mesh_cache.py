@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from drake_safety.control.mesh_cache import cache_folder, shown_mesh
+from drake_safety.control.mesh_cache import cache_folder, has_own_colours, is_shown, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -39,6 +39,33 @@ def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
 def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):
     assert shown_mesh(tmp_path / "trunk.obj") == tmp_path / "trunk.obj"
     assert not cache.exists()
+
+
+@pytest.mark.parametrize(
+    ("materials", "shown", "own_colours"),
+    [
+        (None, True, False),
+        ("newmtl a\nKd 1 0 0\n", True, True),
+        ("newmtl a\nTr 0.0\n", True, True),
+        ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True, True),
+        ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False, False),
+    ],
+)
+def test_an_obj_whose_materials_are_all_transparent_is_converted(
+    cache, tmp_path, materials, shown, own_colours
+):
+    path = tmp_path / "hip.obj"
+    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
+    if materials is not None:
+        path.with_suffix(".mtl").write_text(materials)
+    assert is_shown(path) == shown
+    assert has_own_colours(path) == own_colours
+    found = shown_mesh(path, "0.2 0.4 0.6 1")
+    assert (found == path) == shown
+    if not shown:
+        gltf = json.loads(found.read_text())
+        (colour,) = [one["pbrMetallicRoughness"]["baseColorFactor"] for one in gltf["materials"]]
+        np.testing.assert_allclose(colour, [0.2, 0.4, 0.6, 1.0], atol=1 / 255)
 
 
 def test_up_stays_up_and_the_colour_is_the_models(cache, tower):

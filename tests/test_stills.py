@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+from drake_safety.control import robot_description
+from drake_safety.control.model_files import is_installed
 from drake_safety.evaluation.stills import (
     StillCamera,
     render_stills,
@@ -16,7 +18,10 @@ SIZE = {"width": 96, "height": 72}
 
 @pytest.fixture(scope="module")
 def loop():
-    return load_scenario("laikago_balancing").make_loop(ball=True)
+    """Laikago in the package's own shapes: as published it is as orange as the ball."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robot_description, "is_installed", lambda url: False)
+        return load_scenario("laikago_balancing").make_loop(ball=True)
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +142,14 @@ def test_what_does_not_fit_the_plant_is_refused(loop, camera, standing):
         render_stills(loop, [0.0, 0.1], [standing, standing], [0.5])
     with pytest.raises(ValueError, match=r"times have shape \(1,\) and positions \(2, "):
         render_stills(loop, [0.0], [standing, standing], [0.0])
+
+
+def test_meshes_that_are_shaded_physically_are_lit_as_brightly(camera, standing):
+    pytest.importorskip("trimesh")
+    if not is_installed("package://example-robot-data/"):
+        pytest.skip("the extra 'robots' is not installed")
+    published = load_scenario("laikago_balancing").make_loop(ball=True)
+    corner = np.s_[-8:, -8:]  # The ground.
+    plain = camera.render(standing)[corner].mean()
+    lit = StillCamera(published, standing, **SIZE).render(standing)[corner].mean()
+    assert abs(lit - plain) < 30

@@ -32,6 +32,39 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "drake_safety"
 
 
+def is_shown(path: Path) -> bool:
+    """Whether Drake shows a mesh as it is.
+
+    An OBJ file of MeshLab's may call its materials wholly transparent where it means opaque; Drake
+    takes it at its word.
+
+    Args:
+        path: The mesh.
+    """
+    if path.suffix.lower() not in SHOWN_FORMATS:
+        return False
+    return path.suffix.lower() != ".obj" or not _is_transparent(path.with_suffix(".mtl"))
+
+
+def has_own_colours(path: Path) -> bool:
+    """Whether a mesh that Drake shows as it is brings its materials along.
+
+    Args:
+        path: The mesh.
+    """
+    return is_shown(path) and path.with_suffix(".mtl").is_file()
+
+
+@lru_cache(maxsize=1024)
+def _is_transparent(materials: Path) -> bool:
+    """Whether none of the materials of an MTL file lets anything be seen."""
+    if not materials.is_file():
+        return False
+    words = [line.split() for line in materials.read_text("utf-8", "replace").splitlines()]
+    opacities = [1.0 - float(line[1]) for line in words if len(line) == 2 and line[0] == "Tr"]
+    return bool(opacities) and max(opacities) <= 0.0
+
+
 def shown_mesh(path: Path, rgba: str = "") -> Path:
     """A mesh in a format that Drake shows: the file itself, or a glTF file in the cache.
 
@@ -43,7 +76,7 @@ def shown_mesh(path: Path, rgba: str = "") -> Path:
         MissingExtraError: There is something to convert, and nothing to convert it with.
         ValueError: The file does not exist or cannot be read.
     """
-    if path.suffix.lower() in SHOWN_FORMATS:
+    if is_shown(path):
         return path
     if not path.is_file():
         raise ValueError(f"mesh '{path}' does not exist")
@@ -110,7 +143,7 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
     scene = _scene(path)
     import trimesh
 
-    if path.suffix.lower() == ".stl":
+    if path.suffix.lower() in (".stl", ".obj"):
         colour = [float(value) for value in rgba.split()] or _GREY
         for mesh in scene.geometry.values():
             mesh.visual = trimesh.visual.TextureVisuals(

@@ -83,3 +83,15 @@ def model_file(url: str, folder: str = "") -> Path:
             f"pip install 'drake_safety[{_EXTRAS[parts.netloc]}]'"
         )
     raise ValueError(f"'{url}': no package '{parts.netloc}'; add its files by path")
+
+
+def is_installed(url: str) -> bool:
+    """Whether the package of a ``package://…`` URL can be found; of a path it is always so.
+
+    Args:
+        url: The URL, or a path.
+    """
+    parts = urlparse(url)
+    package_map = PackageMap()
+    add_to_package_map(package_map, url)
+    return parts.scheme != "package" or package_map.Contains(parts.netloc)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,9 +23,14 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from drake_safety.control.model_files import add_to_package_map, model_file
+from drake_safety.control.model_files import (
+    MissingExtraError,
+    add_to_package_map,
+    is_installed,
+    model_file,
+)
 from drake_safety.control.robot_model import CollisionShape, RobotModel, by_pattern
-from drake_safety.control.urdf_copy import read_urdf
+from drake_safety.control.urdf_copy import UrdfCopy, read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.
@@ -55,7 +61,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
         if robot.collision == "stated":
             urdf.drop_collisions()
         if plant.geometry_source_is_registered():
-            urdf.convert_visual_meshes()
+            urdf = _shown(urdf, robot)
     with _quiet_about(robot):
         if urdf is not None and urdf.is_changed:
             urdf.anchor_meshes()
@@ -66,6 +72,25 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             (instance,) = parser.AddModels(str(path))
     plant.RenameModelInstance(instance, robot.name)
     return instance
+
+
+def _shown(urdf: UrdfCopy, robot: RobotModel) -> UrdfCopy:
+    """The URDF with visual meshes that Drake shows, the robot's ``visuals`` where they can be had.
+
+    Raises:
+        ValueError: A mesh cannot be converted, or the frames of ``visuals`` are others.
+    """
+    if robot.visuals and is_installed(robot.visuals):
+        dressed = copy.deepcopy(urdf)
+        dressed.take_visuals(read_urdf(model_file(robot.visuals, robot.source_dir)))
+        try:
+            dressed.convert_visual_meshes()
+        except MissingExtraError as error:
+            _logger.debug("%s keeps its own looks: %s", robot.name, error)
+        else:
+            return dressed
+    urdf.convert_visual_meshes()
+    return urdf
 
 
 @contextmanager

@@ -156,6 +156,10 @@ class RobotModel:
     urdf: str = ""
     """``package://…`` (ours, Drake's or a pip package's) or a path beside the YAML file; any
     format that Drake's Parser reads."""
+    visuals: str = ""
+    """A URDF that says what the links look like, those of the same names, when its package is
+    installed: ``package://…``. Their frames must be those of ``urdf``, itself a URDF. Nothing that
+    is simulated depends on it."""
     base: str = ""
     """Floating base body."""
     posture: dict[str, float] = field(default_factory=dict)

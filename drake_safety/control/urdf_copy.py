@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.control.mesh_cache import SHOWN_FORMATS, shown_mesh
+from drake_safety.control.mesh_cache import has_own_colours, is_shown, shown_mesh
 from drake_safety.control.model_files import model_file
 
 _DRAKE = "http://drake.mit.edu"
@@ -116,9 +116,60 @@ class UrdfCopy:
                     link.remove(visual)
                     continue
                 mesh.set("filename", replacement)
-                is_converted = Path(url).suffix.lower() not in SHOWN_FORMATS
+                is_converted = Path(replacement).suffix != Path(url).suffix
                 if material is not None and is_converted:
                     visual.remove(material)
+
+    def take_visuals(self, other: UrdfCopy) -> None:
+        """Puts what another URDF's links look like in the place of what those of this one do.
+
+        Links that have no visual shape there keep their own.
+
+        Args:
+            other: The other URDF; its frames must be these.
+
+        Raises:
+            ValueError: A joint that leads to such a link lies elsewhere there.
+        """
+        own_joints, their_joints = self._joint_origins(), other._joint_origins()
+        for colour in other.root.iter("material"):
+            # A colour of the same name may be another one here.
+            colour.set("name", f"visuals_{colour.get('name', '')}")
+        self.root.extend(other.root.findall("material"))
+        links = {link.get("name", ""): link for link in self.root.findall("link")}
+        for theirs in other.root.findall("link"):
+            name, visuals = theirs.get("name", ""), theirs.findall("visual")
+            if name not in links or not visuals:
+                continue
+            here, there = own_joints.get(name), their_joints.get(name)
+            if here is not None and there is not None and not np.allclose(here, there, atol=1e-6):
+                raise ValueError(
+                    f"'{other.source}' cannot say what link '{name}' of '{self.source}' looks "
+                    f"like: its joint's origin is {there} there, and {here} here"
+                )
+            for visual in links[name].findall("visual"):
+                links[name].remove(visual)
+            for visual in visuals:
+                mesh, material = visual.find("geometry/mesh"), visual.find("material")
+                if mesh is not None:
+                    path = model_file(mesh.get("filename", ""), str(other.source.parent))
+                    mesh.set("filename", str(path.resolve()))
+                    # A mesh with colours of its own needs none: Drake warns of two.
+                    if material is not None and has_own_colours(path):
+                        visual.remove(material)
+                links[name].append(visual)
+
+    def _joint_origins(self) -> dict[str, list[float]]:
+        """Where the joint to each link lies in its parent, by link: xyz [m] and rpy [rad]."""
+        found = {}
+        for joint in self.root.findall("joint"):
+            child, origin = joint.find("child"), joint.find("origin")
+            text = ["0 0 0", "0 0 0"]
+            if origin is not None:
+                text = [origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0")]
+            if child is not None:
+                found[child.get("link", "")] = [float(word) for word in " ".join(text).split()]
+        return found
 
     def convert_visual_meshes(self) -> None:
         """Puts glTF files of the user's cache in the place of visual meshes Drake does not show.
@@ -129,9 +180,8 @@ class UrdfCopy:
         folder = str(self.source.parent)
 
         def shown(url: str, rgba: str) -> str:
-            if Path(url).suffix.lower() in SHOWN_FORMATS:
-                return url
-            return shown_mesh(model_file(url, folder), rgba).resolve().as_uri()
+            path = model_file(url, folder)
+            return url if is_shown(path) else shown_mesh(path, rgba).resolve().as_uri()
 
         self.replace_visual_meshes(shown)
 

@@ -16,6 +16,7 @@ from pydrake.geometry import (
     ColorRenderCamera,
     LightParameter,
     MakeRenderEngineVtk,
+    Mesh,
     RenderCameraCore,
     RenderEngineVtkParams,
     Rgba,
@@ -36,6 +37,7 @@ _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
+_PBR_BRIGHTNESS = 2.2  # One glTF mesh, and all is shaded physically, which is darker.
 _BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and what it did.
 _AFTER_TRIGGER_S = 0.3  # Feet in the air.
 _LEAST_GAP_S = 0.3  # Between two pictures that no event asks for.
@@ -99,7 +101,9 @@ class StillCamera:
         scene_graph.AddRenderer(
             scene_graph.GetMyMutableContextFromRoot(self._context),
             _RENDERER,
-            MakeRenderEngineVtk(_lighting(centre, radius)),
+            MakeRenderEngineVtk(
+                _lighting(centre, radius, brightness=_PBR_BRIGHTNESS if self._has_gltf() else 1.0)
+            ),
         )
         self._world = scene_graph.world_frame_id()
 
@@ -138,6 +142,13 @@ class StillCamera:
         if not np.isfinite(positions).all():
             raise ValueError("stills: the positions are not finite")
         self._plant.SetPositions(self._plant_context, positions)
+
+    def _has_gltf(self) -> bool:
+        """Whether a glTF mesh is among what is to be seen."""
+        query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
+        inspector = query.inspector()
+        shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
+        return any(isinstance(one, Mesh) and one.extension() == ".gltf" for one in shapes)
 
     def _extent(self) -> tuple[np.ndarray, float]:
         """Centre of the robot's visible geometry in the world (3,) and its radius about it [m]."""
@@ -297,7 +308,7 @@ def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:
     return RigidTransform(R_WC, p_WC)
 
 
-def _lighting(centre: np.ndarray, radius: float) -> RenderEngineVtkParams:
+def _lighting(centre: np.ndarray, radius: float, *, brightness: float) -> RenderEngineVtkParams:
     """One lamp that casts shadows and soft fill from all sides, in proportion to the robot."""
 
     def lamp(x: float, y: float, z: float, intensity: float, kind: str = "point") -> LightParameter:
@@ -307,7 +318,7 @@ def _lighting(centre: np.ndarray, radius: float) -> RenderEngineVtkParams:
             frame="world",
             position=np.append(centre[:2], 0.0) + offset,
             direction=-offset / np.linalg.norm(offset),
-            intensity=intensity,
+            intensity=brightness * intensity,
             cone_angle=55.0,
             color=Rgba(1.0, 0.99, 0.97, 1.0),
         )

@@ -231,7 +231,7 @@ def _read_ablation(run: Run, paths: list[Path]) -> None:
     what, command = "What each choice in learning Γ is worth", _command(run, "ablate")
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
-        why = f"There is none of {[path.name for path in paths]}."
+        why = f"There is neither {' nor '.join(path.name for path in paths)}."
         run.missing.append(Missing(what=what, why=why, command=command))
         return
     if path.stem.endswith("_quick"):
