@@ -10,6 +10,12 @@ from drake_safety.control.mesh_cache import cache_folder, has_own_colours, is_sh
 
 trimesh = pytest.importorskip("trimesh")
 
+NOTHING = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_visual_scenes><visual_scene id="s"/></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
@@ -96,6 +102,9 @@ def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path):
     (tmp_path / "text.dae").write_text("no mesh")
     with pytest.raises(ValueError, match=r"text\.dae' cannot be read"):
         shown_mesh(tmp_path / "text.dae")
+    (tmp_path / "nothing.dae").write_text(NOTHING)
+    with pytest.raises(ValueError, match=r"nothing\.dae' is empty, or holds no surface"):
+        shown_mesh(tmp_path / "nothing.dae")
     assert list(cache.rglob("*.gltf")) == []
 
 

@@ -116,10 +116,7 @@ def mesh_box(path: Path) -> np.ndarray:
         MissingExtraError: There is nothing to read it with.
         ValueError: The file cannot be read, or is empty.
     """
-    bounds = _scene(path).bounds
-    if bounds is None:
-        raise ValueError(f"mesh '{path}' is empty")
-    return np.array(bounds, dtype=float)
+    return np.array(_scene(path).bounds, dtype=float)
 
 
 def _scene(path: Path) -> trimesh.Scene:
@@ -134,9 +131,12 @@ def _scene(path: Path) -> trimesh.Scene:
             "would convert it, is not installed: pip install 'drake_safety[robots]'"
         ) from error
     try:
-        return trimesh.load_scene(path)
+        scene = trimesh.load_scene(path)
     except Exception as error:  # trimesh's readers raise whatever they stumble on.
         raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
+    if scene.bounds is None:
+        raise ValueError(f"mesh '{path}' is empty, or holds no surface that trimesh can read")
+    return scene
 
 
 def _to_gltf(path: Path, rgba: str) -> bytes:
