@@ -10,11 +10,10 @@ import numpy as np
 
 from drake_safety.evaluation.comparison import row_figure
 from drake_safety.evaluation.figure_style import drawing_style, new_figure
+from drake_safety.simulation.closed_loop import ClosedLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
-
-    from drake_safety.simulation.closed_loop import ClosedLoop
 
 _COLUMNS = 4
 _SIZE = (480, 400)  # Of a still [pixels].
@@ -28,7 +27,7 @@ def standing_still(loop: ClosedLoop) -> np.ndarray | None:
     """
     from drake_safety.evaluation.stills import StillCamera
 
-    if not hasattr(loop, "plant"):
+    if not hasattr(loop, "plant") or type(loop).standing_start is ClosedLoop.standing_start:
         return None
     context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
