@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.gradients import unsafe_logits
@@ -172,14 +173,16 @@ def suggest_goal(
         "resolution_m": resolution_m,
     }
     known = None
-    if np.isfinite(checked_goal(goal)).all() and assessment.embedding_.has_safety_head:
-        known = descend_to_accepted(loop, assessment, goal, **options).verdict
-    if known is not None:
-        options |= {"known": known, "num_rounds": _ROUNDS_FROM_KNOWN}
-        num_candidates = max(num_candidates // 2, 2)
-    return nearest_accepted_goal(
-        loop, assessment, goal, rng=rng, num_candidates=num_candidates, **options
-    )
+    # Matrices this small are multiplied sooner by one thread than by several.
+    with threadpool_limits(1):
+        if np.isfinite(checked_goal(goal)).all() and assessment.embedding_.has_safety_head:
+            known = descend_to_accepted(loop, assessment, goal, **options).verdict
+        if known is not None:
+            options |= {"known": known, "num_rounds": _ROUNDS_FROM_KNOWN}
+            num_candidates = max(num_candidates // 2, 2)
+        return nearest_accepted_goal(
+            loop, assessment, goal, rng=rng, num_candidates=num_candidates, **options
+        )
 
 
 def _far(verdict: GoalVerdict, goal: np.ndarray) -> float:
