@@ -25,7 +25,6 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_switch import RecoverySwitch
-from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
@@ -188,26 +187,18 @@ class Balancing(ClosedLoop):
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self._rate_features = safe_set.rate_features
-        if assessment is not None:
-            self.check_assessment()
-            assessor = builder.AddNamedSystem(
-                "safety_assessor",
-                SafetyAssessor(assessment, period_s=parameters.recovery.assessment_period_s),
-            )
+        assessor = self.add_assessor(
+            builder,
+            period_s=parameters.recovery.assessment_period_s,
+            state=assessor_observer.GetOutputPort("state"),
+            desired_preview=desired_preview,
+            features=features.GetOutputPort("features"),
+        )
+        if assessor is not None and recovery:
             builder.Connect(
-                assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
+                assessor.GetOutputPort(self.trigger_port),
+                switch.GetInputPort("safety_probability"),
             )
-            builder.Connect(desired_preview, assessor.GetInputPort("desired_preview"))
-            builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
-            if recovery:
-                builder.Connect(
-                    assessor.GetOutputPort(self.trigger_port),
-                    switch.GetInputPort("safety_probability"),
-                )
-            for i in range(assessor.num_output_ports()):
-                port = assessor.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
-
         elif recovery:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(assessor_observer.GetOutputPort("state"), "state")

@@ -29,7 +29,6 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.state_plane import StatePlane
 from drake_safety.systems.plan_features import PlanFeatures
-from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 
@@ -106,19 +105,13 @@ class Pendulum(ClosedLoop):
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
         self.feature_names = features.feature_names
         self.constraint_names = monitor.constraint_names
-        if assessment is not None:
-            self.check_assessment()
-            assessor = builder.AddNamedSystem(
-                "safety_assessor", SafetyAssessor(assessment, period_s=scenario.control_period_s)
-            )
-            builder.Connect(plant_state, assessor.GetInputPort("state"))
-            builder.Connect(
-                planner.GetOutputPort("desired_preview"), assessor.GetInputPort("desired_preview")
-            )
-            builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
-            for i in range(assessor.num_output_ports()):
-                port = assessor.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
+        self.add_assessor(
+            builder,
+            period_s=scenario.control_period_s,
+            state=plant_state,
+            desired_preview=planner.GetOutputPort("desired_preview"),
+            features=features.GetOutputPort("features"),
+        )
         builder.ExportOutput(plant_state, "state")
         builder.ExportOutput(plant_state, "true_state")
         builder.ExportOutput(observer.GetOutputPort("output"), "output")

@@ -30,7 +30,6 @@ from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.push_source import PushSource
-from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 from drake_safety.systems.whole_body_controller import WholeBodyController
@@ -208,20 +207,13 @@ class Reaching(ClosedLoop):
         self.named_targets = parameters.named_targets
         self.pushes = parameters.pushes
         self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
-        if assessment is not None:
-            self.check_assessment()
-            assessor = builder.AddNamedSystem(
-                "safety_assessor",
-                SafetyAssessor(assessment, period_s=parameters.assessment_period_s),
-            )
-            builder.Connect(
-                assessor_observer.GetOutputPort("state"), assessor.GetInputPort("state")
-            )
-            builder.Connect(desired_preview, assessor.GetInputPort("desired_preview"))
-            builder.Connect(features.GetOutputPort("features"), assessor.GetInputPort("features"))
-            for i in range(assessor.num_output_ports()):
-                port = assessor.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
+        self.add_assessor(
+            builder,
+            period_s=parameters.assessment_period_s,
+            state=assessor_observer.GetOutputPort("state"),
+            desired_preview=desired_preview,
+            features=features.GetOutputPort("features"),
+        )
         builder.ExportOutput(assessor_observer.GetOutputPort("state"), "state")
         builder.ExportOutput(true_observer.GetOutputPort("state"), "true_state")
         builder.ExportOutput(observer.GetOutputPort("output"), "output")

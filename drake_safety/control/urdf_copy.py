@@ -134,7 +134,8 @@ class UrdfCopy:
         own_joints, their_joints = self._joint_origins(), other._joint_origins()
         for colour in other.root.iter("material"):
             # A colour of the same name may be another one here.
-            colour.set("name", f"visuals_{colour.get('name', '')}")
+            if colour.get("name"):
+                colour.set("name", f"visuals_{colour.get('name')}")
         self.root.extend(other.root.findall("material"))
         links = {link.get("name", ""): link for link in self.root.findall("link")}
         for theirs in other.root.findall("link"):

@@ -19,6 +19,8 @@ from drake_safety.simulation.rollouts import (
 )
 from drake_safety.simulation.scenario import Scenario
 
+THRESHOLD = 0.5
+"""From this on Γ says safe."""
 CONFIDENT = 0.9
 """Γ is confident above this, and below one minus this."""
 
@@ -141,7 +143,9 @@ def _outcomes(
     return found
 
 
-def agreement(is_safe: np.ndarray, probability: np.ndarray, threshold: float = 0.5) -> Agreement:
+def agreement(
+    is_safe: np.ndarray, probability: np.ndarray, threshold: float = THRESHOLD
+) -> Agreement:
     """Compares Γ with the truth on a grid.
 
     Args:
@@ -159,7 +163,7 @@ def agreement(is_safe: np.ndarray, probability: np.ndarray, threshold: float = 0
     says_safe = probability >= threshold
     union = np.count_nonzero(is_safe | says_safe)
     shared = np.count_nonzero(is_safe & says_safe)
-    wrong = np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
+    wrong = _is_confidently_wrong(is_safe, probability)
     depth = boundary_distance(is_safe)
     return Agreement(
         threshold=threshold,
@@ -183,8 +187,8 @@ def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dic
     first = segments.take(segments.is_first)
     state = first.state if assessment.uses_features else first.true_state
     probability = assessment.predict(state, first.desired_preview, first.features).normalized
-    is_safe, says_safe = ~first.is_unsafe, probability >= 0.5
-    wrong = np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
+    is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD
+    wrong = _is_confidently_wrong(is_safe, probability)
     return {
         "safe_share": proportion(int(is_safe.sum()), len(first)),
         "intersection_over_union": proportion(
@@ -192,6 +196,10 @@ def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dic
         ),
         "confident_errors": proportion(int(wrong.sum()), len(first)),
     }
+
+
+def _is_confidently_wrong(is_safe: np.ndarray, probability: np.ndarray) -> np.ndarray:
+    return np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
 
 
 def boundary_distance(is_safe: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.control.observation import is_rate
 from drake_safety.simulation.contract import (
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
     from drake_safety.simulation.state_plane import StatePlane
+    from drake_safety.systems.safety_assessor import SafetyAssessor
 
 __all__ = ["ASSESSMENT_PORTS", "RECORDED_PORTS", "REQUIRED_PORTS", "ClosedLoop"]
 
@@ -144,6 +145,48 @@ class ClosedLoop(Diagram):
                     f"assessment and diagram differ in {what}: the assessment was learned with "
                     f"{learned}, the diagram has {here}"
                 )
+
+    def add_assessor(
+        self,
+        builder: DiagramBuilder,
+        *,
+        period_s: float,
+        state: OutputPort,
+        desired_preview: OutputPort,
+        features: OutputPort,
+    ) -> SafetyAssessor | None:
+        """Adds the assessor, if there is Γ, and exports what it says.
+
+        To be called when the names of what the ports carry are set.
+
+        Args:
+            builder: Of the task's diagram.
+            period_s: Time between two of its looks [s].
+            state: As it sees it.
+            desired_preview: The coming desired outputs.
+            features: As it sees them.
+
+        Returns:
+            The assessor; None without Γ.
+
+        Raises:
+            ValueError: The assessment was learned from something else.
+        """
+        if self.assessment is None:
+            return None
+        from drake_safety.systems.safety_assessor import SafetyAssessor
+
+        self.check_assessment()
+        assessor = builder.AddNamedSystem(
+            "safety_assessor", SafetyAssessor(self.assessment, period_s=period_s)
+        )
+        inputs = {"state": state, "desired_preview": desired_preview, "features": features}
+        for name, port in inputs.items():
+            builder.Connect(port, assessor.GetInputPort(name))
+        for i in range(assessor.num_output_ports()):
+            port = assessor.get_output_port(i)
+            builder.ExportOutput(port, port.get_name())
+        return assessor
 
     @property
     def target_box(self) -> np.ndarray | None:
