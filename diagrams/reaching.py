@@ -1,7 +1,6 @@
 """Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,11 +12,11 @@ from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
-from drake_safety.control.mirror import Mirror
 from drake_safety.control.obstacles import Clearance
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.control.robot import ObservationNoise, model_file
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
+from drake_safety.diagrams.reaching_side import ReachingSide
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
@@ -88,10 +87,12 @@ class Reaching(ClosedLoop):
         if not robot.reaching_frames:
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
         self._is_exploring = exploring
+        nominal = scenario.variation("nominal")
+        kinematics = RobotKinematics(robot, nominal)
+        self.kinematics = kinematics
         trained_hand = parameters.hand or next(iter(robot.reaching_frames))
-        self.hand = trained_hand if hand is None else hand
-        for name in (trained_hand, self.hand):
-            robot.reaching_frame(name)
+        self._side = ReachingSide(kinematics, trained_hand, hand, scenario_name=scenario.name)
+        self.hand, self.mirror = self._side.hand, self._side.mirror
         builder = DiagramBuilder()
 
         physics = add_physics(
@@ -106,18 +107,8 @@ class Reaching(ClosedLoop):
         self.plant, self.robot, self.robot_instance = physics.plant, robot, physics.instance
         self.scene_graph = physics.scene_graph
 
-        nominal = scenario.variation("nominal")
-        kinematics = RobotKinematics(robot, nominal)
-        self.kinematics = kinematics
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
         plant_state = physics.state
-        self.mirror = None if self.hand == trained_hand else Mirror(kinematics)
-        if self.mirror is not None and self.mirror.hand(trained_hand) != self.hand:
-            raise ValueError(
-                f"reaching: scenario '{scenario.name}' is about hand '{trained_hand}' of robot "
-                f"'{robot.name}' and its mirror image '{self.mirror.hand(trained_hand)}'; got "
-                f"'{self.hand}'"
-            )
 
         noise = self.variation.observation_noise
         self._observers = Observers(
@@ -238,29 +229,19 @@ class Reaching(ClosedLoop):
     @property
     def target_box(self) -> np.ndarray:
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
-        return np.sort(self._of_this_hand(self.scenario.parameters.target.box), axis=0)
+        return np.sort(self._side.points(self.scenario.parameters.target.box), axis=0)
 
     @property
     def fair_box(self) -> np.ndarray:
         """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
         parameters = self.scenario.parameters
-        return np.sort(self._of_this_hand(parameters.fair.box(parameters.target)), axis=0)
-
-    def _of_this_hand(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) that are told of the trained hand, or the other way round."""
-        return points if self.mirror is None else self.mirror.points(points)
-
-    def _push_of_this_hand(self, push: Push) -> Push:
-        force_n = self._of_this_hand(np.array(push.force_n))
-        return replace(push, force_n=force_n.tolist())
+        return np.sort(self._side.points(parameters.fair.box(parameters.target)), axis=0)
 
     @property
     def mirror_options(self) -> dict[str, str]:
         """The hand on the other side, if the robot has one there."""
-        try:
-            return {"hand": Mirror(self.kinematics).hand(self.hand)}
-        except ValueError:  # No mirror, or nothing in it.
-            return {}
+        other = self._side.other_hand
+        return {} if other is None else {"hand": other}
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """The target of an episode in the world, (3,) [m], as exact as feet are placed."""
@@ -278,7 +259,7 @@ class Reaching(ClosedLoop):
         # The preview carries no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        shape = self._of_this_hand(plan_shape(preview, self.scenario.step_s, duration_s))
+        shape = self._side.points(plan_shape(preview, self.scenario.step_s, duration_s))
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
@@ -315,17 +296,17 @@ class Reaching(ClosedLoop):
         detour = push = None
         noise_rng = rng.spawn(1)[0]
         if goal is None:
-            goal = self._of_this_hand(drawn)
+            goal = self._side.points(drawn)
             if self._is_exploring:
                 push = parameters.random_pushes.sample(rng, self.robot.base)
                 detour = parameters.detours.sample(rng)
         if detour is not None:
-            detour = self._of_this_hand(detour)
+            detour = self._side.points(detour)
         self._set(context, q, goal, detour)
         self._observers.reseed(context, noise_rng)
         if push is None:
             return 0
-        self.set_push(context, self._push_of_this_hand(push))
+        self.set_push(context, self._side.push(push))
         end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
@@ -350,7 +331,7 @@ class Reaching(ClosedLoop):
     def sample_push(self, rng: np.random.Generator) -> Push:
         """A push as episodes begin with it, whatever their share."""
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
-        return self._push_of_this_hand(push)
+        return self._side.push(push)
 
     @property
     def rate_names(self) -> list[str]:
@@ -369,7 +350,7 @@ class Reaching(ClosedLoop):
         ends = [planned.value(time).ravel() for time in (start, end)]
         plans = [planned]
         for _ in range(num_plans - 1):
-            detour = self._of_this_hand(detours.draw(rng))
+            detour = self._side.points(detours.draw(rng))
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
 
