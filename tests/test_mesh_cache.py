@@ -54,6 +54,7 @@ def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):
         ("newmtl a\nKd 1 0 0\n", True, True),
         ("newmtl a\nTr 0.0\n", True, True),
         ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True, True),
+        ("newmtl a\nTr lots\n", True, True),
         ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False, False),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import tempfile
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,7 @@ SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
 """Formats that Drake shows as they are."""
 CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
 """Environment variable that names the cache's folder."""
+_TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # Of an MTL file.
 _GREY = [0.6, 0.6, 0.6, 1.0]
 _VERSION = b"3"  # Of the conversion: another one converts again.
 
@@ -60,9 +62,8 @@ def _is_transparent(materials: Path) -> bool:
     """Whether none of the materials of an MTL file lets anything be seen."""
     if not materials.is_file():
         return False
-    words = [line.split() for line in materials.read_text("utf-8", "replace").splitlines()]
-    opacities = [1.0 - float(line[1]) for line in words if len(line) == 2 and line[0] == "Tr"]
-    return bool(opacities) and max(opacities) <= 0.0
+    found = _TRANSPARENCY.findall(materials.read_text("utf-8", "replace"))
+    return bool(found) and min(map(float, found)) >= 1.0
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:

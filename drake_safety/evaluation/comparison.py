@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -145,7 +145,7 @@ def compare_scenario(
     return row
 
 
-def row_figure(row: dict[str, Any], name: str) -> Figure | None:
+def row_figure(row: Mapping[str, Any], name: str) -> Figure | None:
     """A figure of a row; None where the study had nothing to say."""
     stored = row.get(name)
     if not isinstance(stored, dict) or stored["value"] is None:

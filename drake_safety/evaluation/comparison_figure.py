@@ -69,10 +69,10 @@ def comparison_figure(
 def _words(row: Mapping[str, Any]) -> list[str]:
     """What is said of a row."""
     words = []
-    auc = row_figure(dict(row), "auc")
+    auc = row_figure(row, "auc")
     if auc is not None:
         words.append(f"AUC at planning time {auc.value:.3f}")
-    ends = [row_figure(dict(row), f"falls_{how}_recovery") for how in ("without", "with")]
+    ends = [row_figure(row, f"falls_{how}_recovery") for how in ("without", "with")]
     if None not in ends:
         before, after = (100 * end.value for end in ends if end is not None)
         words.append(f"falls {before:.0f} % → {after:.1f} %")
