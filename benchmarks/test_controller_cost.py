@@ -21,10 +21,10 @@ from pydrake.trajectories import PiecewisePolynomial
 from threadpoolctl import threadpool_limits
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import actuation_matrix, add_robot
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import SOLVED, WholeBodyQP, build_qp, solve_qp
 from drake_safety.models import load_robot
+from drake_safety.robots.robot import actuation_matrix, add_robot
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 ROBOT, HAND = "atlas", "left"

@@ -10,9 +10,9 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.simulation.balls import Throw
+from drake_safety.live.session import TICK_S, LiveGoals, LiveSession, LiveThrows
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.live_session import TICK_S, LiveGoals, LiveSession, LiveThrows
 
 DURATION_S, ROUNDS = 3.0, 3
 BALL = Throw(mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.3)  # One that it has to step for.

@@ -13,11 +13,11 @@ from pydrake.systems.framework import DiagramBuilder
 from threadpoolctl import threadpool_limits
 
 from drake_safety import Scenario, run_episodes
-from drake_safety.control.robot import add_robot
 from drake_safety.models import load_robot
-from drake_safety.simulation.balls import add_ball
+from drake_safety.plants.balls import add_ball
+from drake_safety.plants.ground import add_ground
+from drake_safety.robots.robot import add_robot
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.ground import add_ground
 
 NUM_EPISODES = 24  # Candidates for the comparison with the bare plant.
 ROUNDS = 3

@@ -9,17 +9,17 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import ObservationNoise
-from drake_safety.control.robot_model import by_pattern
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.diagrams.balancing_parameters import BalancingParameters, fitted_to_robot
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
+from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene, add_physics
+from drake_safety.robots.robot import ObservationNoise
+from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.physics import ENGINES_WITH_BALLS, Scene, add_physics
 from drake_safety.simulation.sampling import Start, calm_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController

@@ -5,9 +5,9 @@ from typing import Any
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.control.robot_size import RobotSize, overlaid, scaled_defaults
 from drake_safety.control.safe_sets import BalanceLimits
-from drake_safety.simulation.balls import Throw
-from drake_safety.simulation.robot_size import RobotSize, overlaid, scaled_defaults
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 

@@ -15,7 +15,6 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Saturation, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.robot import PlantVariation
 from drake_safety.diagrams.pendulum_parameters import GRAVITY, PendulumParameters
 from drake_safety.diagrams.pendulum_systems import (
     PendulumController,
@@ -24,6 +23,7 @@ from drake_safety.diagrams.pendulum_systems import (
     bob_position,
 )
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario

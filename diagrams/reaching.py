@@ -12,20 +12,20 @@ from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
-from drake_safety.control.obstacles import Clearance
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
-from drake_safety.control.robot import ObservationNoise, model_file
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
 from drake_safety.diagrams.reaching_side import ReachingSide
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot, robot_files
+from drake_safety.plants.obstacles import Clearance
+from drake_safety.plants.physics import Scene, add_physics
+from drake_safety.plants.pushes import Push
+from drake_safety.robots.robot import ObservationNoise, model_file
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.physics import Scene, add_physics
 from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
-from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.push_source import PushSource

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drake_safety.control.obstacles import Obstacle
 from drake_safety.control.reaching_safe_set import ReachingLimits
-from drake_safety.simulation.pushes import Push, RandomPushes
+from drake_safety.plants.obstacles import Obstacle
+from drake_safety.plants.pushes import Push, RandomPushes
 from drake_safety.simulation.reaching_sampling import (
     Detours,
     FairTargets,

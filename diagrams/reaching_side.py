@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
-from drake_safety.simulation.pushes import Push
+from drake_safety.plants.pushes import Push
 
 
 class ReachingSide:

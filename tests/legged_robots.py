@@ -11,8 +11,8 @@ from pathlib import Path
 import yaml
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot_model import RobotModel, load_robot_file
 from drake_safety.models import load_robot
+from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
 
 def _link(name, mass, size, centre, collisions=()):

@@ -8,8 +8,8 @@ from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
 from drake_safety import load_scenario
-from drake_safety.control.robot import PlantVariation
 from drake_safety.logs.robot_log import RobotLog
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.rollouts import episode_rng
 
 ORIGIN_NS = 1_700_000_000_123_000_000

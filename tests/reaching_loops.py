@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from drake_safety import load_scenario, run_episode
-from drake_safety.control.robot import PlantVariation
+from drake_safety.robots.robot import PlantVariation
 from legged_robots import write_porter
 
 SCENES = "package://drake_safety_models/scenes"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import parse_scenario
 
 SIDES = {"left": 1.0, "right": -1.0}

@@ -17,8 +17,8 @@ from drake_safety.cli.targets import join_targets, parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.planning.goal_verdict import assess_goal, goal_inputs
 from drake_safety.simulation.goal_motion import GoalMotion
-from drake_safety.simulation.planning import assess_goal, goal_inputs
 from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import load_scenario
 

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS
 from drake_safety.simulation.rollouts import Recorder
 from drake_safety.simulation.scenario import parse_scenario

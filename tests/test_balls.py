@@ -10,8 +10,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.robot import add_robot
-from drake_safety.simulation.balls import Ball, Throw, add_ball
+from drake_safety.plants.balls import Ball, Throw, add_ball
+from drake_safety.robots.robot import add_robot
 from legged_robots import robot_model
 
 TIME_STEP_S = 0.0005

@@ -22,8 +22,8 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.evaluation import figure_style, planning_study
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation import rollouts
-from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO

@@ -8,7 +8,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import (
     ASSESSMENT_PORTS,
     REQUIRED_PORTS,

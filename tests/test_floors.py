@@ -16,25 +16,18 @@ ROOT = Path(__file__).resolve().parents[1]
 # room imports `diagrams`.
 ALLOWED = {
     "learning": set(),
-    "control": set(),
+    "robots": set(),
     "assessments": {"learning"},
-    "models": {"control"},
-    "systems": {"learning", "control"},
-    "simulation": {"systems", "learning", "control", "models"},
-    "logs": {"simulation", "systems", "learning", "control"},
-    "evaluation": {"simulation", "systems", "learning", "control", "models"},
-    "diagrams": {"simulation", "systems", "control", "learning", "models"},
-    "cli": {
-        "logs",
-        "evaluation",
-        "simulation",
-        "systems",
-        "learning",
-        "control",
-        "models",
-        "assessments",
-    },
+    "models": {"robots"},
+    "plants": {"robots"},
+    "control": {"plants", "robots"},
+    "systems": {"learning", "control", "plants", "robots"},
 }
+ALLOWED["simulation"] = {*ALLOWED["systems"], "systems", "models"}
+ALLOWED["planning"] = {*ALLOWED["simulation"], "simulation"}
+ALLOWED["diagrams"] = ALLOWED["logs"] = ALLOWED["planning"]
+ALLOWED["evaluation"] = ALLOWED["live"] = {*ALLOWED["planning"], "planning"}
+ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessments"}
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
@@ -42,14 +35,14 @@ HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
 # What only an extra brings, and the files that may import it.
 EXTRAS = {
     "logs": "drake_safety/logs/",
-    "mujoco": "drake_safety/control/mujoco",
-    "robots": "drake_safety/control/mesh_cache",
+    "mujoco": "drake_safety/plants/mujoco",
+    "robots": "drake_safety/robots/mesh_cache",
 }
 ONLY_IN = {
     "torch": "drake_safety/learning/embedding.py",
     "tslearn": "drake_safety/learning/distance.py",
     "dtaidistance": "drake_safety/learning/distance.py",
-    "mujoco": "drake_safety/control/mujoco_model.py",
+    "mujoco": "drake_safety/plants/mujoco_model.py",
 }
 PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}
@@ -138,7 +131,7 @@ def upward_imports(source, name):
         elif target not in {None, room} | ALLOWED.get(room, set()):
             offences.append(f"{name}:{line} in {room} imports {dotted}")
         elif room == "models" and target == "control":
-            if not dotted.startswith("drake_safety.control.robot"):
+            if not dotted.startswith("drake_safety.robots.robot"):
                 offences.append(f"{name}:{line} in models imports {dotted}")
     return offences
 
@@ -300,7 +293,7 @@ def test_a_folder_of_a_robot_is_no_python_package():
         (
             upward_imports,
             "drake_safety/learning/a.py",
-            "def f():\n    from drake_safety.control import robot",
+            "def f():\n    from drake_safety.robots import robot",
             "learning",
         ),
         (
@@ -347,7 +340,7 @@ def test_each_rule_catches_its_offence(rule, name, source, message):
     [
         (upward_imports, "drake_safety/cli/a.py", "from drake_safety.evaluation import report"),
         (upward_imports, "drake_safety/systems/a.py", "from . import b\nfrom ..control import c"),
-        (upward_imports, "models/__init__.py", "from drake_safety.control.robot import x"),
+        (upward_imports, "models/__init__.py", "from drake_safety.robots.robot import x"),
         (upward_imports, "drake_safety/cli/a.py", "from drake_safety import __version__"),
         (
             forbidden_imports,

@@ -5,8 +5,8 @@ import pytest
 
 from drake_safety.learning.gradients import logit_gradient
 from drake_safety.learning.trained_maps import Embedding
-from drake_safety.simulation.goal_descent import descend_to_accepted, suggest_goal
-from drake_safety.simulation.planning import nearest_accepted_goal
+from drake_safety.planning.goal_descent import descend_to_accepted, suggest_goal
+from drake_safety.planning.goal_verdict import nearest_accepted_goal
 from goal_field import BOX, FieldAssessment, GoalTask
 
 GOAL = np.array([0.9, 0.5, 1.5])

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.goal_motion import run_to_goal
-from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.scenario import load_scenario
 
 SCENARIO = "atlas_reaching"

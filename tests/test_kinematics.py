@@ -7,8 +7,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
-from drake_safety.control.robot import PlantVariation, add_robot
-from drake_safety.control.robot_model import RobotModel, load_robot_file
+from drake_safety.robots.robot import PlantVariation, add_robot
+from drake_safety.robots.robot_model import RobotModel, load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_kinematics, robot_model, write_hexapod
 
 G = 9.81

@@ -10,8 +10,8 @@ from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli import main
-from drake_safety.simulation.live_panel import UNSAFE_RGB, LivePanel, picture_board, words_picture
-from drake_safety.simulation.live_session import (
+from drake_safety.live.panel import UNSAFE_RGB, LivePanel, picture_board, words_picture
+from drake_safety.live.session import (
     PROBABILITY,
     STOP,
     TICK_S,

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from drake_safety.control.mesh_cache import cache_folder, has_own_colours, is_shown, shown_mesh
+from drake_safety.robots.mesh_cache import cache_folder, has_own_colours, is_shown, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
 

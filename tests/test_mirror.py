@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
-from drake_safety.control.robot_model import load_robot_file
 from drake_safety.models import load_robot, robot_names
+from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import robot_kinematics, write_biped, write_hexapod
 
 SYMMETRIC = [name for name in robot_names() if load_robot(name).mirror]

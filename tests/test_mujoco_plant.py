@@ -9,8 +9,8 @@ from pydrake.systems.analysis import Simulator
 
 import reaching_loops
 from drake_safety import load_scenario, run_episode, run_episodes
-from drake_safety.control.robot import PlantVariation
-from drake_safety.simulation.pushes import Push
+from drake_safety.plants.pushes import Push
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import parse_scenario
 from drake_safety.simulation.throws import ViolationCounter
 from legged_robots import robot_kinematics

@@ -9,7 +9,7 @@ import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import app
-from drake_safety.simulation.robot_template import write_robot
+from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
 from urdf_files import stl

@@ -13,7 +13,7 @@ from drake_safety.control.observation import (
     stance_state,
     state_names,
 )
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 from legged_robots import ROBOT_NAMES, robot_kinematics
 
 

@@ -4,7 +4,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 from drake_safety.simulation.observers import Observers, combined
 from legged_robots import robot_kinematics
 

@@ -8,7 +8,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.obstacles import (
+from drake_safety.plants.ground import add_ground
+from drake_safety.plants.obstacles import (
     Clearance,
     Obstacle,
     add_obstacles,
@@ -16,9 +17,8 @@ from drake_safety.control.obstacles import (
     collision_geometries,
     filter_collisions,
 )
-from drake_safety.control.robot import add_robot
-from drake_safety.control.robot_model import load_robot_file
-from drake_safety.simulation.ground import add_ground
+from drake_safety.robots.robot import add_robot
+from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import HAND_RADIUS_M, robot_kinematics, robot_model, write_porter
 
 SIZE = np.array([0.3, 0.8, 0.1])

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drake_safety.planning.plan_choice import choose_plan, plan_inputs
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.plan_choice import choose_plan, plan_inputs
 from drake_safety.simulation.rollouts import run_episode
 from goal_field import FieldAssessment
 from shuttle_task import shuttling

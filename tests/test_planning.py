@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.planning import (
+from drake_safety.planning.goal_verdict import (
     SAFE,
     UNKNOWN,
     UNSAFE,
@@ -18,6 +17,7 @@ from drake_safety.simulation.planning import (
     nearest_accepted_goal,
     on_grid,
 )
+from drake_safety.simulation.closed_loop import ClosedLoop
 from goal_field import BOX, FieldAssessment, GoalTask
 
 INSIDE = np.array([0.5, 0.0, 1.0])

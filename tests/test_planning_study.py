@@ -5,8 +5,8 @@ import pytest
 
 from drake_safety.evaluation import planning_study as planning_study_module
 from drake_safety.evaluation.planning_study import planning_study, run_trials
+from drake_safety.planning.plan_choice import plan_inputs
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.plan_choice import plan_inputs
 from drake_safety.simulation.rollouts import episode_rng
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drake_safety.control.safe_sets import BalanceSafeSet
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation import pushed_motions
-from drake_safety.simulation.balls import Throw
 from drake_safety.simulation.pushed_motions import run_pushed_motion, run_pushed_motions
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import ThrowLog

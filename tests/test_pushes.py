@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.simulation.pushes import Push, RandomPushes
+from drake_safety.plants.pushes import Push, RandomPushes
 
 
 def test_a_push_is_as_strong_as_its_force_is_long():

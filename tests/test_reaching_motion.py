@@ -8,8 +8,8 @@ from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episo
 from drake_safety.control.kinematic_preview import chain_joints
 from drake_safety.control.whole_body_qp import solve_qp
 from drake_safety.learning.segments import DIVERGED
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.reaching_sampling import PostureSampling
 from drake_safety.systems import whole_body_controller
 from reaching_loops import (

@@ -13,8 +13,8 @@ import typer
 import yaml
 
 from drake_safety.cli import app
-from drake_safety.control.robot_model import load_robot_file
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.simulation.scenario import load_scenario, parse_scenario, task_names
 from legged_robots import write_hexapod
 

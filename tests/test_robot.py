@@ -8,7 +8,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.robot import (
+from drake_safety.robots.robot import (
     Payload,
     PlantVariation,
     actuation_matrix,
@@ -21,7 +21,7 @@ from drake_safety.control.robot import (
     require_motors,
     servo_joints,
 )
-from drake_safety.control.robot_model import by_pattern, load_robot_file
+from drake_safety.robots.robot_model import by_pattern, load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
 
 

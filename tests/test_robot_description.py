@@ -10,10 +10,10 @@ from pydrake.geometry import Box, Capsule, Role, Sphere
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control import model_files, urdf_copy
-from drake_safety.control.model_files import MissingExtraError, model_file
-from drake_safety.control.robot import add_robot
-from drake_safety.control.robot_model import load_robot_file
+from drake_safety.robots import model_files, urdf_copy
+from drake_safety.robots.model_files import MissingExtraError, model_file
+from drake_safety.robots.robot import add_robot
+from drake_safety.robots.robot_model import load_robot_file
 
 URDF = """<robot name="stool">
 <material name="red"><color rgba="1 0 0 1"/></material>

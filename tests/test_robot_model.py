@@ -2,7 +2,8 @@
 
 import pytest
 
-from drake_safety.control.robot_model import (
+from drake_safety.models import load_robot, robot_names
+from drake_safety.robots.robot_model import (
     Foot,
     ReachingFrame,
     RobotModel,
@@ -11,7 +12,6 @@ from drake_safety.control.robot_model import (
     by_pattern,
     load_robot_file,
 )
-from drake_safety.models import load_robot, robot_names
 from legged_robots import edited, write_biped, write_hexapod
 
 

@@ -5,8 +5,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.model_files import MissingExtraError
 from drake_safety.models import load_robot, robot_names
+from drake_safety.robots.model_files import MissingExtraError
 from drake_safety.simulation.sampling import calm_start
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.throws import ViolationCounter
@@ -76,7 +76,7 @@ def test_every_joint_is_driven_and_the_ranges_are_of_its_size(name):
 
 
 def test_without_the_extra_a_scenario_says_what_to_install(monkeypatch):
-    from drake_safety.control import model_files
+    from drake_safety.robots import model_files
 
     monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):
@@ -85,7 +85,7 @@ def test_without_the_extra_a_scenario_says_what_to_install(monkeypatch):
 
 def test_without_the_extra_the_list_of_scenarios_says_which_need_it(monkeypatch, capsys):
     from drake_safety.cli.scenarios import scenarios
-    from drake_safety.control import model_files
+    from drake_safety.robots import model_files
 
     monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
     monkeypatch.setenv("COLUMNS", "200")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.control.robot import PlantVariation
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
 from gliding_task import SCENARIO, Gliding

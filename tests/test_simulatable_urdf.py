@@ -9,7 +9,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.simulatable_urdf import simulatable_copy
+from drake_safety.robots.simulatable_urdf import simulatable_copy
 from urdf_files import GOOD, LINK, mesh, stl, written
 
 TRIANGLE = [[0, 0, 0], [2, 0, 0], [0, 1, 4]]

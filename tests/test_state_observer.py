@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform
 
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import add_noise, stance_state
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 from drake_safety.systems.state_observer import StateObserver
 from legged_robots import ROBOT_NAMES, robot_kinematics
 

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 
-from drake_safety.control import robot_description
-from drake_safety.control.model_files import is_installed
 from drake_safety.evaluation.stills import (
     StillCamera,
     render_stills,
@@ -10,6 +8,8 @@ from drake_safety.evaluation.stills import (
     stack_positions,
     still_times,
 )
+from drake_safety.robots import robot_description
+from drake_safety.robots.model_files import is_installed
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.view import View
 

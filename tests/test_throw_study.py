@@ -12,7 +12,7 @@ from drake_safety.evaluation.throw_study import (
     evaluate_throws,
 )
 from drake_safety.evaluation.throws_figure import OUTCOMES
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.throws import ThrowLog
 
 IMPACT_S, LEAVE_S, FALL_S = 0.5, 0.8, 1.0

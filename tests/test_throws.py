@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.observation import quaternion_of
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throw, run_throws, trigger_time
 

@@ -6,7 +6,7 @@ from matplotlib.colors import to_hex
 
 from drake_safety.evaluation.figure_style import BALL_COLOUR, RECOVERY_COLOUR
 from drake_safety.evaluation.timeline_figure import timeline_figure
-from drake_safety.simulation.pushes import Push
+from drake_safety.plants.pushes import Push
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.robot import PlantVariation
 from drake_safety.control.whole_body_model import PointReference
 from drake_safety.control.whole_body_qp import build_qp, solve_qp
 from drake_safety.models import load_robot, robot_names
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.systems.whole_body_controller import NOT_FINITE, WholeBodyController
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
 from whole_body_loop import PERIOD_S, WholeBodyLoop

@@ -7,8 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.control.kinematics import RobotKinematics, planar_pose
-from drake_safety.control.robot_model import load_robot_file
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
+from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_kinematics, robot_model, write_biped
 
 

@@ -13,10 +13,10 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import quaternion_of
-from drake_safety.control.robot import PlantVariation
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import SOLVED, build_qp, solve_qp
 from drake_safety.models import robot_names
+from drake_safety.robots.robot import PlantVariation
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
 
 NAMES = sorted({*ROBOT_NAMES, *robot_names()})

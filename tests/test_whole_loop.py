@@ -7,8 +7,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
-from drake_safety.control.robot import PlantVariation
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.throws import run_throw
 
 HARD = Throw(time_s=0.4, mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.2)

@@ -13,7 +13,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import actuation_matrix, add_robot
+from drake_safety.robots.robot import actuation_matrix, add_robot
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 TIME_STEP_S = 0.002

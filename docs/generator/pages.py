@@ -18,7 +18,17 @@ sys.path.insert(0, str(Path(__file__).parent))
 from system_block import parse_block
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("learning", "control", "simulation", "logs", "evaluation")
+ROOMS = (
+    "learning",
+    "robots",
+    "control",
+    "plants",
+    "simulation",
+    "planning",
+    "logs",
+    "evaluation",
+    "live",
+)
 _OUTWARD = re.compile(r"\[([^\]]*)\]\(\.\./([^)]+)\)")
 
 

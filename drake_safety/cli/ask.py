@@ -33,7 +33,7 @@ def ask(
     Tells the belief and the verdict; of a refusal also the likely cause and the nearest target
     that would be accepted. Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    from drake_safety.simulation.planning import assess_goal
+    from drake_safety.planning.goal_verdict import assess_goal
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)

@@ -24,7 +24,7 @@ def new(
 
     What a URDF does not tell is marked ASK in the files, with its unit.
     """
-    from drake_safety.simulation.robot_template import write_robot
+    from drake_safety.robots.robot_template import write_robot
 
     written = write_robot(
         name,

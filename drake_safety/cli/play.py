@@ -12,7 +12,7 @@ from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 
 if TYPE_CHECKING:
-    from drake_safety.simulation.live_session import LiveSession
+    from drake_safety.live.session import LiveSession
 
 
 def play(
@@ -36,7 +36,7 @@ def play(
     """
     from pydrake.geometry import Meshcat, MeshcatParams
 
-    from drake_safety.simulation.live_session import LiveGoals, LiveThrows
+    from drake_safety.live.session import LiveGoals, LiveThrows
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.simulation.balls import Throw
+    from drake_safety.plants.balls import Throw
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.scenario import Scenario
     from drake_safety.simulation.throws import ThrowLog
@@ -171,7 +171,7 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
     Raises:
         ValueError: An unknown key, what is no number, or a ball that cannot be.
     """
-    from drake_safety.simulation.balls import Throw
+    from drake_safety.plants.balls import Throw
 
     throws: list[Throw] = []
     for text in pushes:

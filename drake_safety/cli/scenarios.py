@@ -7,7 +7,7 @@ from drake_safety.cli.console import console, new_table
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
-    from drake_safety.control.model_files import MissingExtraError
+    from drake_safety.robots.model_files import MissingExtraError
     from drake_safety.simulation.scenario import load_scenario, scenario_names
 
     table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")

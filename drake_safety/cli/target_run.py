@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from drake_safety.cli.training_folder import GoalThreshold
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.plants.pushes import Push
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.goal_motion import GoalMotion
-    from drake_safety.simulation.pushes import Push
 
 _MOTION_PORTS = (
     "calibrated_safety_probability",
@@ -48,8 +48,8 @@ def run_to_target(
     Raises:
         ValueError: The task has no goals, or no such target, hand or push.
     """
+    from drake_safety.planning.goal_verdict import assess_goal
     from drake_safety.simulation.goal_motion import run_to_goal
-    from drake_safety.simulation.planning import assess_goal
 
     loop = settings.make_loop()
     goal = parse_target(loop, target)

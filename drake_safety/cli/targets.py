@@ -13,8 +13,8 @@ from drake_safety.cli.console import console, margin_words
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.planning.goal_verdict import GoalVerdict
     from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.planning import GoalVerdict
 
 TARGET = "--target"
 TARGET_HELP = "Where to reach: three numbers in the world [m], or a name that the scenario gives."
@@ -72,7 +72,7 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     Raises:
         ValueError: The task's plans have no goal, no such name, or not three numbers.
     """
-    from drake_safety.simulation.planning import target_box
+    from drake_safety.planning.goal_verdict import target_box
 
     target_box(loop)
     if text in loop.named_targets:
@@ -90,7 +90,7 @@ def nearest_accepted(
     loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
 ) -> GoalVerdict | None:
     """What would be accepted with reserve instead of a target that was refused, if anything."""
-    from drake_safety.simulation.goal_descent import suggest_goal
+    from drake_safety.planning.goal_descent import suggest_goal
 
     return suggest_goal(
         loop,

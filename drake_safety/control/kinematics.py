@@ -10,13 +10,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg.lapack import dposv
 
-from drake_safety.control.robot import (
+from drake_safety.robots.robot import (
     PlantVariation,
     add_robot,
     apply_masses,
     posture_positions,
 )
-from drake_safety.control.robot_model import ReachingFrame, RobotModel
+from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6

@@ -9,7 +9,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 
 
 def quaternion_of(q: np.ndarray) -> Quaternion:

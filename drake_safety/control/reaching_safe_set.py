@@ -14,7 +14,6 @@ from drake_safety.control.kinematics import (
     planar_pose,
 )
 from drake_safety.control.observation import is_rate
-from drake_safety.control.obstacles import Clearance
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
     DIRECTIONS,
@@ -22,6 +21,7 @@ from drake_safety.control.safe_sets import (
     signed_distance_to_polygon,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.plants.obstacles import Clearance
 
 _NUM_PREVIEWED = 8  # Samples of the plan for which the whole body is previewed.
 _GRAVITY = 9.81

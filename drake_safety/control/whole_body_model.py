@@ -10,7 +10,7 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import Frame, RigidBody
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics, fit_stance
-from drake_safety.control.robot_model import ReachingFrame
+from drake_safety.robots.robot_model import ReachingFrame
 
 EQUALITY = 5
 """daqp's word, in ``sense``, for a row whose bounds are equal."""

@@ -7,7 +7,7 @@ from pydrake.multibody.inverse_kinematics import InverseKinematics
 from pydrake.solvers import SnoptSolver
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot_model import RobotModel
+from drake_safety.robots.robot_model import RobotModel
 
 _TOLERANCE_M = 2e-3  # Well above what the solver leaves of a point it can reach.
 

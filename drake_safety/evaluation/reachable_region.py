@@ -13,8 +13,8 @@ from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.planning import goal_inputs
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 

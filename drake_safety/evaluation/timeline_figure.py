@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import GridSpecBase
 
-    from drake_safety.simulation.balls import Throw
-    from drake_safety.simulation.pushes import Push
+    from drake_safety.plants.balls import Throw
+    from drake_safety.plants.pushes import Push
 
 _WIDTH = 12.0  # All sizes are in inches.
 _GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from drake_safety.control.robot_model import load_typed
+from drake_safety.robots.robot_model import load_typed
 
 TIME_UNITS = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 """How many of each are a second."""

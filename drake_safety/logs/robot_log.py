@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot_model import RobotModel
 from drake_safety.logs import checks
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.conversion import (
@@ -27,6 +26,7 @@ from drake_safety.logs.conversion import (
 from drake_safety.logs.log_map import LogMap, load_log_map
 from drake_safety.logs.messages import read_bag, read_mcap
 from drake_safety.logs.tables import read_csv, read_parquet
+from drake_safety.robots.robot_model import RobotModel
 
 FORMATS = (".csv", ".parquet", ".mcap", ".bag")
 """Suffixes of the files that can be read; a folder is a ROS 2 bag."""

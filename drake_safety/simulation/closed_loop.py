@@ -21,9 +21,9 @@ from drake_safety.simulation.view import View
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episode
-    from drake_safety.simulation.balls import Throw
+    from drake_safety.plants.balls import Throw
+    from drake_safety.plants.pushes import Push
     from drake_safety.simulation.episode_start import EpisodeStart
-    from drake_safety.simulation.pushes import Push
     from drake_safety.simulation.scenario import Scenario
     from drake_safety.simulation.state_plane import StatePlane
     from drake_safety.systems.safety_assessor import SafetyAssessor

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.mishap import Mishap
-from drake_safety.simulation.pushes import Push
 from drake_safety.simulation.rollouts import Recorder, episode_rng
 
 _PORTS = ("output", "margins", "plant_state")

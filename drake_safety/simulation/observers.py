@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 from drake_safety.systems.state_observer import StateObserver
 
 

@@ -14,7 +14,7 @@ from drake_safety.control.kinematics import (
     fit_stance,
     planar_pose,
 )
-from drake_safety.simulation.balls import Throw
+from drake_safety.plants.balls import Throw
 from drake_safety.systems.trajectory_planner import interpolate
 
 

@@ -13,9 +13,9 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
 import drake_safety
-from drake_safety.control.robot import PlantVariation
-from drake_safety.control.robot_model import load_typed
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.robots.robot import PlantVariation
+from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 if TYPE_CHECKING:

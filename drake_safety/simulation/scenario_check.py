@@ -12,9 +12,9 @@ from pydrake.geometry import Sphere
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
-from drake_safety.control.robot_model import RobotModel, by_pattern
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.models import load_robot, robot_files
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.contract import Finding, check_contract
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario

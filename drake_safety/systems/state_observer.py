@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import add_noise, stance_state, state_names
-from drake_safety.control.robot import ObservationNoise
+from drake_safety.robots.robot import ObservationNoise
 
 
 class StateObserver(LeafSystem):

@@ -46,7 +46,7 @@ class WholeBodyController(LeafSystem):
         kinematics: The robot as the controller believes it to be.
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
         actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
-            :func:`~drake_safety.control.robot.actuation_matrix`; the joints' own order by
+            :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
             default.
         period_s: Control period [s].
         offset_s: Time of the first tick; commands of what drives it are then fresh [s].

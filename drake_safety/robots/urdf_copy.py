@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.control.mesh_cache import has_own_colours, is_shown, shown_mesh
-from drake_safety.control.model_files import model_file
+from drake_safety.robots.mesh_cache import has_own_colours, is_shown, shown_mesh
+from drake_safety.robots.model_files import model_file
 
 _DRAKE = "http://drake.mit.edu"
 

@@ -9,9 +9,9 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_safety.control.mujoco_model import build_model, import_mujoco, joint_order
-from drake_safety.control.robot import PlantVariation
-from drake_safety.control.robot_model import RobotModel
+from drake_safety.plants.mujoco_model import build_model, import_mujoco, joint_order
+from drake_safety.robots.robot import PlantVariation
+from drake_safety.robots.robot_model import RobotModel
 
 _LOGGER = logging.getLogger("drake_safety")
 _NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
@@ -49,7 +49,7 @@ class MujocoDynamics:
         servos: Whether the command is a joint state for robot.yaml's servos, not torques.
 
     Raises:
-        ValueError: As :func:`~drake_safety.control.mujoco_model.build_model`.
+        ValueError: As :func:`~drake_safety.plants.mujoco_model.build_model`.
     """
 
     def __init__(

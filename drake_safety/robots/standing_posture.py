@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.urdf_survey import Limb, Survey
+from drake_safety.robots.urdf_survey import Limb, Survey
 
 _SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Of the leg's length.
 _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)

@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
-from drake_safety.control.robot import add_to_package_map
+from drake_safety.robots.robot import add_to_package_map
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 _MAX_STEPS = 30_000  # Of sphere tracing.

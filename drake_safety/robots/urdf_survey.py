@@ -14,7 +14,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.robot import add_to_package_map
+from drake_safety.robots.robot import add_to_package_map
 
 _CORNER_RADIUS_M = 0.005  # Of the spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.control.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
-from drake_safety.control.model_files import MissingExtraError, model_file
-from drake_safety.control.urdf_copy import UrdfCopy, number, read_urdf
+from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
+from drake_safety.robots.model_files import MissingExtraError, model_file
+from drake_safety.robots.urdf_copy import UrdfCopy, number, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
 """Of a joint, what Drake ignores with a warning each time that a robot is built."""
@@ -21,7 +21,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     """Reads a URDF, changes what Drake would refuse, and gathers the meshes that go along.
 
     Visual meshes that Drake does not show are converted; see
-    :func:`~drake_safety.control.mesh_cache.shown_mesh`. Those that cannot be are left out, as are
+    :func:`~drake_safety.robots.mesh_cache.shown_mesh`. Those that cannot be are left out, as are
     collision meshes that Drake does not read.
 
     Args:

@@ -23,14 +23,14 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from drake_safety.control.model_files import (
+from drake_safety.robots.model_files import (
     MissingExtraError,
     add_to_package_map,
     is_installed,
     model_file,
 )
-from drake_safety.control.robot_model import CollisionShape, RobotModel, by_pattern
-from drake_safety.control.urdf_copy import UrdfCopy, read_urdf
+from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
+from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.

@@ -11,8 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.gradients import unsafe_logits
-from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.planning import (
+from drake_safety.planning.goal_verdict import (
     RESERVE,
     GoalVerdict,
     assess_goals,
@@ -23,6 +22,7 @@ from drake_safety.simulation.planning import (
     target_box,
     threshold_with_reserve,
 )
+from drake_safety.simulation.closed_loop import ClosedLoop
 
 _DIFFERENCE_M = 1e-3  # Between the goals that tell how inputs change with them.
 _LONGEST_STEP_M = 0.15  # The logit is nearly straight over that much.
@@ -62,7 +62,7 @@ def descend_to_accepted(
     falls as long as Γ, which decides, does not accept.
 
     It finds the nearest accepted goal of one basin, where
-    :func:`~drake_safety.simulation.planning.nearest_accepted_goal` searches everywhere;
+    :func:`~drake_safety.planning.goal_verdict.nearest_accepted_goal` searches everywhere;
     :func:`suggest_goal` does both.
 
     Args:

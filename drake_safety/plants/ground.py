@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 
-from drake_safety.control.robot import add_to_package_map
+from drake_safety.robots.robot import add_to_package_map
 
 # Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
 # is deformable.

@@ -20,15 +20,15 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
-from drake_safety.control.model_files import add_to_package_map as add_to_package_map
-from drake_safety.control.model_files import model_file as model_file
-from drake_safety.control.model_files import models_package_xml as models_package_xml
-from drake_safety.control.robot_description import (
+from drake_safety.robots.model_files import add_to_package_map as add_to_package_map
+from drake_safety.robots.model_files import model_file as model_file
+from drake_safety.robots.model_files import models_package_xml as models_package_xml
+from drake_safety.robots.robot_description import (
     add_description,
     add_stated_shapes,
     ignore_neighbours,
 )
-from drake_safety.control.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 
 ENGINES = ("drake", "mujoco")
 """Physics engines that a plant variation may choose."""

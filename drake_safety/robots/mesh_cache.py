@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.control.model_files import MissingExtraError
+from drake_safety.robots.model_files import MissingExtraError
 
 if TYPE_CHECKING:
     import trimesh

@@ -13,21 +13,21 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
-from drake_safety.simulation.balls import Throw
-from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.goal_descent import suggest_goal
-from drake_safety.simulation.live_panel import (
+from drake_safety.live.panel import (
     INK_RGB,
     RECOVERY_RGB,
     SAFE_RGB,
     UNSAFE_RGB,
     LivePanel,
 )
-from drake_safety.simulation.planning import (
+from drake_safety.planning.goal_descent import suggest_goal
+from drake_safety.planning.goal_verdict import (
     GoalVerdict,
     assess_goal,
     target_box,
 )
+from drake_safety.plants.balls import Throw
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
 TICK_S = 0.04

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.control.robot_model import load_robot_file
-from drake_safety.control.simulatable_urdf import simulatable_copy
-from drake_safety.control.standing_posture import solve_standing_posture
-from drake_safety.control.urdf_copy import JointLimits, UrdfCopy
-from drake_safety.control.urdf_survey import Limb, Survey
-from drake_safety.simulation.scenario_template import TASKS, Sizes, scenario_yaml
+from drake_safety.robots.robot_model import load_robot_file
+from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
+from drake_safety.robots.simulatable_urdf import simulatable_copy
+from drake_safety.robots.standing_posture import solve_standing_posture
+from drake_safety.robots.urdf_copy import JointLimits, UrdfCopy
+from drake_safety.robots.urdf_survey import Limb, Survey
 
 # Servo gains of the balancing task's defaults, whose robot weighs 25.4 kg and stands 0.42 m high:
 # a torque in proportion to mass times height.

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.control.mujoco_dynamics import MujocoDynamics, PointForce
+from drake_safety.plants.mujoco_dynamics import MujocoDynamics, PointForce
 
 
 class MujocoPlant(LeafSystem):
@@ -23,7 +23,7 @@ class MujocoPlant(LeafSystem):
         - state
         - positions
 
-    ``command`` is what :class:`~drake_safety.control.mujoco_dynamics.MujocoDynamics` takes: joint
+    ``command`` is what :class:`~drake_safety.plants.mujoco_dynamics.MujocoDynamics` takes: joint
     torques, or the desired joint state ``[q; v]`` of servos, in the order of the robot's
     velocities. ``applied_spatial_force`` is as a MultibodyPlant's. ``state`` is ``[q; v]`` as of
     the MultibodyPlant, ``positions`` its first half. All of MuJoCo's state, its solver's start

@@ -23,14 +23,17 @@ from pydrake.systems.framework import Context, DiagramBuilder, InputPort, Output
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_safety.control.mujoco_dynamics import MujocoDynamics
-from drake_safety.control.obstacles import (
+from drake_safety.plants.balls import Ball, add_ball
+from drake_safety.plants.ground import add_ground
+from drake_safety.plants.mujoco_dynamics import MujocoDynamics
+from drake_safety.plants.mujoco_plant import MujocoPlant
+from drake_safety.plants.obstacles import (
     Obstacle,
     add_obstacles,
     collision_geometries,
     filter_collisions,
 )
-from drake_safety.control.robot import (
+from drake_safety.robots.robot import (
     PlantVariation,
     actuation_matrix,
     add_robot,
@@ -38,10 +41,7 @@ from drake_safety.control.robot import (
     require_motors,
     servo_matrix,
 )
-from drake_safety.control.robot_model import RobotModel
-from drake_safety.simulation.balls import Ball, add_ball
-from drake_safety.simulation.ground import add_ground
-from drake_safety.systems.mujoco_plant import MujocoPlant
+from drake_safety.robots.robot_model import RobotModel
 
 
 @dataclass(kw_only=True)

@@ -18,8 +18,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.control.robot import add_robot, add_to_package_map, model_file
-from drake_safety.control.robot_model import RobotModel
+from drake_safety.robots.robot import add_robot, add_to_package_map, model_file
+from drake_safety.robots.robot_model import RobotModel
 
 
 @dataclass(kw_only=True)

@@ -21,8 +21,8 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 
-from drake_safety.control.robot import PAYLOAD_RADIUS_M, PlantVariation, model_file
-from drake_safety.control.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, model_file
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 
 if TYPE_CHECKING:
     import mujoco

@@ -1,0 +1,1 @@
+"""Engines behind one face: Drake's plant and MuJoCo's, ground, obstacles, balls and pushes."""
