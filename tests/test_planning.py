@@ -14,9 +14,8 @@ from drake_safety.planning.goal_verdict import (
     UNSAFE,
     assess_goal,
     goal_inputs,
-    nearest_accepted_goal,
-    on_grid,
 )
+from drake_safety.planning.nearest_goal import nearest_accepted_goal, on_grid
 from drake_safety.simulation.closed_loop import ClosedLoop
 from goal_field import BOX, FieldAssessment, GoalTask
 
@@ -43,6 +42,7 @@ def search(gamma, goal, *, seed=0, **options):
         goal,
         threshold=0.5,
         rng=np.random.default_rng(seed),
+        method="search",
         **options,
     )
 

@@ -90,9 +90,9 @@ def nearest_accepted(
     loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
 ) -> GoalVerdict | None:
     """What would be accepted with reserve instead of a target that was refused, if anything."""
-    from drake_safety.planning.goal_descent import suggest_goal
+    from drake_safety.planning.nearest_goal import nearest_accepted_goal
 
-    return suggest_goal(
+    return nearest_accepted_goal(
         loop,
         assessment,
         verdict.goal,

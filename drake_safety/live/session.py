@@ -20,12 +20,12 @@ from drake_safety.live.panel import (
     UNSAFE_RGB,
     LivePanel,
 )
-from drake_safety.planning.goal_descent import suggest_goal
 from drake_safety.planning.goal_verdict import (
     GoalVerdict,
     assess_goal,
     target_box,
 )
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng
@@ -373,7 +373,7 @@ class LiveGoals(LiveSession):
         )
         self.nearest = None
         if is_thorough and not verdict.is_accepted:
-            self.nearest = suggest_goal(
+            self.nearest = nearest_accepted_goal(
                 self.loop,
                 self.assessment,
                 goal,

@@ -1,9 +1,9 @@
-"""Goals judged before anything moves: what Γ says of one, and which one near it Γ accepts."""
+"""Goals judged before anything moves: what Γ says of them."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,18 +14,6 @@ from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.simulation.closed_loop import ClosedLoop
-
-RESERVE = 0.8
-"""Share of the way from the threshold to certainty by which a suggested goal exceeds the threshold.
-
-At the threshold itself as many goals are safe as not: a suggestion must be better than that."""
-
-_FIRST_RADIUS_M = 0.05
-_GROWTH = 1.6  # From one ball of candidates to the next.
-_LAST_CHANCE = (
-    16  # Times as many candidates, all over the region, when no ball had an accepted one.
-)
-_SPREAD = 0.25  # How far these lie from it, as a share of its distance to the goal.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,137 +202,6 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
-def nearest_accepted_goal(
-    loop: ClosedLoop,
-    assessment: SafetyAssessment,
-    goal: np.ndarray,
-    *,
-    threshold: float,
-    rng: np.random.Generator,
-    reserve: float = RESERVE,
-    num_candidates: int = 64,
-    num_rounds: int = 6,
-    resolution_m: float = 1e-3,
-    known: GoalVerdict | None = None,
-) -> GoalVerdict | None:
-    """The goal nearest to a given one that is accepted with reserve, as far as a search finds it.
-
-    With reserve: Γ ≥ threshold + reserve (1 - threshold). The nearest goal lies at the limit that
-    was searched with, and of those at the threshold itself many are unsafe.
-
-    Candidates fill growing balls about the goal, in the end the whole region, until one of them is
-    accepted. From there on the search goes down: a bisection towards the goal, then candidates
-    about the best one and in the ball that it bounds, and so on. All candidates lie on a grid of
-    ``resolution_m``: rounded to it, an accepted goal stays an accepted one.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: What was learned from its episodes.
-        goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
-        threshold: From which Γ, calibrated, on a goal is safe.
-        rng: Source of the candidates.
-        reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
-            is accepted.
-        num_candidates: That are judged at a time.
-        num_rounds: How often candidates are drawn about the best one that was found.
-        resolution_m: Spacing of the grid of candidates [m].
-        known: What is accepted with reserve already: balls grow only as far as that lies, with half
-            as many candidates, and the whole region is not searched.
-
-    Returns:
-        The verdict on it, by the threshold itself; None when the goal is not finite, or nothing in
-        the region is accepted with reserve.
-
-    Raises:
-        ValueError: The reserve is not in [0, 1], or the goal is not three numbers.
-    """
-    stricter = threshold_with_reserve(threshold, reserve)
-    goal = checked_goal(goal)
-    if not np.isfinite(goal).all():
-        return None
-    box = target_box(loop)
-    centre = np.clip(goal, *box)
-
-    def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
-        points = np.unique(on_grid(candidates, resolution_m), axis=0)
-        inside = points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
-        verdicts = assess_goals(loop, assessment, inside, threshold=stricter)
-        accepted = [verdict for verdict in verdicts if verdict.is_accepted]
-        return min(accepted, key=lambda one: _distance(one.goal, goal), default=None)
-
-    best = nearest_of(centre[None])
-    radius, farthest = _FIRST_RADIUS_M, _distance(*box)
-    num_in_ball = num_candidates
-    if known is not None:
-        farthest, num_in_ball = _distance(known.goal, goal), max(num_candidates // 2, 1)
-    while best is None and radius < farthest:
-        best = nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
-        radius *= _GROWTH
-    if known is not None and (best is None or _distance(best.goal, goal) > farthest):
-        best = known
-    if best is None:
-        best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
-    if best is None:
-        return None
-
-    for _ in range(num_rounds):
-        best = _bisected(best, centre, nearest_of, resolution_m)
-        distance = _distance(best.goal, goal)
-        if distance < resolution_m:
-            break
-        about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
-        ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
-        candidates = np.clip(np.concatenate([about, ball]), *box)
-        is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
-        found = nearest_of(candidates[is_nearer])
-        if found is not None and _distance(found.goal, goal) < distance:
-            best = found
-    return replace(best, threshold=threshold)
-
-
-def threshold_with_reserve(threshold: float, reserve: float) -> float:
-    """What Γ has to reach for a goal to be suggested.
-
-    Args:
-        threshold: From which Γ, calibrated, on a goal is safe.
-        reserve: Share of the way from the threshold to certainty, in [0, 1].
-
-    Raises:
-        ValueError: The reserve is not in [0, 1].
-    """
-    if not 0.0 <= reserve <= 1.0:
-        raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
-    return threshold + reserve * max(1.0 - threshold, 0.0)
-
-
-def _bisected(
-    best: GoalVerdict, centre: np.ndarray, nearest_of: Any, resolution_m: float
-) -> GoalVerdict:
-    """Moves an accepted goal straight towards the centre for as long as it stays accepted."""
-    refused = centre
-    while _distance(best.goal, refused) > resolution_m:
-        between = 0.5 * (best.goal + refused)
-        found = nearest_of(between[None])
-        if found is None:
-            refused = between
-        elif _distance(found.goal, centre) < _distance(best.goal, centre):
-            best = found
-        else:
-            break
-    return best
-
-
-def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
-    """The nearest points of the grid that suggested goals lie on.
-
-    Args:
-        points: In the world, (..., 3) [m].
-        resolution_m: Spacing of the grid [m].
-    """
-    # A multiple of the spacing is not yet the number that is read back from its digits.
-    return np.round(np.round(points / resolution_m) * resolution_m, 9)
-
-
 def target_box(loop: ClosedLoop) -> np.ndarray:
     """Lowest and highest corner of the goals that were sampled in training, (2, 3) [m].
 
@@ -374,17 +231,6 @@ def _region(box: np.ndarray) -> str:
         ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in zip("xyz", *box, strict=True))
         + " m"
     )
-
-
-def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
-    """Points spread evenly in the unit ball, (N, 3)."""
-    directions = rng.normal(size=(num_points, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions * np.cbrt(rng.uniform(size=(num_points, 1)))
-
-
-def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(one - other))
 
 
 def _finite(value: float) -> float | None:

@@ -5,8 +5,7 @@ import pytest
 
 from drake_safety.learning.gradients import logit_gradient
 from drake_safety.learning.trained_maps import Embedding
-from drake_safety.planning.goal_descent import descend_to_accepted, suggest_goal
-from drake_safety.planning.goal_verdict import nearest_accepted_goal
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from goal_field import BOX, FieldAssessment, GoalTask
 
 GOAL = np.array([0.9, 0.5, 1.5])
@@ -76,45 +75,44 @@ class PlaneAssessment(FieldAssessment):
         return np.concatenate(parts, axis=1)
 
 
-def test_the_nearest_accepted_goal_of_a_plane_is_found_with_few_judged():
-    found = descend_to_accepted(GoalTask(), PlaneAssessment(), GOAL, threshold=0.5)
-    # Γ ≥ 0.9 is ln 9 below the middle of the slope.
-    distance = GOAL @ NORMAL - (OFFSET - np.log(9.0) / STEEPNESS)
-    assert found.verdict.safety_probability >= 0.9
-    assert found.verdict.threshold == 0.5
-    assert np.linalg.norm(found.verdict.goal - GOAL) == pytest.approx(distance, abs=0.02)
-    task = GoalTask()
-    sampled = nearest_accepted_goal(
-        task, PlaneAssessment(), GOAL, threshold=0.5, rng=np.random.default_rng(0)
-    )
-    assert found.num_judged < 0.3 * task.num_resets
-    assert np.linalg.norm(found.verdict.goal - GOAL) <= np.linalg.norm(sampled.goal - GOAL) + 0.005
-
-
-def test_what_is_found_lies_in_the_region_and_a_flat_field_leads_nowhere():
-    outside = np.array([0.9, 3.0, 1.5])
-    found = descend_to_accepted(GoalTask(), PlaneAssessment(), outside, threshold=0.5)
-    assert np.all((found.verdict.goal >= BOX[0]) & (found.verdict.goal <= BOX[1]))
-    flat = PlaneAssessment()
-    weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
-    flat.embedding_ = Embedding(weights, num_margins=0)
-    assert descend_to_accepted(GoalTask(), flat, GOAL, threshold=0.5).verdict is None
-
-
 def suggest(task, assessment, goal=GOAL, **options):
-    return suggest_goal(
+    return nearest_accepted_goal(
         task, assessment, goal, threshold=0.5, rng=np.random.default_rng(0), **options
     )
 
 
-def search(task, assessment, goal=GOAL):
-    return nearest_accepted_goal(
-        task, assessment, goal, threshold=0.5, rng=np.random.default_rng(0)
-    )
+def search(task, assessment):
+    return suggest(task, assessment, method="search")
+
+
+def descend(task, assessment, goal=GOAL):
+    return suggest(task, assessment, goal, method="gradient")
 
 
 def distance(verdict, goal=GOAL):
     return np.linalg.norm(verdict.goal - goal)
+
+
+def test_the_nearest_accepted_goal_of_a_plane_is_found_with_few_judged():
+    task, whole = GoalTask(), GoalTask()
+    found = descend(task, PlaneAssessment())
+    # Γ ≥ 0.9 is ln 9 below the middle of the slope.
+    expected = GOAL @ NORMAL - (OFFSET - np.log(9.0) / STEEPNESS)
+    assert found.safety_probability >= 0.9
+    assert found.threshold == 0.5
+    assert distance(found) == pytest.approx(expected, abs=0.02)
+    searched = search(whole, PlaneAssessment())
+    assert task.num_resets < 0.3 * whole.num_resets
+    assert distance(found) <= distance(searched) + 0.005
+
+
+def test_what_is_found_lies_in_the_region_and_a_flat_field_leads_nowhere():
+    found = descend(GoalTask(), PlaneAssessment(), np.array([0.9, 3.0, 1.5]))
+    assert np.all((found.goal >= BOX[0]) & (found.goal <= BOX[1]))
+    flat = PlaneAssessment()
+    weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
+    flat.embedding_ = Embedding(weights, num_margins=0)
+    assert descend(GoalTask(), flat) is None
 
 
 def test_a_suggestion_is_as_near_as_that_of_the_search_with_fewer_goals_judged():
@@ -138,7 +136,7 @@ def test_a_nearer_goal_than_the_gradient_leads_to_is_found():
                 np.linalg.norm(goals - centre, axis=1) < 0.12, 1.0, beyond(goals)
             )
 
-    led = descend_to_accepted(GoalTask(), Pocketed(), GOAL, threshold=0.5).verdict
+    led = descend(GoalTask(), Pocketed())
     found = suggest(GoalTask(), Pocketed())
     assert distance(led) > 0.5
     assert distance(found) == pytest.approx(0.08, abs=0.02)
@@ -162,23 +160,6 @@ def test_what_cannot_be_suggested_for_is_none_or_an_error():
         suggest(task, PlaneAssessment(), GOAL[:2] * 0.0 + [0.5, 0.0])
     with pytest.raises(ValueError, match=r"reserve is -0\.1, expected a value in \[0, 1\]"):
         suggest(task, PlaneAssessment(), reserve=-0.1)
-    with pytest.raises(ValueError, match="three finite numbers"):
-        descend_to_accepted(task, PlaneAssessment(), GOAL * np.nan, threshold=0.5)
+    with pytest.raises(ValueError, match=r"method must be one of \('both',.*\); got 'best'"):
+        suggest(task, PlaneAssessment(), method="best")
     assert task.num_resets == 0
-
-
-def test_what_is_known_is_where_the_search_begins():
-    task, whole = GoalTask(), GoalTask()
-    known = search(whole, PlaneAssessment())
-    found = nearest_accepted_goal(
-        task,
-        PlaneAssessment(),
-        GOAL,
-        threshold=0.5,
-        rng=np.random.default_rng(1),
-        known=known,
-        num_rounds=1,
-        num_candidates=8,
-    )
-    assert distance(found) <= distance(known)
-    assert task.num_resets < 0.15 * whole.num_resets

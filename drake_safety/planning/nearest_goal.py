@@ -1,0 +1,252 @@
+"""The nearest accepted goal: what may be offered in place of a goal that is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.gradients import unsafe_logits
+from drake_safety.planning.goal_verdict import (
+    GoalVerdict,
+    assess_goals,
+    checked_goal,
+    goal_inputs,
+    target_box,
+)
+from drake_safety.simulation.closed_loop import ClosedLoop
+
+METHODS = ("both", "gradient", "search")
+"""How the nearest accepted goal may be looked for."""
+RESERVE = 0.8
+"""Share of the way from the threshold to certainty by which a suggested goal exceeds the threshold.
+
+At the threshold itself as many goals are safe as not: a suggestion must be better than that."""
+
+_Nearest = Callable[[np.ndarray], GoalVerdict | None]
+"""The nearest to the goal of those of the candidates (N, 3) [m] that are accepted."""
+
+_DIFFERENCE_M = 1e-3  # Between the goals that tell how inputs change with them.
+_MAX_STEPS = 12  # Along the gradient.
+_LONGEST_STEP_M = 0.15  # The logit is nearly straight over that much.
+_MARGIN = 0.5  # By how much the logit that is aimed at falls where Γ does not follow.
+_LARGEST_LOGIT = 8.0
+
+_FIRST_RADIUS_M = 0.05
+_GROWTH = 1.6  # From one ball of candidates to the next.
+_LAST_CHANCE = (
+    16  # Times as many candidates, all over the region, when no ball had an accepted one.
+)
+_SPREAD = 0.25  # How far these lie from it, as a share of its distance to the goal.
+_NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Of candidates about the best goal that was found.
+
+
+def nearest_accepted_goal(
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    *,
+    threshold: float,
+    rng: np.random.Generator,
+    reserve: float = RESERVE,
+    num_candidates: int = 64,
+    resolution_m: float = 1e-3,
+    method: str = "both",
+) -> GoalVerdict | None:
+    """The goal nearest to a given one that is accepted with reserve, as far as it can be found.
+
+    With reserve: Γ ≥ threshold + reserve (1 - threshold). The nearest goal lies at the limit that
+    was searched with, and of those at the threshold itself many are unsafe.
+
+    The gradient of the logit that is learned with Γ finds an accepted goal with few goals judged,
+    often not the nearest one: it follows one basin, and Γ, which decides, not exactly. A search no
+    farther than that, in all directions, takes fewer goals than one that knows none yet. Where the
+    gradient finds nothing, or the maps have none to follow, the search is the whole one.
+
+    All candidates lie on a grid of ``resolution_m``: rounded to it, an accepted goal stays an
+    accepted one.
+
+    Args:
+        loop: A closed loop whose plans have a goal.
+        assessment: What was learned from its episodes.
+        goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
+        threshold: From which Γ, calibrated, on a goal is safe.
+        rng: Source of the candidates.
+        reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
+            is accepted.
+        num_candidates: That the search judges at a time, half as many where the gradient has found
+            an accepted goal.
+        resolution_m: Spacing of the grid that the goal found lies on [m].
+        method: ``both``, or the ``gradient`` or the ``search`` alone.
+
+    Returns:
+        The verdict on it, by the threshold itself; None when the goal is not finite, or nothing
+        that is accepted with reserve was found.
+
+    Raises:
+        ValueError: The loop's plans have no goal, the goal is not three numbers, the reserve is
+            not in [0, 1], the method is unknown, or maps without a safety head are to be followed.
+    """
+    if method not in METHODS:
+        raise ValueError(f"nearest accepted goal: method must be one of {METHODS}; got '{method}'")
+    if not 0.0 <= reserve <= 1.0:
+        raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
+    stricter = threshold + reserve * max(1.0 - threshold, 0.0)
+    goal = checked_goal(goal)
+    if not np.isfinite(goal).all():
+        return None
+    box = target_box(loop)
+
+    def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
+        points = np.unique(on_grid(candidates, resolution_m), axis=0)
+        inside = points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
+        verdicts = assess_goals(loop, assessment, inside, threshold=stricter)
+        return _nearest((verdict for verdict in verdicts if verdict.is_accepted), goal)
+
+    best: GoalVerdict | None = None
+    # Matrices this small are multiplied sooner by one thread than by several.
+    with threadpool_limits(1):
+        if method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head):
+            best = _descend(loop, assessment, goal, box, stricter, nearest_of, resolution_m)
+        if method != "gradient":
+            best = _search(goal, box, nearest_of, best, rng, num_candidates, resolution_m)
+    return None if best is None else replace(best, threshold=threshold)
+
+
+def _descend(
+    loop: ClosedLoop,
+    assessment: SafetyAssessment,
+    goal: np.ndarray,
+    box: np.ndarray,
+    threshold: float,
+    nearest_of: _Nearest,
+    resolution_m: float,
+) -> GoalVerdict | None:
+    """Moves a refused goal to the nearest accepted one of one basin, along the gradient.
+
+    Each step goes to the point nearest to the goal on the plane on which the logit, were it
+    straight, would have the value aimed at. Network and inputs share the chain rule: the network's
+    gradient is exact, the inputs' change with the goal a difference of four goals. What is aimed at
+    falls as long as Γ, which decides, does not accept.
+    """
+    bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
+    share = min(max(threshold, 1.0 - bound), bound)
+    aim = math.log((1.0 - share) / share)
+    best: GoalVerdict | None = None
+    point = centre = np.clip(goal, *box)
+    for _ in range(_MAX_STEPS):
+        # Beyond the region nothing was learned: differences point inwards.
+        inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
+        inputs = goal_inputs(loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
+        x, logit, gradient = unsafe_logits(assessment, *inputs)
+        slope = (x[1:] - x[0]) @ gradient[0] / inwards
+        found = nearest_of(point[None])
+        if found is None and logit[0] <= aim + 0.1:
+            aim = logit[0] - _MARGIN
+        best = _nearest((best, found), goal)
+        steepness = float(slope @ slope)
+        if steepness < 1e-12:
+            break
+        ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
+        step = np.clip(ahead, *box) - point
+        length = float(np.linalg.norm(step))
+        if length < resolution_m:
+            break
+        point = point + step * min(1.0, _LONGEST_STEP_M / length)
+    return None if best is None else _bisect(best, centre, nearest_of, resolution_m)
+
+
+def _search(
+    goal: np.ndarray,
+    box: np.ndarray,
+    nearest_of: _Nearest,
+    known: GoalVerdict | None,
+    rng: np.random.Generator,
+    num_candidates: int,
+    resolution_m: float,
+) -> GoalVerdict | None:
+    """Looks for the nearest accepted goal in all directions.
+
+    Candidates fill growing balls about the goal until one of them is accepted: as far as the one
+    that is known, with fewer of them, and where none is in the end the whole region. From there on
+    the search goes down: a bisection towards the goal, then candidates about the best one and in
+    the ball that it bounds, and so on.
+    """
+    centre = np.clip(goal, *box)
+    best = nearest_of(centre[None])
+    num_in_ball, num_rounds = num_candidates, _NUM_ROUNDS
+    radius, farthest = _FIRST_RADIUS_M, _distance(*box)
+    if known is not None:
+        num_candidates, num_rounds = max(num_candidates // 2, 2), _ROUNDS_FROM_KNOWN
+        num_in_ball, farthest = num_candidates // 2, _distance(known.goal, goal)
+    while best is None and radius < farthest:
+        best = nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
+        radius *= _GROWTH
+    best = _nearest((best, known), goal)
+    if best is None:
+        best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
+    if best is None:
+        return None
+
+    for _ in range(num_rounds):
+        best = _bisect(best, centre, nearest_of, resolution_m)
+        distance = _distance(best.goal, goal)
+        if distance < resolution_m:
+            break
+        about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
+        ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
+        candidates = np.clip(np.concatenate([about, ball]), *box)
+        is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
+        found = nearest_of(candidates[is_nearer])
+        if found is not None and _distance(found.goal, goal) < distance:
+            best = found
+    return best
+
+
+def _bisect(
+    best: GoalVerdict, centre: np.ndarray, nearest_of: _Nearest, resolution_m: float
+) -> GoalVerdict:
+    """Moves an accepted goal straight towards the centre for as long as it stays accepted."""
+    refused = centre
+    while _distance(best.goal, refused) > resolution_m:
+        between = 0.5 * (best.goal + refused)
+        found = nearest_of(between[None])
+        if found is None:
+            refused = between
+        elif _distance(found.goal, centre) < _distance(best.goal, centre):
+            best = found
+        else:
+            break
+    return best
+
+
+def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
+    """The nearest points of the grid that suggested goals lie on.
+
+    Args:
+        points: In the world, (..., 3) [m].
+        resolution_m: Spacing of the grid [m].
+    """
+    # A multiple of the spacing is not yet the number that is read back from its digits.
+    return np.round(np.round(points / resolution_m) * resolution_m, 9)
+
+
+def _nearest(verdicts: Iterable[GoalVerdict | None], goal: np.ndarray) -> GoalVerdict | None:
+    """The first of the verdicts whose goal is nearest to the given one."""
+    found = [verdict for verdict in verdicts if verdict is not None]
+    return min(found, key=lambda verdict: _distance(verdict.goal, goal), default=None)
+
+
+def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
+    """Points spread evenly in the unit ball, (N, 3)."""
+    directions = rng.normal(size=(num_points, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions * np.cbrt(rng.uniform(size=(num_points, 1)))
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm(one - other))
