@@ -14,8 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from drake_safety import Scenario, load_scenario, run_episodes
 from drake_safety.models import load_robot
-from drake_safety.plants.ground import add_ground
 from drake_safety.plants.obstacles import add_obstacles, filter_collisions
+from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import add_robot
 from drake_safety.simulation.closed_loop import ClosedLoop
 

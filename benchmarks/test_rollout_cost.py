@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from drake_safety import Scenario, run_episodes
 from drake_safety.models import load_robot
 from drake_safety.plants.balls import add_ball
-from drake_safety.plants.ground import add_ground
+from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import add_robot
 from drake_safety.simulation.closed_loop import ClosedLoop
 

@@ -4,7 +4,7 @@ from pydrake.geometry import Role, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.plants.ground import add_ground
+from drake_safety.plants.physics import add_ground
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 
 import legged_robots
-from drake_safety.plants.ground import add_ground
 from drake_safety.plants.mujoco_dynamics import MujocoDynamics, PointForce
+from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import Payload, PlantVariation, add_robot, apply_masses
 
 ROBOTS = ("laikago", "atlas", "hexapod")

@@ -8,7 +8,6 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.plants.ground import add_ground
 from drake_safety.plants.obstacles import (
     Clearance,
     Obstacle,
@@ -17,6 +16,7 @@ from drake_safety.plants.obstacles import (
     collision_geometries,
     filter_collisions,
 )
+from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import HAND_RADIUS_M, robot_kinematics, robot_model, write_porter

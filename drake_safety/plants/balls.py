@@ -7,12 +7,11 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
-from drake_safety.robots.robot import add_to_package_map
+from drake_safety.robots.model_files import package_parser
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 _MAX_STEPS = 30_000  # Of sphere tracing.
@@ -45,9 +44,8 @@ class Throw:
 
 def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
     """Adds a ball to a plant that is not finalised."""
-    parser = Parser(plant)
-    add_to_package_map(parser.package_map())
-    (instance,) = parser.AddModels(url="package://drake_safety_models/scenes/ball.sdf")
+    ball = "package://drake_safety_models/scenes/ball.sdf"
+    (instance,) = package_parser(plant).AddModels(url=ball)
     return instance
 
 

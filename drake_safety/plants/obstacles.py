@@ -13,12 +13,12 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.robot import add_robot, add_to_package_map, model_file
+from drake_safety.robots.model_files import model_file, package_parser
+from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import RobotModel
 
 
@@ -55,9 +55,7 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
     Raises:
         ValueError: A model cannot be read, has not exactly one link that nothing holds, or moves.
     """
-    parser = Parser(plant)
-    parser.SetAutoRenaming(True)
-    add_to_package_map(parser.package_map())
+    parser = package_parser(plant)
     instances = []
     for obstacle in obstacles:
         who = f"obstacle '{obstacle.model}'"

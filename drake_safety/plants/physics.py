@@ -7,16 +7,19 @@ and for the poses of geometry, but takes no step.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import HalfSpace, SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    DiscreteContactApproximation,
+    AddMultibodyPlant,
+    CoulombFriction,
     MultibodyPlant,
+    MultibodyPlantConfig,
 )
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
@@ -24,7 +27,6 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_safety.plants.balls import Ball, add_ball
-from drake_safety.plants.ground import add_ground
 from drake_safety.plants.mujoco_dynamics import MujocoDynamics
 from drake_safety.plants.mujoco_plant import MujocoPlant
 from drake_safety.plants.obstacles import (
@@ -33,6 +35,7 @@ from drake_safety.plants.obstacles import (
     collision_geometries,
     filter_collisions,
 )
+from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot import (
     PlantVariation,
     actuation_matrix,
@@ -42,6 +45,10 @@ from drake_safety.robots.robot import (
     servo_matrix,
 )
 from drake_safety.robots.robot_model import RobotModel
+
+# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
+# is deformable.
+logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
 
 
 @dataclass(kw_only=True)
@@ -78,8 +85,13 @@ class DrakePhysics:
         time_step_s: float,
         servos: bool,
     ):
-        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step_s)
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        config = MultibodyPlantConfig(
+            time_step=time_step_s,
+            discrete_contact_approximation="lagged",
+            # What the ports say is of now, not of the last step: no copies are kept for it.
+            use_sampled_output_ports=False,
+        )
+        plant, scene_graph = AddMultibodyPlant(config, builder)
         instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
         self._robot, self._variation = robot, variation
         self.plant: MultibodyPlant = plant
@@ -242,6 +254,24 @@ def add_physics(
     return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
 
 
+def add_ground(plant: MultibodyPlant, friction: float) -> None:
+    """Adds level ground at z = 0 to a plant that is not finalised.
+
+    Args:
+        plant: The plant.
+        friction: Coulomb's coefficient, static and dynamic.
+    """
+    # What is seen; what is stood on is the half space, which has no edge.
+    package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ground.urdf")
+    plant.RegisterCollisionGeometry(
+        plant.world_body(),
+        RigidTransform(),
+        HalfSpace(),
+        "ground",
+        CoulombFriction(friction, friction),
+    )
+
+
 def _furnish(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
@@ -258,8 +288,6 @@ def _furnish(
     ball = add_ball(plant) if scene.has_ball else None
     obstacles = add_obstacles(plant, list(scene.obstacles or ()))
     decorations = add_obstacles(plant, list(scene.decorations))
-    # What the ports say is of now, not of the last step: no copies are kept for it.
-    plant.SetUseSampledOutputPorts(False)
     plant.Finalize()
     require_motors(plant, robot)
     for decoration, model in zip(scene.decorations, decorations, strict=True):

@@ -8,7 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from urllib.parse import urlparse
 
-from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import MultibodyPlant
 
 _EXTRAS = {"example-robot-data": "robots"}
 """Packages of models that an extra installs."""
@@ -43,6 +44,21 @@ def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
         folder = _installed_folder(parts.netloc)
         if folder is not None:
             package_map.Add(parts.netloc, str(folder))
+
+
+def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
+    """A parser that knows the packages of :func:`add_to_package_map`.
+
+    Models of a name that the plant has already are renamed.
+
+    Args:
+        plant: Where models go, before ``Finalize``.
+        url: As there.
+    """
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    add_to_package_map(parser.package_map(), url)
+    return parser
 
 
 @lru_cache

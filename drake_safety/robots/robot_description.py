@@ -19,15 +19,14 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
 from drake_safety.robots.model_files import (
     MissingExtraError,
-    add_to_package_map,
     is_installed,
     model_file,
+    package_parser,
 )
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
@@ -50,9 +49,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
         ValueError: The file is no URDF though its name says so, its package is not installed, or
             a mesh cannot be converted.
     """
-    parser = Parser(plant)
-    parser.SetAutoRenaming(True)
-    add_to_package_map(parser.package_map(), robot.urdf)
+    parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir)
     urdf = None
     if path.suffix == ".urdf":

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.robot import add_to_package_map
+from drake_safety.robots.model_files import package_parser
 
 _CORNER_RADIUS_M = 0.005  # Of the spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
@@ -60,10 +59,8 @@ class Survey:
         builder = DiagramBuilder()
         plant: MultibodyPlant
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-        parser = Parser(plant)
-        add_to_package_map(parser.package_map())
         try:
-            (self.instance,) = parser.AddModels(str(path))
+            (self.instance,) = package_parser(plant).AddModels(str(path))
             plant.Finalize()
         except (RuntimeError, ValueError) as error:
             raise ValueError(f"Drake cannot read '{path}': {error}") from error
