@@ -13,7 +13,6 @@ from drake_safety.robots.robot import (
     PlantVariation,
     actuation_matrix,
     add_robot,
-    apply_mass_scale,
     apply_masses,
     model_file,
     models_package_xml,
@@ -159,7 +158,7 @@ def test_the_mass_scale_scales_the_whole_mass_matrix(name):
     context = plant.CreateDefaultContext()
     M = plant.CalcMassMatrix(context)
     for _ in range(2):  # A scale replaces the one before; it does not multiply it.
-        apply_mass_scale(plant, context, robot, 0.8)
+        apply_masses(plant, context, robot, PlantVariation(mass_scale=0.8))
     np.testing.assert_allclose(plant.CalcMassMatrix(context), 0.8 * M, rtol=1e-12, atol=1e-15)
 
 
@@ -170,7 +169,7 @@ def test_a_payload_moves_the_centre_of_mass_by_its_share(name):
     context = plant.CreateDefaultContext()
     position = [0.1, -0.02, 0.05]
     base = plant.GetBodyByName(robot.base)
-    apply_mass_scale(plant, context, robot, 0.8)
+    apply_masses(plant, context, robot, PlantVariation(mass_scale=0.8))
     mass, centre = plant.CalcTotalMass(context), plant.CalcCenterOfMassPositionInWorld(context)
     p_WP = base.EvalPoseInWorld(context) @ np.array(position)
     variation = PlantVariation(mass_scale=0.8, payload=Payload(mass_kg=2.0, position_m=position))
@@ -207,7 +206,7 @@ def test_the_mass_scale_leaves_other_models_alone():
     context = plant.CreateDefaultContext()
     instance = [plant.GetModelInstanceByName(second.name)]
     before = plant.CalcTotalMass(context, instance)
-    apply_mass_scale(plant, context, first, 2.0)
+    apply_masses(plant, context, first, PlantVariation(mass_scale=2.0))
     assert plant.CalcTotalMass(context, instance) == before
 
 

@@ -15,6 +15,7 @@ from drake_safety.robots.robot import (
     add_robot,
     apply_masses,
     posture_positions,
+    servo_joints,
 )
 from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
@@ -63,10 +64,8 @@ class RobotKinematics:
         self.num_velocities = self.plant.num_velocities()
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
         instance = self.plant.GetModelInstanceByName(robot.name)
-        joints = [self.plant.get_joint(i) for i in self.plant.GetJointIndices(instance)]
-        joints = [j for j in joints if j.num_velocities() == 1]
-        joints.sort(key=lambda joint: joint.velocity_start())
-        self.joint_names = [joint.name() for joint in joints]
+        self.joint_names = servo_joints(self.plant, robot)
+        joints = [self.plant.GetJointByName(name, instance) for name in self.joint_names]
         self.position_limits = np.array(
             [[j.position_lower_limit(), j.position_upper_limit()] for j in joints]
         ).reshape(-1, 2)

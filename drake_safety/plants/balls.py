@@ -11,6 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
+from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -72,12 +73,7 @@ class Ball:
         inspector = scene_graph.model_inspector()
         (self._geometry,) = plant.GetCollisionGeometriesForBody(self._body)
         self.radius_m = inspector.GetShape(self._geometry).radius()
-        robot = self._target.model_instance()
-        self._robot_geometries = [
-            geometry
-            for index in plant.GetBodyIndices(robot)
-            for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index))
-        ]
+        self._robot_geometries = collision_geometries(plant, [self._target.model_instance()])
 
     def park(self, context: Context) -> None:
         """Puts the ball at rest on the ground, far away.

@@ -9,8 +9,8 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_safety.plants.mujoco_model import build_model, import_mujoco, joint_order
-from drake_safety.robots.robot import PlantVariation
+from drake_safety.plants.mujoco_model import build_model, import_mujoco
+from drake_safety.robots.robot import PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel
 
 _LOGGER = logging.getLogger("drake_safety")
@@ -72,7 +72,7 @@ class MujocoDynamics:
         )
         self._scratch = mujoco.MjData(self.model)
         self.command_places = np.array(commands, dtype=int)
-        self.joint_names = joint_order(plant, robot)
+        self.joint_names = servo_joints(plant, robot)
         self.num_command = len(self.joint_names) * (2 if servos else 1)
         model = self.model
         self.num_positions, self.num_velocities = model.nq, model.nv

@@ -21,7 +21,8 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 
-from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, model_file
+from drake_safety.robots.model_files import model_file
+from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 
 if TYPE_CHECKING:
@@ -92,14 +93,6 @@ def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
     return spec
 
 
-def joint_order(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
-    """Names of the robot's joints in the order of its velocities, the base left out."""
-    instance = plant.GetModelInstanceByName(robot.name)
-    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    moving = [joint for joint in joints if joint.num_velocities() == 1]
-    return [j.name() for j in sorted(moving, key=lambda joint: joint.velocity_start())]
-
-
 def _add_actuators(
     spec: mujoco.MjSpec,
     plant: MultibodyPlant,
@@ -115,7 +108,7 @@ def _add_actuators(
     for index in plant.GetJointActuatorIndices(instance):
         actuator = plant.get_joint_actuator(index)
         limits.setdefault(actuator.joint().name(), actuator.effort_limit())
-    names = joint_order(plant, robot)
+    names = servo_joints(plant, robot)
     commands = []
 
     def add(kind: str, name: str, gain: float, bias: list[float], command: int) -> None:
@@ -267,7 +260,8 @@ def build_model(
 
     Returns:
         The model, and for each of its controls the place of its value in the command: joint
-        positions and velocities with servos, joint torques without, in :func:`joint_order`.
+        positions and velocities with servos, joint torques without, in the order of
+        :func:`~drake_safety.robots.robot.servo_joints`.
 
     Raises:
         ValueError: The robot's model is no URDF or MuJoCo cannot read it, its base is not the

@@ -42,7 +42,6 @@ from drake_safety.robots.robot import (
     add_robot,
     apply_masses,
     require_motors,
-    servo_matrix,
 )
 from drake_safety.robots.robot_model import RobotModel
 
@@ -120,8 +119,11 @@ class DrakePhysics:
     def connect_servos(
         self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
     ) -> None:
-        """Drives a robot with servos by joint positions and velocities (2 n_j,), by name."""
-        D = servo_matrix(self.plant, self._robot, joint_names)
+        """Drives a robot with servos by joint positions and velocities (2 n_j,), by name.
+
+        Actuators that are the joints' dry friction hold velocity zero.
+        """
+        D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
         builder.Connect(

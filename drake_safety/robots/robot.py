@@ -28,7 +28,7 @@ from drake_safety.robots.robot_description import (
     add_stated_shapes,
     ignore_neighbours,
 )
-from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot_model import Foot, ReachingFrame, RobotModel, by_pattern
 
 ENGINES = ("drake", "mujoco")
 """Physics engines that a plant variation may choose."""
@@ -103,16 +103,22 @@ _FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry fric
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
-def _require(exists: bool, robot: RobotModel, what: str, name: str, known: list[str]) -> None:
-    if not exists:
+def _require(robot: RobotModel, what: str, name: str, known: list[str]) -> None:
+    if name not in known:
         raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
-    """Names of the one-degree-of-freedom joints of ``robot`` in the plant's order."""
+    """Names of the robot's one-degree-of-freedom joints.
+
+    Of a finalised plant they are in the order of its positions and of its velocities.
+    """
     instance = plant.GetModelInstanceByName(robot.name)
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    return [j.name() for j in joints if j.num_velocities() == 1]
+    joints = [joint for joint in joints if joint.num_velocities() == 1]
+    if plant.is_finalized():
+        joints.sort(key=lambda joint: joint.velocity_start())
+    return [joint.name() for joint in joints]
 
 
 def _set_friction(
@@ -172,44 +178,33 @@ def add_robot(
     instance = add_description(plant, robot)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
-    _require(robot.base in bodies, robot, "body", robot.base, bodies)
-    for foot in robot.feet.values():
-        _require(foot.body in bodies, robot, "body", foot.body, bodies)
-        for joint_name in foot.joints:
-            _require(joint_name in joints, robot, "joint", joint_name, joints)
-    for frame in robot.reaching_frames.values():
-        _require(frame.body in bodies, robot, "body", frame.body, bodies)
-        for joint_name in frame.joints:
-            _require(joint_name in joints, robot, "joint", joint_name, joints)
-    for body_name in robot.whole_body.orientation:
-        _require(body_name in bodies, robot, "body", body_name, bodies)
+    limbs: list[Foot | ReachingFrame] = [*robot.feet.values(), *robot.reaching_frames.values()]
+    for name in (robot.base, *(limb.body for limb in limbs), *robot.whole_body.orientation):
+        _require(robot, "body", name, bodies)
+    for name in (name for limb in limbs for name in limb.joints):
+        _require(robot, "joint", name, joints)
     robot.mirror_partners(servo_joints(plant, robot))
     if robot.collision == "stated" and plant.geometry_source_is_registered():
         add_stated_shapes(plant, robot, instance)
 
-    actuated = {
-        plant.get_joint_actuator(i).joint().name(): plant.get_joint_actuator(i)
-        # Per model instance the plant lists actuators only once it is finalised.
-        for i in plant.GetJointActuatorIndices()
-        if plant.get_joint_actuator(i).model_instance() == instance
-    }
-    for index in plant.GetJointIndices(instance):
-        joint = plant.get_joint(index)
-        if joint.num_velocities() != 1:
-            continue
-        actuator: JointActuator | None = actuated.get(joint.name())
-        limit = by_pattern(robot.effort_limits, joint.name(), "effort limit", robot.name)
+    # Per model instance the plant lists actuators only once it is finalised.
+    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    actuated = {one.joint().name(): one for one in actuators if one.model_instance() == instance}
+    for name in servo_joints(plant, robot):
+        joint = plant.GetJointByName(name, instance)
+        actuator: JointActuator | None = actuated.get(name)
+        limit = by_pattern(robot.effort_limits, name, "effort limit", robot.name)
         if actuator is None:
             if limit is None:
                 continue
-            actuator = plant.AddJointActuator(f"{joint.name()}_actuator", joint, limit)
-            actuated[joint.name()] = actuator
+            actuator = plant.AddJointActuator(f"{name}_actuator", joint, limit)
+            actuated[name] = actuator
         elif limit is not None and np.isinf(actuator.effort_limit()):
             actuator.set_effort_limit(limit)
-        gains = by_pattern(robot.joint_gains, joint.name(), "gains", robot.name)
+        gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
         if gains is not None and servos:
             actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
-        speed = by_pattern(robot.velocity_limits, joint.name(), "velocity limit", robot.name)
+        speed = by_pattern(robot.velocity_limits, name, "velocity limit", robot.name)
         if speed is not None:
             joint.set_velocity_limits([-speed], [speed])
         if variation.joint_damping:
@@ -269,7 +264,7 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
     names = servo_joints(plant, robot)
     for pattern in robot.posture:
         if not any(re.fullmatch(pattern, name) for name in names):
-            _require(False, robot, "joint for posture pattern", pattern, names)
+            _require(robot, "joint for posture pattern", pattern, names)
     positions = {}
     for name in names:
         value = by_pattern(robot.posture, name, "posture", robot.name)
@@ -301,50 +296,10 @@ def actuation_matrix(
     matrix = np.zeros((len(actuators), len(joint_names)))
     for row, actuator in enumerate(actuators):
         name = actuator.joint().name()
-        _require(name in joint_names, robot, "joint", name, joint_names)
+        _require(robot, "joint", name, joint_names)
         if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
             matrix[row, joint_names.index(name)] = 1.0
     return matrix
-
-
-def servo_matrix(plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]) -> np.ndarray:
-    """Maps joint positions and velocities onto the robot's servos, by name.
-
-    Actuators that are the joints' dry friction hold velocity zero.
-
-    Args:
-        plant: The finalised plant.
-        robot: The robot.
-        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
-
-    Returns:
-        (2 n_u, 2 n_j), in the order of ``plant.get_desired_state_input_port(instance)``.
-
-    Raises:
-        ValueError: An actuated joint is not among the names.
-    """
-    return np.kron(np.eye(2), actuation_matrix(plant, robot, joint_names))
-
-
-def apply_mass_scale(
-    plant: MultibodyPlant, context: Context, robot: RobotModel, scale: float
-) -> None:
-    """Scales every body's spatial inertia of ``robot`` in a plant's Context.
-
-    Args:
-        plant: The finalised plant.
-        context: The plant's Context, whose parameters change.
-        robot: The robot.
-        scale: Factor on the published inertias (mass and rotational inertia alike).
-    """
-    for index in plant.GetBodyIndices(plant.GetModelInstanceByName(robot.name)):
-        body = plant.get_body(index)
-        M_BBo_B = body.default_spatial_inertia()
-        if M_BBo_B.get_mass() > 0:
-            scaled = SpatialInertia(
-                scale * M_BBo_B.get_mass(), M_BBo_B.get_com(), M_BBo_B.get_unit_inertia()
-            )
-            body.SetSpatialInertiaInBodyFrame(context, scaled)
 
 
 def apply_masses(
@@ -361,14 +316,19 @@ def apply_masses(
     Raises:
         ValueError: The robot has no such body for the payload.
     """
-    apply_mass_scale(plant, context, robot, variation.mass_scale)
+    instance = plant.GetModelInstanceByName(robot.name)
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
+    for body in bodies:
+        M_BBo_B = body.default_spatial_inertia()
+        if M_BBo_B.get_mass() > 0:
+            scaled_kg = variation.mass_scale * M_BBo_B.get_mass()
+            scaled = SpatialInertia(scaled_kg, M_BBo_B.get_com(), M_BBo_B.get_unit_inertia())
+            body.SetSpatialInertiaInBodyFrame(context, scaled)
     payload = variation.payload
     if payload is None:
         return
-    instance = plant.GetModelInstanceByName(robot.name)
     name = payload.body or robot.base
-    bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
-    _require(name in bodies, robot, "body", name, bodies)
+    _require(robot, "body", name, [body.name() for body in bodies])
     body = plant.GetBodyByName(name, instance)
     p_PcmBo_B = -np.array(payload.position_m)
     M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M).Shift(p_PcmBo_B)
