@@ -6,7 +6,7 @@ import pytest
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
 from drake_safety.learning.segments import Episodes
-from drake_safety.logs.episodes import cut_logs
+from drake_safety.logs.episodes import cut_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
 from log_files import FORMATS, balancing_loop, balancing_scenario, map_text, recorded, write
@@ -49,7 +49,7 @@ def directly(folder):
 def unwritten(folder):
     """What logs adapt to that never were in a file."""
     scenario = load_scenario(folder / "short.yaml")
-    actual, starts = cut_logs([recorded(index) for index in INDICES], scenario)
+    actual, starts = cut_log([recorded(index) for index in INDICES], scenario)
     sets = pair_starts(scenario, actual, starts).feedback()
     return {mode: load(folder, mode).adapt(sets) for mode in MODES}
 

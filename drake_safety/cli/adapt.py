@@ -187,13 +187,13 @@ def _run_pairs(
 
 
 def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int) -> EpisodePairs:
-    from drake_safety.logs.episodes import cut_logs
+    from drake_safety.logs.episodes import cut_log
     from drake_safety.logs.robot_log import read_log
     from drake_safety.models import load_robot
     from drake_safety.simulation.feedback import pair_starts
 
     robot = load_robot(scenario.robot)
-    actual, starts = cut_logs([read_log(log, log_map, robot) for log in logs], scenario)
+    actual, starts = cut_log([read_log(log, log_map, robot) for log in logs], scenario)
     return pair_starts(scenario, actual, starts, seed=seed)
 
 

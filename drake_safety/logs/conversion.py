@@ -11,11 +11,6 @@ from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, LogMap, Position, Velocity
 
 
-def base_positions(log_map: LogMap, channels: Mapping[str, Channel]) -> np.ndarray:
-    """Positions of the base in the world at its topic's times, (N, 3) [m]."""
-    return points(log_map.base_position, channels)
-
-
 def points(position: Position, channels: Mapping[str, Channel]) -> np.ndarray:
     """Points in the world at their topic's times, (N, 3 n) [m]."""
     table = channels[position.topic].table(position.columns)

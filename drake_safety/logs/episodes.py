@@ -23,107 +23,85 @@ _ROUNDING_S = 1e-9
 
 
 def episodes_from_log(
-    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+    log: RobotLog | Sequence[RobotLog],
+    loop: ClosedLoop | Scenario,
+    *,
+    desired_output: np.ndarray | None = None,
 ) -> Episodes:
-    """Turns a log into episodes of the actual robot; see :func:`cut_log`.
-
-    Args:
-        log: The log.
-        loop: The loop whose ports say what each state means, without Γ; of a scenario its
-            ``actual`` one.
-        desired_output: z* in the world that was kept all the time, (n_z,) [m], for a log that
-            has none.
-
-    Raises:
-        ValueError: As :func:`cut_log`.
-    """
+    """The episodes of :func:`cut_log`, without what they begin with."""
     return cut_log(log, loop, desired_output=desired_output)[0]
 
 
 def cut_log(
-    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+    log: RobotLog | Sequence[RobotLog],
+    loop: ClosedLoop | Scenario,
+    *,
+    desired_output: np.ndarray | None = None,
 ) -> tuple[Episodes, list[EpisodeStart]]:
-    """Turns a log into episodes, and says what each begins with, for its nominal twin.
+    """Turns logs into episodes of the actual robot, and says what each begins with, for its twin.
 
-    An episode lasts as long as the scenario's, and the next begins where it ends. The last one
-    ends where the robot leaves the safe set, as the loop's monitor sees it at its ticks; what the
-    log holds after that is not looked at, for it may be anything. A safe rest that is too short
+    An episode lasts as long as the scenario's, and the next begins where it ends. The last one of
+    a log ends where the robot leaves the safe set, as the loop's monitor sees it at its ticks; what
+    the log holds after that is not looked at, for it may be anything. A safe rest that is too short
     for a segment is left out. What the assessor sees is what was logged: measurement noise is in
     it already, and none is added. The preview is the logged z*, which after the last row stays
     as it is; z* counts from the stance frame of the episode's first row.
 
     Args:
-        log: The log.
+        log: The log, or several of one robot, whose episodes are numbered through.
         loop: The loop whose ports say what each state means, without Γ; of a scenario its
             ``actual`` one.
-        desired_output: z* in the world that was kept all the time, (n_z,) [m], for a log that
-            has none.
+        desired_output: z* in the world that was kept all the time, (n_z,) [m], for logs that
+            have none.
 
     Returns:
         The episodes, and what each begins with: ``run_episode(nominal_loop, start=starts[i])``
         is the twin of ``episodes[i]``.
 
     Raises:
-        ValueError: The log is of another robot, has no z*, begins outside the safe set, or is
+        ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
             too short for one segment.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    desired = _desired_output(log, loop, desired_output)
+    episodes: list[Episode] = []
+    starts: list[EpisodeStart] = []
+    for one in [log] if isinstance(log, RobotLog) else log:
+        for episode, start in _cut(one, loop, _desired_output(one, loop, desired_output)):
+            episodes.append(replace(episode, index=len(episodes)))
+            starts.append(start)
+    return Episodes(episodes_info(loop, seed=0), episodes), starts
+
+
+def _cut(
+    log: RobotLog, loop: ClosedLoop, desired: np.ndarray
+) -> list[tuple[Episode, EpisodeStart]]:
+    """The episodes of one log and their beginnings; z* in the world is ``desired``, (N, n_z)."""
     scenario = loop.scenario
     shortest = scenario.assessment.shortest_segment or scenario.assessment.horizon
     context = loop.CreateDefaultContext()
-    episodes: list[Episode] = []
-    starts: list[EpisodeStart] = []
+    found: list[tuple[Episode, EpisodeStart]] = []
     begin_s = 0.0
     while log.duration_s - begin_s > scenario.step_s:
         start = _start(log, loop, desired, begin_s)
         loop.reset_to(context, None, start)
-        episode = _episode(log, loop, context, begin_s, len(episodes))
-        if not episode.is_safe and episode.num_steps == 0 and not episodes:
+        episode = _episode(log, loop, context, begin_s)
+        if not episode.is_safe and episode.num_steps == 0 and not found:
             raise ValueError(
                 f"log '{log.path}' begins outside the safe set of scenario '{scenario.name}': "
                 f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
             )
         if not episode.is_safe or episode.num_steps >= shortest:
-            episodes.append(episode)
-            starts.append(start)
+            found.append((episode, start))
         if not episode.is_safe:
             break
         begin_s += float(episode.time_s[-1])
-    if not episodes:
+    if not found:
         raise ValueError(
             f"log '{log.path}' lasts {log.duration_s:g} s: too short for a segment of {shortest} "
             f"steps of {scenario.step_s} s of scenario '{scenario.name}'"
         )
-    return Episodes(episodes_info(loop, seed=0), episodes), starts
-
-
-def cut_logs(
-    logs: Sequence[RobotLog],
-    loop: ClosedLoop | Scenario,
-    *,
-    desired_output: np.ndarray | None = None,
-) -> tuple[Episodes, list[EpisodeStart]]:
-    """The episodes of several logs of one robot, numbered through; see :func:`cut_log`.
-
-    Args:
-        logs: The logs.
-        loop: As for :func:`cut_log`.
-        desired_output: As for :func:`cut_log`, the same for all logs.
-
-    Raises:
-        ValueError: As :func:`cut_log`.
-    """
-    if isinstance(loop, Scenario):
-        loop = loop.make_loop("actual")
-    episodes: list[Episode] = []
-    starts: list[EpisodeStart] = []
-    for log in logs:
-        found, begins = cut_log(log, loop, desired_output=desired_output)
-        episodes += [replace(one, index=len(episodes) + one.index) for one in found]
-        starts += begins
-    return Episodes(episodes_info(loop, seed=0), episodes), starts
+    return found
 
 
 def _desired_output(
@@ -178,9 +156,7 @@ def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float)
     return start
 
 
-def _episode(
-    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, index: int
-) -> Episode:
+def _episode(log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float) -> Episode:
     scenario = loop.scenario
     length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
     period_s = loop.monitor_period_s
@@ -203,7 +179,7 @@ def _episode(
     cause = ""
     if is_out.any():
         cause = loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
-    return Episode(index=index, **arrays, is_safe=cause == "", cause=cause)
+    return Episode(index=0, **arrays, is_safe=cause == "", cause=cause)
 
 
 def _margins(

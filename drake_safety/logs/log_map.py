@@ -4,9 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-
-from drake_safety.robots.robot_model import load_typed
+from drake_safety.robots.robot_model import load_typed_file
 
 TIME_UNITS = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 """How many of each are a second."""
@@ -35,50 +33,57 @@ class LogTime:
 
 
 @dataclass(kw_only=True)
-class Position:
-    """A point, or several one after the other, in the world."""
+class _Columns:
+    """Where numbers are that belong together."""
 
     topic: str = ""
     """Of the messages; empty for a table."""
     columns: list[str] = field(default_factory=list)
-    """x, y, z: columns, or fields of the messages such as ``pose.pose.position.x``."""
+    """Columns, or fields of the messages such as ``pose.pose.position.x``."""
+
+    def _check(self, multiple: int, **chosen: tuple[str, Iterable[str]]) -> None:
+        """Refuses a number of columns, or a choice, given with what there is to choose from."""
+        for name, (value, known) in chosen.items():
+            _check_one_of(name, value, known)
+        if len(self.columns) % multiple:
+            raise ValueError(f"'columns' must be {multiple} names; got {self.columns}")
+        if len(set(self.columns)) != len(self.columns):
+            raise ValueError(f"'columns' names a column twice: {self.columns}")
+
+
+@dataclass(kw_only=True)
+class Position(_Columns):
+    """A point, or several one after the other, in the world: x, y, z."""
+
     unit: str = "m"
 
     def __post_init__(self) -> None:
-        _check_one_of("unit", self.unit, LENGTH_UNITS)
-        _check_count("columns", self.columns, 3)
+        self._check(3, unit=(self.unit, LENGTH_UNITS))
 
 
 @dataclass(kw_only=True)
-class Orientation:
+class Orientation(_Columns):
     """The base's orientation in the world, a quaternion."""
 
-    topic: str = ""
-    columns: list[str] = field(default_factory=list)
-    """In the order that ``order`` says."""
     order: str = "wxyz"
+    """Of the columns."""
 
     def __post_init__(self) -> None:
-        _check_one_of("order", self.order, ORDERS)
-        _check_count("columns", self.columns, 4)
+        self._check(4, order=(self.order, ORDERS))
 
 
 @dataclass(kw_only=True)
-class Velocity:
-    """A linear or angular velocity of the base relative to the world."""
+class Velocity(_Columns):
+    """A linear or angular velocity of the base relative to the world: x, y, z."""
 
-    topic: str = ""
-    columns: list[str] = field(default_factory=list)
-    """x, y, z."""
     unit: str = ""
     """m or mm, rad or deg, per second; m and rad by default."""
     frame: str = "world"
     """Whose axes x, y, z are: ``world`` or ``body``, the base's own (as in ROS odometry)."""
 
     def __post_init__(self) -> None:
-        _check_one_of("unit", self.unit, ("", *LENGTH_UNITS, *ANGLE_UNITS))
-        _check_one_of("frame", self.frame, FRAMES)
-        _check_count("columns", self.columns, 3)
+        units = ("", *LENGTH_UNITS, *ANGLE_UNITS)
+        self._check(3, unit=(self.unit, units), frame=(self.frame, FRAMES))
 
 
 @dataclass(kw_only=True)
@@ -162,18 +167,12 @@ def load_log_map(path: str | Path) -> LogMap:
     Raises:
         ValueError: The file does not exist or does not fit the schema.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"map '{path}' of a log's columns does not exist")
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"map '{path}' is not YAML: {error}") from error
-    log_map = load_typed(LogMap, raw, f"map '{path}'")
+    who = f"map '{path}'"
+    log_map = load_typed_file(LogMap, Path(path), who)
     try:
         log_map.check()
     except ValueError as error:
-        raise ValueError(f"map '{path}': {error}") from error
+        raise ValueError(f"{who}: {error}") from error
     return log_map
 
 
@@ -181,10 +180,3 @@ def _check_one_of(name: str, value: str, known: Iterable[str]) -> None:
     known = list(known)
     if value not in known:
         raise ValueError(f"'{name}' must be one of {known}; got '{value}'")
-
-
-def _check_count(name: str, columns: list[str], multiple: int) -> None:
-    if len(columns) % multiple:
-        raise ValueError(f"'{name}' must be {multiple} names; got {columns}")
-    if len(set(columns)) != len(columns):
-        raise ValueError(f"'{name}' names a column twice: {columns}")

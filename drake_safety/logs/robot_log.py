@@ -13,7 +13,6 @@ from drake_safety.logs import checks
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.conversion import (
     angular_velocities,
-    base_positions,
     base_velocities,
     joint_table,
     points,
@@ -196,7 +195,7 @@ def _converted(
     def positions(read_by: LogMap, at: np.ndarray) -> np.ndarray:
         rotations = rotations_of(quaternions(read_by, channels))
         rotations = rotations_at(times[read_by.base_orientation.topic], rotations, at)
-        base = values_at(base_time, base_positions(read_by, channels), at)
+        base = values_at(base_time, points(read_by.base_position, channels), at)
         table = joint_table(read_by, channels, kinematics.joint_names, "joint_positions")
         joints = values_at(times[read_by.joint_positions.topic], table, at)
         return np.hstack([rotations.as_quat(scalar_first=True), base, joints])
@@ -249,7 +248,7 @@ def _velocities(
         (
             log_map.base_linear_velocity,
             base_time,
-            rates(base_time, base_positions(log_map, channels)),
+            rates(base_time, points(log_map.base_position, channels)),
             "m",
         ),
     ):

@@ -307,6 +307,21 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     return value
 
 
+def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
+    """:func:`load_typed` of a YAML file.
+
+    Raises:
+        ValueError: The file does not exist, is not YAML, or does not fit the schema.
+    """
+    if not path.is_file():
+        raise ValueError(f"{who} does not exist")
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{who} is not YAML: {error}") from error
+    return load_typed(schema, raw, who)
+
+
 def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
     """What a schema of nested dataclasses does not know, with what it knows there."""
     optional = get_args(schema)
@@ -358,13 +373,7 @@ def load_robot_file(path: str | Path) -> RobotModel:
         ValueError: The file does not exist or does not fit the schema.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"robot file '{path}' does not exist")
-    try:
-        raw = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"robot file '{path}' is not YAML: {error}") from error
-    robot = load_typed(RobotModel, raw, f"robot file '{path}'")
+    robot = load_typed_file(RobotModel, path, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)
     return robot
 
