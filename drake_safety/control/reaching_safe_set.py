@@ -18,7 +18,9 @@ from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
     DIRECTIONS,
     convex_hull,
+    fall_margin,
     signed_distance_to_polygon,
+    support_margin,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
 from drake_safety.plants.obstacles import Clearance
@@ -148,13 +150,6 @@ class ReachingSafeSet:
             if is_rate(name) or name.startswith(("capture_point_", "soon_"))
         ]
 
-    def _support(self, q: np.ndarray) -> list[tuple[float, float]]:
-        """Corners of the polygon of the contact points on the ground; none in the air."""
-        p_WC = self.kinematics.contact_positions(q)
-        clearance = p_WC[:, 2] - self.kinematics.foot_radii
-        is_support = clearance < self.limits.support_clearance_m
-        return convex_hull(p_WC[is_support, :2])
-
     def _joint_margins(self, q: np.ndarray) -> np.ndarray:
         """Distance of every joint to its nearer stop, less the margin, (n_j,) [rad]."""
         lowest, highest = self.kinematics.position_limits.T
@@ -175,13 +170,6 @@ class ReachingSafeSet:
         v_WH = V_WB.Shift(R_WB @ self._hand.point).translational()
         return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
-    def _support_margin(self, q: np.ndarray) -> float:
-        corners = self._support(q)
-        if corners:
-            return signed_distance_to_polygon(q[4:6], corners)
-        centre = self.kinematics.contact_positions(q)[:, :2].mean(axis=0)
-        return -float(np.hypot(*(q[4:6] - centre))) - 1e-3
-
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Signed margins (4,) of a state; minus infinity never occurs.
 
@@ -190,18 +178,12 @@ class ReachingSafeSet:
             v: Velocities (n_v,); unused by these constraints.
         """
         del v
-        w, x, y, z = q[:4].tolist()
-        cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
-        fall = min(
-            float(q[6]) - self._lowest_height,
-            self.kinematics.standing_height * (cos_tilt - self._cos_fall_tilt),
-        )
         return np.array(
             [
-                self._support_margin(q),
+                support_margin(self.kinematics, q, self.limits.support_clearance_m),
                 self.clearance.of_arms(q),
                 self._joint_margins(q).min(),
-                fall,
+                fall_margin(self.kinematics, q, self._lowest_height, self._cos_fall_tilt),
             ]
         )
 

@@ -77,6 +77,41 @@ def signed_distance_to_polygon(
     return nearest if inside else -nearest
 
 
+def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: float) -> float:
+    """Signed distance of the base's ground projection to the edge of the feet's polygon [m].
+
+    In the air it is negative: the distance to the middle of the feet.
+
+    Args:
+        kinematics: The robot.
+        q: Positions (n_q,).
+        clearance_m: A contact point on the ground is lower than this.
+    """
+    p_WC = kinematics.contact_positions(q)
+    is_support = p_WC[:, 2] - kinematics.foot_radii < clearance_m
+    if is_support.any():
+        return signed_distance_to_polygon(q[4:6], convex_hull(p_WC[is_support, :2]))
+    x, y = (q[4:6] - p_WC[:, :2].mean(axis=0)).tolist()
+    return -math.hypot(x, y) - 1e-3
+
+
+def fall_margin(
+    kinematics: RobotKinematics, q: np.ndarray, lowest_height_m: float, cos_fall_tilt: float
+) -> float:
+    """Height over the lowest, or what a rigid pendulum has left before it tilts too far [m].
+
+    Args:
+        kinematics: The robot, whose standing height is the pendulum's length.
+        q: Positions (n_q,).
+        lowest_height_m: Of the base.
+        cos_fall_tilt: Cosine of the largest angle between the base's z axis and the vertical.
+    """
+    # Plain floats: each operation on a short array costs more than all of them here.
+    w, x, y, z, _, _, height = q[:7].tolist()
+    cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
+    return min(height - lowest_height_m, kinematics.standing_height * (cos_tilt - cos_fall_tilt))
+
+
 @dataclass(kw_only=True)
 class BalanceLimits:
     """The numbers of :class:`BalanceSafeSet`."""
@@ -142,10 +177,6 @@ class BalanceSafeSet:
         self.feature_names += [f"tracking_error_{axis}" for axis in "xyz"]
         self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
-    def _support(self, p_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        clearance = p_WC[:, 2] - self.kinematics.foot_radii
-        return clearance, clearance < self.limits.support_clearance_m
-
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Signed margins (3,) [m] of a state; minus infinity never occurs.
 
@@ -154,23 +185,15 @@ class BalanceSafeSet:
             v: Velocities (n_v,); unused by these constraints.
         """
         del v
-        p_WC = self.kinematics.contact_positions(q)
-        _, is_support = self._support(p_WC)
-        # Plain floats: each operation on a short array costs more than all of them here.
-        w, x, y, z, base_x, base_y, height = q[:7].tolist()
-        if is_support.any():
-            corners = convex_hull(p_WC[is_support, :2])
-            support = signed_distance_to_polygon((base_x, base_y), corners)
-        else:
-            centre_x, centre_y = p_WC[:, :2].mean(axis=0).tolist()
-            support = -math.hypot(base_x - centre_x, base_y - centre_y) - 1e-3
-        lowest, highest = self.limits.height_m
-        cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
-        fall = min(
-            height - self.limits.fall_height_m,
-            self.kinematics.standing_height * (cos_tilt - self._cos_fall_tilt),
+        kinematics, limits = self.kinematics, self.limits
+        height, (lowest, highest) = float(q[6]), limits.height_m
+        return np.array(
+            [
+                support_margin(kinematics, q, limits.support_clearance_m),
+                min(height - lowest, highest - height),
+                fall_margin(kinematics, q, limits.fall_height_m, self._cos_fall_tilt),
+            ]
         )
-        return np.array([support, min(height - lowest, highest - height), fall])
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """The margins seen in eight directions, now, at the capture point and at the goal.
@@ -198,7 +221,8 @@ class BalanceSafeSet:
         R_SW = np.array([[c, s], [-s, c]])
         origin = np.array([x, y])
         contacts = (p_WC[:, :2] - origin) @ R_SW.T
-        clearance, is_support = self._support(p_WC)
+        clearance = p_WC[:, 2] - kinematics.foot_radii
+        is_support = clearance < limits.support_clearance_m
         if not is_support.any():
             is_support = np.ones_like(is_support)
         base = R_SW @ (q[4:6] - origin)
