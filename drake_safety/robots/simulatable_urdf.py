@@ -8,10 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
 from drake_safety.robots.model_files import MissingExtraError, model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, number, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
 """Of a joint, what Drake ignores with a warning each time that a robot is built."""
@@ -205,14 +206,10 @@ def _listed(names: Iterable[str]) -> str:
 def _box_in_link(box: np.ndarray, shape: ET.Element, mesh: ET.Element) -> np.ndarray:
     """The box around a mesh's box, scaled and posed as a shape is, (2, 3) [m]."""
     scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
-    origin = shape.find("origin")
-    xyz, rpy = (
-        [float(v) for v in (origin.get(key, "0 0 0") if origin is not None else "0 0 0").split()]
-        for key in ("xyz", "rpy")
-    )
-    corners = np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1).T
-    corners = corners @ _rotation(*rpy).T + xyz
-    return np.array([corners.min(axis=0), corners.max(axis=0)])
+    origin = origin_of(shape)
+    X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
+    corners = X_LM @ np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1)
+    return np.array([corners.min(axis=1), corners.max(axis=1)])
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
@@ -258,9 +255,3 @@ def _stl_box(file: Path) -> np.ndarray | None:
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     corners = np.frombuffer(content, kind, count, 84)["corners"].reshape(-1, 3)
     return np.array([corners.min(axis=0), corners.max(axis=0)], dtype=float)
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()

@@ -83,16 +83,13 @@ class UrdfCopy:
 
     def free_fixed_joints(self) -> None:
         """A fixed joint mimics no other: Drake refuses one that says it does."""
-        for joint in self.root.findall("joint"):
-            for mimic in joint.findall("mimic"):
-                if joint.get("type") == "fixed":
-                    joint.remove(mimic)
+        for joint in self.root.findall("joint[@type='fixed']"):
+            _remove(joint, "mimic")
 
     def drop_collisions(self) -> None:
         """Takes out all collision shapes."""
         for link in self.root.findall("link"):
-            for collision in link.findall("collision"):
-                link.remove(collision)
+            _remove(link, "collision")
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
         """Puts meshes that Drake shows in the place of those to be seen.
@@ -131,7 +128,14 @@ class UrdfCopy:
         Raises:
             ValueError: A joint that leads to such a link lies elsewhere there.
         """
-        own_joints, their_joints = self._joint_origins(), other._joint_origins()
+        own_joints, their_joints = (
+            {
+                child.get("link"): origin_of(joint)
+                for joint in urdf.root.findall("joint")
+                if (child := joint.find("child")) is not None
+            }
+            for urdf in (self, other)
+        )
         for colour in other.root.iter("material"):
             # A colour of the same name may be another one here.
             if colour.get("name"):
@@ -148,8 +152,7 @@ class UrdfCopy:
                     f"'{other.source}' cannot say what link '{name}' of '{self.source}' looks "
                     f"like: its joint's origin is {there} there, and {here} here"
                 )
-            for visual in links[name].findall("visual"):
-                links[name].remove(visual)
+            _remove(links[name], "visual")
             for visual in visuals:
                 mesh, material = visual.find("geometry/mesh"), visual.find("material")
                 if mesh is not None:
@@ -159,18 +162,6 @@ class UrdfCopy:
                     if material is not None and has_own_colours(path):
                         visual.remove(material)
                 links[name].append(visual)
-
-    def _joint_origins(self) -> dict[str, list[float]]:
-        """Where the joint to each link lies in its parent, by link: xyz [m] and rpy [rad]."""
-        found = {}
-        for joint in self.root.findall("joint"):
-            child, origin = joint.find("child"), joint.find("origin")
-            text = ["0 0 0", "0 0 0"]
-            if origin is not None:
-                text = [origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0")]
-            if child is not None:
-                found[child.get("link", "")] = [float(word) for word in " ".join(text).split()]
-        return found
 
     def convert_visual_meshes(self) -> None:
         """Puts glTF files of the user's cache in the place of visual meshes Drake does not show.
@@ -222,14 +213,10 @@ class UrdfCopy:
             radius_m: Radius of each.
         """
         link = self.link(link_name)
-        for collision in link.findall("collision"):
-            link.remove(collision)
+        _remove(link, "collision")
         for index, point in enumerate(points):
-            collision = ET.SubElement(link, "collision", name=f"{link_name}_contact_{index}")
-            xyz = " ".join(f"{value:.5g}" for value in point)
-            ET.SubElement(collision, "origin", xyz=xyz, rpy="0 0 0")
-            geometry = ET.SubElement(collision, "geometry")
-            ET.SubElement(geometry, "sphere", radius=f"{radius_m:.5g}")
+            name = f"{link_name}_contact_{index}"
+            _add_collision(link, name, point, "sphere", radius=f"{radius_m:.5g}")
         self.notes.append(
             f"link '{link_name}' touches the ground with {len(points)} spheres in place of its "
             "own collision shapes"
@@ -247,13 +234,8 @@ class UrdfCopy:
         boxes = self.lost_shapes.get(link_name, [])
         link = self.link(link_name)
         for index, (low, high) in enumerate(boxes):
-            collision = ET.SubElement(link, "collision", name=f"{link_name}_box_{index}")
-            xyz, size = (
-                " ".join(f"{value:.5g}" for value in values)
-                for values in ((low + high) / 2, high - low)
-            )
-            ET.SubElement(collision, "origin", xyz=xyz, rpy="0 0 0")
-            ET.SubElement(ET.SubElement(collision, "geometry"), "box", size=size)
+            name = f"{link_name}_box_{index}"
+            _add_collision(link, name, (low + high) / 2, "box", size=_numbers(high - low))
         if boxes:
             self.notes.append(
                 f"link '{link_name}' collides as the box around each mesh that it had"
@@ -343,6 +325,31 @@ def _parsed(content: bytes) -> ET.Element:
         ET.register_namespace(prefix, address)
     ET.register_namespace("drake", _DRAKE)
     return root
+
+
+def _remove(element: ET.Element, tag: str) -> None:
+    """Takes the parts of a kind out of an element."""
+    for part in element.findall(tag):
+        element.remove(part)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(f"{value:.5g}" for value in values)
+
+
+def _add_collision(
+    link: ET.Element, name: str, center: np.ndarray, shape: str, **sizes: str
+) -> None:
+    collision = ET.SubElement(link, "collision", name=name)
+    ET.SubElement(collision, "origin", xyz=_numbers(center), rpy="0 0 0")
+    ET.SubElement(ET.SubElement(collision, "geometry"), shape, sizes)
+
+
+def origin_of(element: ET.Element) -> list[float]:
+    """Where an element lies in its parent: xyz [m] and rpy [rad], (6,)."""
+    origin = element.find("origin")
+    texts = [("" if origin is None else origin.get(key)) or "0 0 0" for key in ("xyz", "rpy")]
+    return [float(word) for word in " ".join(texts).split()]
 
 
 def _colour(material: ET.Element | None, colours: dict[str, ET.Element]) -> str:
