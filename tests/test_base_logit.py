@@ -84,7 +84,7 @@ def test_each_head_counts_for_what_it_is_worth(segments, safety_slope):
     assert np.isfinite(logit).all()
 
 
-def test_one_input_has_the_same_logit_as_many():
+def test_the_logit_is_that_of_the_mean_head_and_the_smallest_mean_margin_and_is_limited():
     logit = BaseLogit(
         margin_unit=0.02,
         margin_range=(-0.03, 0.1),
@@ -96,9 +96,6 @@ def test_one_input_has_the_same_logit_as_many():
         np.zeros((2, 1, 2)), np.array([[1.0], [9.0]]), np.array([[[0.02, 0.5]], [[0.04, 0.5]]])
     )
     expected = -0.2 + 0.8 * np.mean([1.0, 8.0]) - 1.3 * 0.03 / 0.02
-    heads, one = logit.heads(output), logit.heads_one([1.0, 9.0], 0.03)
-    np.testing.assert_allclose(heads, [one])
+    heads = logit.heads(output)
     assert logit.of_heads(heads)[0] == pytest.approx(expected)
-    assert logit.of_one(*one) == pytest.approx(expected)
-    steep = dataclasses.replace(logit, safety_slope=10.0)
-    assert steep.of_heads(heads)[0] == steep.of_one(*one) == 8.0
+    assert dataclasses.replace(logit, safety_slope=10.0).of_heads(heads)[0] == 8.0
