@@ -1,17 +1,11 @@
 """The ground that a robot stands on."""
 
-import logging
-
 from pydrake.geometry import HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 
 from drake_safety.robots.robot import add_to_package_map
-
-# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
-# is deformable.
-logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
 
 
 def add_ground(plant: MultibodyPlant, friction: float) -> None:

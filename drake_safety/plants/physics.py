@@ -253,6 +253,11 @@ def _furnish(
 ) -> tuple[ModelInstanceIndex, ModelInstanceIndex | None]:
     """Fills and finalises a plant; returns the model instances of robot and ball."""
     plant.set_name("plant")
+    # By default shapes are prepared for deformable contact too, and Drake warns that the ground's
+    # half space takes no part in it. Nothing here is deformable.
+    config = scene_graph.get_config()
+    config.default_proximity_properties.resolution_hint = None
+    scene_graph.set_config(config)
     instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
     add_ground(plant, variation.foot_friction or robot.foot_friction)
     ball = add_ball(plant) if scene.has_ball else None
