@@ -1,6 +1,9 @@
 """Safety assessment for robots in Drake: beforehand, will this motion stay safe?"""
 
+import sys
 from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +25,41 @@ __all__ = [
     "run_episodes",
 ]
 
-# In a checkout `models`, `diagrams` and `assessments` stand beside this package, in a wheel inside
-# it.
-if not (Path(__file__).parent / "models").is_dir():
-    __path__.append(str(Path(__file__).resolve().parents[1]))
+_PACKAGE = Path(__file__).resolve().parent
+_BESIDE = ("assessments", "diagrams", "models")
+
+
+def package_folder(name: str) -> Path:
+    """Where `models`, `diagrams` or `assessments` stands: in this package, or in a checkout beside it.
+
+    Args:
+        name: One of the three.
+    """
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
+
+
+class _CheckoutFinder:
+    """Finds in a checkout what stands beside this package, by the name that it is installed as.
+
+    An editable install's finder does so too, but for the checkout that was installed, which need
+    not be the one that this package was imported from.
+    """
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """The module's spec; None for any but the three."""
+        parent, _, child = name.rpartition(".")
+        if parent != __name__ or child not in _BESIDE:
+            return None
+        folder = package_folder(child)
+        return spec_from_file_location(
+            name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+        )
+
+
+if not (_PACKAGE / "models").is_dir():
+    sys.meta_path.insert(0, _CheckoutFinder)
 
 # Resolved on first use: an online run needs neither the training code nor the rollouts.
 _HOMES = {

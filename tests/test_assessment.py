@@ -47,6 +47,13 @@ def area_under_curve(score, is_positive):
     return ((difference > 0.0) + 0.5 * (difference == 0.0)).mean()
 
 
+def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
+    parameters = AssessmentParameters(hidden_sizes=[8, 8])
+    learner = SafetyAssessment(parameters)
+    parameters.mode, parameters.hidden_sizes[0] = "paper", 3
+    assert (learner.parameters.mode, learner.parameters.hidden_sizes) == ("sharpened", [8, 8])
+
+
 def test_held_out_episodes_are_told_apart(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
     area = area_under_curve(result.safety_probability, ~held_out.is_unsafe)

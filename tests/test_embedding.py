@@ -143,11 +143,14 @@ def test_one_input_alone_gives_what_it_gives_among_many(data, embedding):
     output = embedding.evaluate(data.x)
     activations = embedding.activations(data.x)
     for row in (0, 17, 599):
-        one, hidden = embedding.evaluate_one(data.x[row].astype(np.float32))
-        np.testing.assert_allclose(one[:, :2], output.embedding[:, row], rtol=1e-4, atol=1e-3)
-        np.testing.assert_allclose(one[:, 2:], output.margins[:, row], rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(hidden[:, :-1], activations[:, row], rtol=1e-4, atol=1e-4)
-        np.testing.assert_array_equal(hidden[:, -1], 1.0)
+        x = data.x[row : row + 1]
+        one = embedding.evaluate(x)
+        np.testing.assert_allclose(
+            one.embedding[:, 0], output.embedding[:, row], rtol=1e-4, atol=1e-3
+        )
+        np.testing.assert_allclose(one.margins[:, 0], output.margins[:, row], rtol=1e-4, atol=1e-5)
+        hidden = embedding.activations(x)[:, 0]
+        np.testing.assert_allclose(hidden, activations[:, row], rtol=1e-4, atol=1e-4)
 
 
 def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):

@@ -19,8 +19,6 @@ def test_the_first_coordinate_counts_rows():
 @pytest.mark.parametrize("point", [(70.0, 0.0), (0.0, -70.1), (np.nan, 0.0), (np.inf, 0.0)])
 def test_a_point_beyond_the_edge_is_outside_and_not_in_the_last_cell(point):
     assert GRID.locate(np.array(point)) == OUTSIDE
-    assert GRID.locate_one(*point) == OUTSIDE
-    assert GRID.bilinear_one(*point) is None
     cells, weights = GRID.bilinear(np.array(point))
     assert np.all(cells == OUTSIDE)
     assert np.all(weights == 0.0)
@@ -59,22 +57,11 @@ def test_between_the_outermost_centres_and_the_edge_the_nearest_centres_count():
     np.testing.assert_allclose((weights * values[cells]).sum(axis=1), [0.0, 13 * 14, 0.5])
 
 
-def test_one_point_alone_is_treated_as_among_many():
-    points = np.random.default_rng(3).uniform(-70.0, 69.99, size=(300, 2))
-    cells, weights = GRID.bilinear(points)
-    for i, point in enumerate(points.tolist()):
-        assert GRID.locate_one(*point) == GRID.locate(points[i])
-        one_cells, one_weights = GRID.bilinear_one(*point)
-        assert one_cells == cells[i].tolist()
-        np.testing.assert_allclose(one_weights, weights[i], atol=1e-12)
-
-
 def test_a_grid_of_one_cell_interpolates_to_that_cell():
     grid = Grid(resolution=1, cell_length=2.0)
     cells, weights = grid.bilinear(np.array([0.3, -0.7]))
     assert set(cells.tolist()) == {0}
     assert weights.sum() == pytest.approx(1.0)
-    assert set(grid.bilinear_one(0.3, -0.7)[0]) == {0}
 
 
 def test_points_that_coincide_cannot_be_scaled():

@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.learning.prediction import Correction
+from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 PERIOD_S = 0.04
@@ -45,7 +45,7 @@ class AssessmentDouble:
         self.uses_features = uses_features
         self.asked = []
 
-    def predict_row(self, state, desired_preview, features, beliefs, correction):
+    def predict_one(self, state, desired_preview, features, *, beliefs, correction):
         self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
         if not np.isfinite(state).all():
             safe, belief = 0.0, [0.0, 0.0, 1.0]
@@ -53,7 +53,15 @@ class AssessmentDouble:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
         calibrated = safe + correction.hidden[0, 3] * correction.guard[0, 5]
-        return np.array([safe, safe / 0.9, *belief, 0.2, 0.3, 3.0, -4.0, 0.01, np.nan, calibrated])
+        return Assessment(
+            safety_probability=safe,
+            normalized=safe / 0.9,
+            belief=np.array(belief),
+            cause_probability=np.array([0.2, 0.3]),
+            embedding=np.array([3.0, -4.0]),
+            predicted_margins=np.array([0.01, np.nan]),
+            calibrated=calibrated,
+        )
 
 
 def running(assessment=None, features=FEATURES):

@@ -25,7 +25,7 @@ from drake_safety.learning.feedback import (
     segments_of,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import check_width, input_parts
+from drake_safety.learning.inputs import check_width, inputs
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import INPUT_LIMIT
@@ -71,7 +71,8 @@ class SafetyAssessment:
     """
 
     def __init__(self, parameters: AssessmentParameters | None = None):
-        self.parameters = AssessmentParameters() if parameters is None else parameters
+        # A copy: what a scenario is changed to afterwards is not what was learned with.
+        self.parameters = copy.deepcopy(parameters or AssessmentParameters())
 
     @property
     def uses_features(self) -> bool:
@@ -194,6 +195,7 @@ class SafetyAssessment:
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
+        adapted.parameters = copy.deepcopy(self.parameters)
         # What was promised was promised of other beliefs.
         adapted.calibrations_ = {}
         arguments = (self.grid_, self.parameters, self.num_causes)
@@ -247,13 +249,7 @@ class SafetyAssessment:
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
         """x, (N, n_x): [s; z*] in the paper's mode, [s; z*; features] in the sharpened one."""
-        parts = input_parts(
-            np.asarray(state, dtype=float),
-            np.asarray(desired_preview, dtype=float),
-            None if features is None else np.asarray(features, dtype=float),
-            self.parameters,
-        )
-        return np.concatenate(parts, axis=-1)
+        return inputs(state, desired_preview, features, self.parameters)
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "beliefs_"):
@@ -327,51 +323,20 @@ class SafetyAssessment:
         correction: Correction | None = None,
     ) -> Assessment:
         """Assesses one input; the arguments are those of `predict` without the axis N."""
-        self._check_fitted()
-        learned = self._or_own(beliefs, correction)
-        row = self.predict_row(state, desired_preview, features, *learned)
-        num_columns = self.beliefs_.shape[2]
-        return Assessment(
-            safety_probability=float(row[0]),
-            normalized=float(row[1]),
-            belief=row[2:5],
-            cause_probability=row[5 : 2 + num_columns],
-            embedding=row[2 + num_columns : 4 + num_columns],
-            predicted_margins=row[4 + num_columns : -1],
-            calibrated=float(row[-1]),
-        )
-
-    def predict_row(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None,
-        beliefs: np.ndarray,
-        correction: Correction,
-    ) -> np.ndarray:
-        """`predict_one` as one vector, for the online run.
-
-        Returns:
-            The fields of `Assessment` one after the other, in their order, (8 + 2 n_c,).
-        """
-        parts = input_parts(state, desired_preview, features, self.parameters)
-        width = sum(map(len, parts))
-        if width != self.embedding_.num_inputs:
-            check_width(width, self.info_, self.parameters)
-        return prediction.predict_row(
-            parts,
-            embedding=self.embedding_,
-            grid=self.grid_,
+        result = self.predict(
+            np.asarray(state)[None],
+            np.asarray(desired_preview)[None],
+            None if features is None else np.asarray(features)[None],
             beliefs=beliefs,
             correction=correction,
-            base_logit=self.base_logit_,
-            is_sharpened=self.parameters.is_sharpened,
         )
+        return result.one(0)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one safetensors file, first under a temporary name: it is whole or absent."""
         self._check_fitted()
-        assessment_file.save(self, Path(path))
+        learned = {name: value for name, value in vars(self).items() if name.endswith("_")}
+        assessment_file.write(Path(path), self.parameters, learned)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
@@ -380,12 +345,7 @@ class SafetyAssessment:
         Raises:
             ValueError: The file is truncated, of another kind, or of another schema version.
         """
-        entries, tensors = assessment_file.read(Path(path))
-        assessment = cls(entries["parameters"])
-        try:
-            assessment.info_ = entries["info"]
-            assessment.adaptation_ = entries["adaptation"]
-            assessment_file.restore(assessment, tensors, **entries["numbers"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
+        parameters, learned = assessment_file.read(Path(path))
+        assessment = cls(parameters)
+        vars(assessment).update(learned)
         return assessment

@@ -7,9 +7,9 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,41 +22,52 @@ from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
-if TYPE_CHECKING:
-    from drake_safety.learning.assessment import SafetyAssessment
-
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 4
 
+_MAPS, _CORRECTION = "embedding.", "correction."
+_TRAINING: dict[str, tuple[type, type]] = {
+    "training_points": (np.float32, np.float32),
+    "training_score": (np.float32, float),
+    "training_cause": (np.int16, np.int64),
+    "training_heads": (np.float32, float),
+    "training_nearest": (np.int16, np.int64),
+}
+"""What is kept of the training segments, as it is stored and as it is used."""
+_OF_HEADS = ("training_heads", "training_nearest")
 
-def write(
-    path: Path,
-    *,
-    parameters: AssessmentParameters,
-    info: EpisodesInfo,
-    adaptation: Adaptation | None,
-    numbers: Mapping[str, Any],
-    tensors: Mapping[str, np.ndarray],
-) -> None:
+
+def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
     """Writes one safetensors file, first under a temporary name.
 
     Args:
         path: The file.
         parameters: What the assessment was learned with.
-        info: What its training episodes share.
-        adaptation: What it was adapted to.
-        numbers: Further values, of JSON types.
-        tensors: Arrays by name.
+        learned: The assessment's learned attributes by name.
     """
     from safetensors.numpy import save
 
+    embedding, correction = learned["embedding_"], learned["correction_"]
+    tensors = {f"{_MAPS}{name}": w for name, w in embedding.weights.items()}
+    tensors |= {f"{_CORRECTION}{name}": value for name, value in asdict(correction).items()}
+    tensors["correction.guard"] = correction.guard.astype(np.uint8)
+    tensors["beliefs"] = learned["beliefs_"]
+    for name, (stored, _) in _TRAINING.items():
+        if learned[f"{name}_"] is not None:
+            tensors[name] = learned[f"{name}_"].astype(stored)
+    adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
+    numbers = {
+        "num_margins": embedding.num_margins,
+        "base_logit": None if base_logit is None else asdict(base_logit),
+        "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
+    }
     metadata = {
         "schema": SCHEMA,
         "schema_version": str(SCHEMA_VERSION),
         "parameters": json.dumps(asdict(parameters)),
-        "info": json.dumps(asdict(info)),
+        "info": json.dumps(asdict(learned["info_"])),
         "adaptation": json.dumps(None if adaptation is None else asdict(adaptation)),
-        "numbers": json.dumps(dict(numbers)),
+        "numbers": json.dumps(numbers),
     }
     content = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -72,11 +83,11 @@ def write(
         raise
 
 
-def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
     """Reads what `write` wrote.
 
     Returns:
-        "parameters", "info", "adaptation" and "numbers" by name, and the arrays.
+        The parameters, and the learned attributes by name.
 
     Raises:
         ValueError: The file is truncated, of another kind, of another schema version, or lacks
@@ -94,121 +105,62 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             f"reads {SCHEMA_VERSION}: train the assessment again (episodes are kept: `--resume`)"
         )
     try:
-        parameters = json.loads(metadata["parameters"])
-        parameters["adaptation"] = AdaptationParameters(**parameters["adaptation"])
-        adaptation = json.loads(metadata["adaptation"])
-        return {
-            "parameters": AssessmentParameters(**parameters),
-            "info": EpisodesInfo(**json.loads(metadata["info"])),
-            "adaptation": None if adaptation is None else Adaptation(**adaptation),
-            "numbers": json.loads(metadata["numbers"]),
-        }, tensors
+        entries = {
+            name: json.loads(metadata[name])
+            for name in ("parameters", "info", "adaptation", "numbers")
+        }
+        adaptation = AdaptationParameters(**entries["parameters"].pop("adaptation"))
+        parameters = AssessmentParameters(**entries["parameters"], adaptation=adaptation)
+        return parameters, _learned(parameters, entries, tensors)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
 
 
-def save(assessment: SafetyAssessment, path: Path) -> None:
-    """Writes a fitted assessment.
-
-    Args:
-        assessment: The assessment.
-        path: The file.
-    """
-    base_logit, correction = assessment.base_logit_, assessment.correction_
-    tensors: dict[str, np.ndarray] = {
-        f"embedding.{name}": w for name, w in assessment.embedding_.weights.items()
-    }
-    tensors |= {
-        "beliefs": assessment.beliefs_,
-        "correction.change": correction.change,
-        "correction.hidden": correction.hidden,
-        "correction.hidden_range": correction.hidden_range,
-        "correction.guard": correction.guard.astype(np.uint8),
-        "training_points": assessment.training_points_,
-        "training_score": assessment.training_score_.astype(np.float32),
-        "training_cause": assessment.training_cause_.astype(np.int16),
-    }
-    if assessment.training_heads_ is not None and assessment.training_nearest_ is not None:
-        tensors["training_heads"] = assessment.training_heads_.astype(np.float32)
-        tensors["training_nearest"] = assessment.training_nearest_.astype(np.int16)
-    write(
-        path,
-        parameters=assessment.parameters,
-        info=assessment.info_,
-        adaptation=assessment.adaptation_,
-        numbers={
-            "num_margins": assessment.embedding_.num_margins,
-            "base_logit": None if base_logit is None else asdict(base_logit),
-            "calibrations": [one.to_json() for one in assessment.calibrations_.values()],
-        },
-        tensors=tensors,
-    )
-
-
-def restore(
-    assessment: SafetyAssessment,
-    tensors: dict[str, np.ndarray],
-    *,
-    num_margins: int,
-    base_logit: dict[str, Any] | None,
-    calibrations: list[dict[str, Any]],
-) -> None:
-    """Gives an assessment, whose parameters and info are known, the rest of what `save` wrote.
-
-    Args:
-        assessment: The assessment.
-        tensors: Arrays by name.
-        num_margins: n_c of the maps; 0 without a margin head.
-        base_logit: L; None without heads.
-        calibrations: Of each kind.
-
-    Raises:
-        KeyError: An array is missing.
-        ValueError: Shapes do not fit each other.
-    """
-    parameters, info = assessment.parameters, assessment.info_
-    assessment.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-    prefix = "embedding."
-    weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-    assessment.embedding_ = Embedding(weights, num_margins=num_margins)
-    if assessment.embedding_.num_inputs != num_inputs(info, parameters):
+def _learned(
+    parameters: AssessmentParameters, entries: dict[str, Any], tensors: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    info, numbers = EpisodesInfo(**entries["info"]), entries["numbers"]
+    grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
+    weights = {k.removeprefix(_MAPS): v for k, v in tensors.items() if k.startswith(_MAPS)}
+    embedding = Embedding(weights, num_margins=numbers["num_margins"])
+    expected_inputs = num_inputs(info, parameters)
+    if embedding.num_inputs != expected_inputs:
         raise ValueError(
-            f"its maps take {assessment.embedding_.num_inputs} inputs, "
-            f"its names amount to {num_inputs(info, parameters)}"
+            f"its maps take {embedding.num_inputs} inputs, its names amount to {expected_inputs}"
         )
-    assessment.training_points_ = tensors["training_points"]
-    assessment.training_score_ = single(tensors["training_score"])
-    assessment.training_cause_ = tensors["training_cause"].astype(np.int64)
-    heads, nearest = tensors.get("training_heads"), tensors.get("training_nearest")
-    assessment.training_heads_ = None if heads is None else single(heads)
-    assessment.training_nearest_ = None if nearest is None else nearest.astype(np.int64)
-    assessment.base_logit_ = None
+    base_logit = numbers["base_logit"]
     if base_logit is not None:
         low, high = base_logit["margin_range"]
-        assessment.base_logit_ = BaseLogit(**base_logit | {"margin_range": (low, high)})
-    stored = [Calibration(**one) for one in calibrations]
-    assessment.calibrations_ = {one.kind: one for one in stored}
-    assessment.beliefs_ = tensors["beliefs"]
-    assessment.correction_ = Correction(
-        change=tensors["correction.change"],
-        hidden=tensors["correction.hidden"],
-        hidden_range=tensors["correction.hidden_range"],
-        guard=tensors["correction.guard"].astype(float),
-    )
-    num_members, num_cells = assessment.embedding_.num_members, assessment.grid_.num_cells
-    for name, shape, expected in (
-        ("beliefs", assessment.beliefs_.shape, (num_members, num_cells, 3 + assessment.num_causes)),
-        ("correction's change", assessment.correction_.change.shape, (3,)),
-        (
-            "correction's hidden",
-            assessment.correction_.hidden.shape,
-            (num_members, assessment.embedding_.num_activations + 1),
-        ),
-        ("correction's hidden_range", assessment.correction_.hidden_range.shape, (2,)),
-        ("correction's guard", assessment.correction_.guard.shape, (num_members, num_cells)),
-    ):
-        if shape != expected:
-            raise ValueError(f"the shape of its {name} is {shape}, expected {expected}")
+        base_logit = BaseLogit(**base_logit | {"margin_range": (low, high)})
+    correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
+    correction["guard"] = correction["guard"].astype(float)
+    calibrations = [Calibration(**one) for one in numbers["calibrations"]]
+    adaptation = entries["adaptation"]
+    learned: dict[str, Any] = {
+        "info_": info,
+        "grid_": grid,
+        "embedding_": embedding,
+        "base_logit_": base_logit,
+        "beliefs_": tensors["beliefs"],
+        "correction_": Correction(**correction),
+        "calibrations_": {one.kind: one for one in calibrations},
+        "adaptation_": None if adaptation is None else Adaptation(**adaptation),
+    }
+    for name, (_, used) in _TRAINING.items():
+        is_optional = name in _OF_HEADS and base_logit is None
+        learned[f"{name}_"] = None if is_optional else tensors[name].astype(used)
+    cells = (embedding.num_members, grid.num_cells)
+    expected = {
+        "beliefs": (*cells, 3 + len(info.constraint_names)),
+        "correction.change": (3,),
+        "correction.hidden": (embedding.num_members, embedding.num_activations + 1),
+        "correction.hidden_range": (2,),
+        "correction.guard": cells,
+    }
+    for name, shape in expected.items():
+        if tensors[name].shape != shape:
+            raise ValueError(f"the shape of its {name} is {tensors[name].shape}, expected {shape}")
+    return learned
 
 
 def single(values: np.ndarray) -> np.ndarray:

@@ -76,8 +76,8 @@ class AssessmentParameters:
         batch_size: Segments a training step.
         epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of the episodes that a map does not learn from, others for each map: what
-            the maps say of those makes Gamma a probability (sharpened).
+        held_out: Share of the episodes that no map learns from: what the maps say of those
+            together makes Gamma a probability (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Share of activations dropped in training (sharpened).
         target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety

@@ -77,9 +77,10 @@ class Grid:
     def locate(self, points: np.ndarray) -> np.ndarray:
         """L: the cell of each point (..., 2), or `OUTSIDE`."""
         position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
-        is_inside = np.all((position >= 0.0) & (position < self.resolution), axis=-1)
-        index = np.where(is_inside[..., None], position, 0.0).astype(int)
-        return np.where(is_inside, index[..., 0] * self.resolution + index[..., 1], OUTSIDE)
+        is_inside = _is_within(position, self.resolution)
+        index = np.where(is_inside, position, 0.0).astype(int)
+        cells = index[..., 0] * self.resolution + index[..., 1]
+        return np.where(is_inside[..., 0], cells, OUTSIDE)
 
     def bilinear(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weights that interpolate between the centres of the four cells around each point.
@@ -93,49 +94,24 @@ class Grid:
             Cells (..., 4) and their weights (..., 4), which sum to one; a point that lies outside
             the grid has cells `OUTSIDE` and weights zero.
         """
-        points = np.asarray(points, dtype=float)
-        is_inside = self.locate(points) != OUTSIDE
-        position = (points + self.half_width) / self.cell_length - 0.5
-        position = np.clip(
-            np.where(is_inside[..., None], position, 0.0), 0.0, self.resolution - 1.0
-        )
-        lower = np.minimum(position.astype(int), max(self.resolution - 2, 0))
-        upper = np.minimum(lower + 1, self.resolution - 1)
+        position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
+        is_inside = _is_within(position, self.resolution)
+        last = self.resolution - 1
+        position = np.where(is_inside, position - 0.5, 0.0).clip(0.0, last)
+        lower = np.minimum(position.astype(int), max(last - 1, 0))
         fraction = position - lower
-        cells, weights = [], []
-        for first, w_first in ((lower, 1.0 - fraction), (upper, fraction)):
-            for second, w_second in ((lower, 1.0 - fraction), (upper, fraction)):
-                cells.append(first[..., 0] * self.resolution + second[..., 1])
-                weights.append(w_first[..., 0] * w_second[..., 1])
+        # Both neighbours along an axis, and then the four pairs of them.
+        index = np.stack([lower, np.minimum(lower + 1, last)], axis=-2)
+        weight = np.stack([1.0 - fraction, fraction], axis=-2)
+        cells = index[..., :, None, 0] * self.resolution + index[..., None, :, 1]
+        weights = weight[..., :, None, 0] * weight[..., None, :, 1]
+        shape = (*is_inside.shape[:-1], 4)
         return (
-            np.where(is_inside[..., None], np.stack(cells, axis=-1), OUTSIDE),
-            np.where(is_inside[..., None], np.stack(weights, axis=-1), 0.0),
+            np.where(is_inside, cells.reshape(shape), OUTSIDE),
+            np.where(is_inside, weights.reshape(shape), 0.0),
         )
 
-    def bilinear_one(self, first: float, second: float) -> tuple[list[int], list[float]] | None:
-        """`bilinear` of one point in plain floats, for the online run; None outside."""
-        size, half = self.resolution, self.half_width
-        u = (first + half) / self.cell_length
-        v = (second + half) / self.cell_length
-        if not (0.0 <= u < size and 0.0 <= v < size):
-            return None
-        last = size - 1
-        u = min(max(u - 0.5, 0.0), last)
-        v = min(max(v - 0.5, 0.0), last)
-        i, j = min(int(u), max(last - 1, 0)), min(int(v), max(last - 1, 0))
-        u -= i
-        v -= j
-        row, next_row, next_j = i * size, min(i + 1, last) * size, min(j + 1, last)
-        return (
-            [row + j, row + next_j, next_row + j, next_row + next_j],
-            [(1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v],
-        )
 
-    def locate_one(self, first: float, second: float) -> int:
-        """`locate` of one point in plain floats, for the online run."""
-        size, half = self.resolution, self.half_width
-        u = (first + half) / self.cell_length
-        v = (second + half) / self.cell_length
-        if not (0.0 <= u < size and 0.0 <= v < size):
-            return OUTSIDE
-        return int(u) * size + int(v)
+def _is_within(position: np.ndarray, resolution: int) -> np.ndarray:
+    """Whether positions (..., 2) in units of cells lie in the grid, (..., 1); not where NaN."""
+    return np.all((position >= 0.0) & (position < resolution), axis=-1, keepdims=True)

@@ -8,13 +8,13 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.segments import EpisodesInfo
 
 
-def input_parts(
+def inputs(
     state: np.ndarray,
     desired_preview: np.ndarray,
     features: np.ndarray | None,
     parameters: AssessmentParameters,
-) -> tuple[np.ndarray, ...]:
-    """What x consists of, in its order, along the last axis.
+) -> np.ndarray:
+    """x, (..., n_x): [s; z*] in the paper's mode, [s; z*; features] in the sharpened one.
 
     Args:
         state: States as the assessor sees them, (..., n_s).
@@ -22,11 +22,12 @@ def input_parts(
         features: Features, (..., n_f); the paper's mode has no use for them.
         parameters: Of the assessment. With a feature unit u, asinh(features / u) comes last.
     """
-    if features is None or not parameters.is_sharpened:
-        return state, desired_preview
-    if not parameters.feature_unit:
-        return state, desired_preview, features
-    return state, desired_preview, features, np.arcsinh(features / parameters.feature_unit)
+    parts = [np.asarray(state, dtype=float), np.asarray(desired_preview, dtype=float)]
+    if features is not None and parameters.is_sharpened:
+        parts.append(np.asarray(features, dtype=float))
+        if parameters.feature_unit:
+            parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
+    return np.concatenate(parts, axis=-1)
 
 
 def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +42,18 @@ class Assessments:
     predicted_margins: np.ndarray
     unsafe_logit: np.ndarray
     calibrated: np.ndarray
+
+    def one(self, row: int) -> Assessment:
+        """What it says of one of them."""
+        return Assessment(
+            safety_probability=float(self.safety_probability[row]),
+            normalized=float(self.normalized[row]),
+            belief=self.belief[row],
+            cause_probability=self.cause_probability[row],
+            embedding=self.embedding[row],
+            predicted_margins=self.predicted_margins[row],
+            calibrated=float(self.calibrated[row]),
+        )
 
 
 @dataclass(kw_only=True, eq=False, slots=True)
@@ -94,26 +105,6 @@ class BaseLogit:
         logit = self.offset + heads @ (self.safety_slope, self.margin_slope)
         return np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
-    def heads_one(self, logits: list[float], margin: float | None) -> tuple[float, float]:
-        """`heads` of one input in plain floats, for the online run.
-
-        Args:
-            logits: Of each member's safety head; none without heads.
-            margin: Smallest predicted margin, if there is a margin head.
-        """
-        z = nearness = 0.0
-        if logits:
-            z = sum([min(max(one, -LOGIT_LIMIT), LOGIT_LIMIT) for one in logits]) / len(logits)
-        if margin is not None:
-            low, high = self.margin_range
-            nearness = -min(max(margin, low), high) / self.margin_unit
-        return z, nearness
-
-    def of_one(self, z: float, nearness: float) -> float:
-        """L of what `heads_one` gave."""
-        logit = self.offset + self.safety_slope * z + self.margin_slope * nearness
-        return min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)
-
 
 @dataclass(eq=False, slots=True)
 class Correction:
@@ -142,6 +133,11 @@ class Correction:
             hidden_range=np.zeros(2),
             guard=np.zeros((embedding.num_members, grid.num_cells)),
         )
+
+    @property
+    def is_any(self) -> bool:
+        """Whether anything is added at all."""
+        return bool(self.change.any() or self.hidden.any())
 
     def residual(self, embedding: Embedding, x: np.ndarray) -> np.ndarray:
         """What the hidden layer adds to L at finite inputs (N, n_x), (N,)."""
@@ -205,35 +201,36 @@ def predict(
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)
+    cells, weights = _cells(output.embedding, grid, is_sharpened)
+    is_outside = cells[..., 0] == OUTSIDE
+    # Rows of all members' cells; a point outside has weights of zero, so any row will do for it.
+    cells = cells + grid.num_cells * np.arange(len(cells))[:, None, None]
     num_members, _, num_columns = beliefs.shape
-    columns = np.concatenate([beliefs, correction.guard[..., None]], axis=2)
-    masses = np.zeros((len(x), num_columns))
-    guard = np.zeros(len(x))
-    num_inside = np.zeros(len(x), dtype=int)
-    for values, points in zip(columns, output.embedding, strict=True):
-        read, is_outside = _read(values, points, grid, is_sharpened)
-        guard += read[:, -1]
-        num_inside += ~is_outside
-        read = read[:, :-1]
-        read[is_outside] = belief_masses.empty((), num_columns - 3)
-        masses += read
+    masses = np.einsum("knw,knwc->nc", weights, beliefs.reshape(-1, num_columns)[cells])
+    # A map that sends the input outside its grid knows nothing of it.
+    masses[:, belief_masses.UNCERTAINTY] += is_outside.sum(axis=0)
     masses /= num_members
     safe = masses[:, belief_masses.SAFE]
     # As a sum, not as 1 - mu: rounding must not lift the share above one.
     known = safe + masses[:, belief_masses.UNSAFE]
-    normalized = np.divide(safe, known, out=np.zeros_like(safe), where=known > 0.0)
+    is_known = known > 0.0
+    normalized = np.divide(safe, known, out=np.zeros_like(safe), where=is_known)
     calibrated = normalized.copy()
-    if base_logit is not None:
-        is_known = known > 0.0
-        heads = base_logit.heads(output)[is_known]
-        residual = correction.residual(embedding, x[is_known])
-        shift = correction.shift(heads, residual, guard[is_known] / num_inside[is_known])
-        calibrated[is_known] = sigmoid(-base_logit.of_heads(heads) - shift)
+    if base_logit is not None and is_known.any():
+        heads = base_logit.heads(output)
+        shift = np.zeros(len(x))
+        if correction.is_any:
+            guard = np.einsum("knw,knw->n", weights, correction.guard.ravel()[cells])
+            guard /= np.maximum(num_members - is_outside.sum(axis=0), 1)
+            residual = np.zeros(len(x))
+            residual[is_known] = correction.residual(embedding, x[is_known])
+            shift = correction.shift(heads, residual, guard)
+        calibrated[is_known] = sigmoid(-base_logit.of_heads(heads) - shift)[is_known]
     margins = np.full((len(x), num_columns - 3), np.nan)
     if output.margins.shape[2]:
         margins = output.margins.mean(axis=0)
     return Assessments(
-        # Gamma(x) = b_safe of the cell v = L(x)
+        # Gamma(x) = b_safe of the cell that Psi(x) lies in
         safety_probability=safe.copy(),
         normalized=normalized,
         belief=masses[:, :3].copy(),
@@ -245,95 +242,9 @@ def predict(
     )
 
 
-def _read(
-    values: np.ndarray, points: np.ndarray, grid: Grid, is_sharpened: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cell values (R*R, c) at points (N, 2) of one map, zero outside, and which lie outside."""
+def _cells(points: np.ndarray, grid: Grid, is_sharpened: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that beliefs are read from and their weights, (K, N, 4), or (K, N, 1) as printed."""
     if is_sharpened:
-        cells, weights = grid.bilinear(points)
-        return np.einsum("nk,nkc->nc", weights, values[cells]), cells[:, 0] == OUTSIDE
-    cells = grid.locate(points)
-    is_outside = cells == OUTSIDE
-    return np.where(is_outside[:, None], 0.0, values[cells]), is_outside
-
-
-def predict_row(
-    parts: tuple[np.ndarray, ...],
-    *,
-    embedding: Embedding,
-    grid: Grid,
-    beliefs: np.ndarray,
-    correction: Correction,
-    base_logit: BaseLogit | None,
-    is_sharpened: bool,
-) -> np.ndarray:
-    """`predict` of one input as one vector, for the online run: what it costs is most of the tick.
-
-    Args:
-        parts: Vectors that the input consists of, in their order, (n_x,) together.
-        embedding: The maps.
-        grid: The grid of their cells.
-        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        correction: What feedback adds to L.
-        base_logit: L; None without heads.
-        is_sharpened: Whether beliefs are interpolated between cell centres.
-
-    Returns:
-        The fields of `Assessment` one after the other, in their order, (8 + 2 n_c,).
-    """
-    num_members, num_cells, num_columns = beliefs.shape
-    row = np.empty(2 + 2 * num_columns)
-    masses = row[2 : 2 + num_columns]
-    margins = row[4 + num_columns : -1]
-    evaluated = embedding.evaluate_one(*parts)
-    output = None if evaluated is None else evaluated[0]
-    rows: list[int] = []
-    weights: list[float] = []
-    if output is None:
-        row[2 + num_columns : -1] = np.nan
-    elif is_sharpened:
-        for member, (first, second) in enumerate(output[:, :2].tolist()):
-            corners = grid.bilinear_one(first, second)
-            if corners is not None:
-                start = member * num_cells
-                rows += [start + cell for cell in corners[0]]
-                weights += corners[1]
-        if rows:
-            np.dot(weights, beliefs.reshape(-1, num_columns).take(rows, axis=0), out=masses)
-            masses /= num_members
-            # A map that sends the input outside its grid knows nothing of it.
-            masses[belief_masses.UNCERTAINTY] += 1.0 - len(rows) / (4 * num_members)
-    else:
-        cell = grid.locate_one(*output[0, :2].tolist())
-        if cell != OUTSIDE:
-            rows, weights = [cell], [1.0]
-            masses[:] = beliefs[0, cell]
-    if not rows:
-        masses[:] = 0.0
-        masses[belief_masses.UNCERTAINTY] = 1.0
-    safe, unsafe = masses[:2].tolist()
-    known = safe + unsafe
-    row[0] = safe
-    row[1] = row[-1] = safe / known if known > 0.0 else 0.0
-    if evaluated is not None:
-        output, activations = evaluated
-        row[2 + num_columns : 4 + num_columns] = output[0, :2]
-        margins[:] = np.nan
-        if embedding.num_margins:
-            np.add.reduce(output[:, 2:], out=margins)
-            margins /= num_members
-        if known > 0.0 and base_logit is not None:
-            z, nearness = base_logit.heads_one(
-                embedding.unsafe_logit_one(output[:, :2]) if embedding.has_safety_head else [],
-                float(margins.min()) if embedding.num_margins else None,
-            )
-            offset, safety_slope, margin_slope = correction.change.tolist()
-            shift = offset + safety_slope * z + margin_slope * nearness
-            least, most = correction.hidden_range.tolist()
-            shift += min(max(float(np.vdot(activations, correction.hidden)), least), most)
-            shift = min(max(shift, -SHIFT_LIMIT), SHIFT_LIMIT)
-            if shift < 0.0:
-                guard = float(np.dot(weights, correction.guard.ravel().take(rows)))
-                shift *= 1.0 - guard / sum(weights)
-            row[-1] = 1.0 / (1.0 + math.exp(base_logit.of_one(z, nearness) + shift))
-    return row
+        return grid.bilinear(points)
+    cells = grid.locate(points)[..., None]
+    return cells, (cells != OUTSIDE).astype(float)

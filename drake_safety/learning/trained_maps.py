@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -61,16 +61,13 @@ class Embedding:
             raise ValueError(
                 f"Embedding: {missing or 'trunk layers'} missing in {list(self.weights)}"
             )
-        self._layers = [
-            (self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :])
-            for name in names
-        ]
+        self._layers = [self._layer(name) for name in names]
         for (w, _), (next_w, _) in zip(self._layers, self._layers[1:], strict=False):
             if w.shape[0] != next_w.shape[0] or w.shape[2] != next_w.shape[1]:
                 raise ValueError(
                     f"Embedding: a layer of shape {w.shape} is followed by one of {next_w.shape}"
                 )
-        self.num_members, self.num_inputs, width = self._layers[0][0].shape
+        self.num_members, self.num_inputs, _ = self._layers[0][0].shape
         self.num_activations = self._layers[-1][0].shape[1]
         if self._layers[-1][0].shape[2] != 2 + num_margins:
             raise ValueError(
@@ -78,23 +75,12 @@ class Embedding:
                 f"{2 + num_margins} for {num_margins} margins"
             )
         self.has_safety_head = "safety.0.weight" in self.weights
-        # For one input at a time every operation counts: a last entry that is always one carries
-        # the biases through the products, and all members share the first.
-        layers = [_with_bias(w, bias[:, 0]) for w, bias in self._layers[:-1]]
-        layers.append(np.concatenate([self._layers[-1][0], self._layers[-1][1]], axis=1))
-        joint = layers[0].transpose(1, 0, 2).reshape(self.num_inputs + 1, -1)
-        self._first, *following = _pack([joint, *layers[1:]])
-        self._stacked: tuple[int, ...] = (self.num_members, 1, width + 1)
-        self._product: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.matmul
-        if self.num_members == 1:
-            # Plain products of a vector and a matrix cost numpy half of what stacks of one cost.
-            self._stacked, self._product = (width + 1,), np.dot
-            following = [w[0] for w in following]
-        widths = [w.shape[-2] for w in following]
-        self._following = [
-            (np.zeros((*self._stacked[:-1], width), dtype=np.float32), w)
-            for width, w in zip(widths, following, strict=True)
-        ]
+        if self.has_safety_head:
+            self._safety_layers = [self._layer(f"safety.{i}") for i in range(2)]
+
+    def _layer(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (K, in, out) and biases (K, 1, out)."""
+        return self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :]
 
     @property
     def has_heads(self) -> bool:
@@ -123,28 +109,28 @@ class Embedding:
         output = EmbeddingOutput(
             np.empty((*shape, 2)),
             np.full(shape, np.nan),
-            np.full((*shape, self.num_margins), np.nan),
+            np.empty((*shape, self.num_margins)),
         )
+        weight, bias = self._layers[-1]
         for start in range(0, len(x), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            is_finite = np.all(np.isfinite(x[rows]), axis=1)
+            is_finite = np.isfinite(x[rows]).all(axis=1)
             chunk = np.where(is_finite[:, None], x[rows], np.float32(0.0))
-            for member in range(self.num_members):
-                z = self._activations(chunk, member)
-                weight, bias = self._layers[-1]
-                z = z @ weight[member]
-                z += bias[member]
-                z[~is_finite] = np.nan
-                output.embedding[member, rows] = z[:, :2]
-                output.margins[member, rows] = z[:, 2:]
-                if self.has_safety_head:
-                    output.unsafe_logit[member, rows] = self._logit(z[None, :, :2], member)
+            z = self._hidden(chunk) @ weight + bias
+            z[:, ~is_finite] = np.nan
+            output.embedding[:, rows] = z[..., :2]
+            output.margins[:, rows] = z[..., 2:]
+            if self.has_safety_head:
+                output.unsafe_logit[:, rows] = self._logit(z[..., :2])
         return output
 
     def activations(self, x: np.ndarray) -> np.ndarray:
         """Of the members' last hidden layer at finite inputs (N, n_x), (K, N, num_activations)."""
-        x = self._checked(x)
-        return np.stack([self._activations(x, member) for member in range(self.num_members)])
+        return self._hidden(self._checked(x))
+
+    def embed(self, x: np.ndarray) -> np.ndarray:
+        """Psi: inputs (N, n_x) to points (K, N, 2)."""
+        return self.evaluate(x).embedding
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
         x = np.asarray(x, dtype=np.float32)
@@ -154,84 +140,13 @@ class Embedding:
             )
         return x
 
-    def _activations(self, x: np.ndarray, member: int) -> np.ndarray:
+    def _hidden(self, x: np.ndarray) -> np.ndarray:
         for weight, bias in self._layers[:-1]:
-            x = x @ weight[member]
-            x += bias[member]
+            x = x @ weight
+            x += bias
             np.maximum(x, 0.0, out=x)
         return x
 
-    def embed(self, x: np.ndarray) -> np.ndarray:
-        """Psi: inputs (N, n_x) to points (K, N, 2)."""
-        return self.evaluate(x).embedding
-
-    def evaluate_one(self, *parts: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """What every member makes of one input.
-
-        Args:
-            parts: Vectors that x consists of, in their order, (n_x,) together.
-
-        Returns:
-            y and margins, (K, 2 + n_c), and the activations of the last hidden layer with a last
-            entry of 1, (K, num_activations + 1); None for an input that is not finite, or too
-            large for single precision.
-        """
-        x = np.empty(self.num_inputs + 1, dtype=np.float32)
-        start, square = 0, 0.0
-        for part in parts:
-            square += np.vdot(part, part)  # Unlike part.dot(part), silent when it overflows.
-            if not square < INPUT_LIMIT:
-                return None
-            stop = start + len(part)
-            x[start:stop] = part
-            start = stop
-        x[start:] = 1.0
-        z = x.dot(self._first).reshape(self._stacked)
-        hidden = z
-        for zero, weight in self._following:
-            hidden = np.maximum(z, zero, out=z)
-            z = self._product(hidden, weight)
-        return z.reshape(self.num_members, -1), hidden.reshape(self.num_members, -1)
-
-    def unsafe_logit_one(self, points: np.ndarray) -> list[float]:
-        """Logit of every member's safety head at its own point of one input.
-
-        Args:
-            points: y by every member, (K, 2).
-        """
-        hidden = np.matmul(points[:, None, :], self.weights["safety.0.weight"])
-        hidden += self.weights["safety.0.bias"][:, None, :]
-        np.maximum(hidden, 0.0, out=hidden)
-        logit = np.matmul(hidden, self.weights["safety.1.weight"])[:, 0, 0]
-        return (logit + self.weights["safety.1.bias"][:, 0]).tolist()
-
-    def _logit(self, y: np.ndarray, member: int) -> np.ndarray:
-        w = self.weights
-        hidden = np.maximum(y[0] @ w["safety.0.weight"][member] + w["safety.0.bias"][member], 0.0)
-        return (hidden @ w["safety.1.weight"][member] + w["safety.1.bias"][member])[:, 0]
-
-
-def _with_bias(weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Weights (K, n, m) and biases (K, m) as one (K, n + 1, m + 1) that keeps a last entry of 1."""
-    k, n, m = weight.shape
-    joined = np.zeros((k, n + 1, m + 1), dtype=weight.dtype)
-    joined[:, :n, :m], joined[:, n, :m], joined[:, n, m] = weight, bias, 1.0
-    return joined
-
-
-def _pack(arrays: list[np.ndarray]) -> list[np.ndarray]:
-    """Copies float32 arrays into one block that numpy places on huge pages.
-
-    The weights of an ensemble nearly fill a processor's L2 cache; spread over small pages they
-    evict each other, and a single input takes an eighth longer.
-    """
-    page = 2 * 1024 * 1024 // 4
-    block = np.zeros(sum(array.size + 16 for array in arrays) + 2 * page, dtype=np.float32)
-    start = (-block.ctypes.data // 4) % page
-    packed = []
-    for array in arrays:
-        view = block[start : start + array.size].reshape(array.shape)
-        view[...] = array
-        packed.append(view)
-        start += -(-array.size // 16) * 16
-    return packed
+    def _logit(self, y: np.ndarray) -> np.ndarray:
+        (first, first_bias), (second, second_bias) = self._safety_layers
+        return (np.maximum(y @ first + first_bias, 0.0) @ second + second_bias)[..., 0]

@@ -93,7 +93,7 @@ def learned_maps(
         progress: Called with "distances", "t-SNE", "training" and the fraction that is done.
 
     Returns:
-        The maps, and which segments each of them did not learn from, (K, N).
+        The maps, and which segments they did not learn from, (N,).
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
@@ -129,21 +129,21 @@ def learned_maps(
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Which segments each map does not learn from, (K, N): those of some episodes, others for each.
+    """Which segments no map learns from, (N,): those of some episodes, the same for all maps.
+
+    L is asked for the mean of the ensemble. What that is worth shows only where none of the maps
+    knows the end, and a mean over maps of which one does not is another quantity.
 
     Args:
         segments: The training segments.
         parameters: Of the assessment.
     """
     episodes = np.unique(segments.episode)
-    num_members = parameters.num_members
-    share = parameters.held_out if parameters.is_sharpened else 0.0
-    num_held_out = min(int(share * len(episodes)), len(episodes) // (num_members + 1))
-    rng = np.random.default_rng(np.random.SeedSequence(parameters.seed, spawn_key=(num_members,)))
-    drawn = rng.permutation(episodes)[: num_members * num_held_out]
-    return np.array(
-        [np.isin(segments.episode, fold) for fold in drawn.reshape(num_members, num_held_out)]
+    share = min(parameters.held_out, 0.5) if parameters.is_sharpened else 0.0
+    rng = np.random.default_rng(
+        np.random.SeedSequence(parameters.seed, spawn_key=(parameters.num_members,))
     )
+    return np.isin(segments.episode, rng.permutation(episodes)[: int(share * len(episodes))])
 
 
 def _sample_weight(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
@@ -183,6 +183,7 @@ def _train(
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
     num_members = parameters.num_members
+    learned = data.take(~is_held_out)
     members = []
     for member in range(num_members):
 
@@ -193,7 +194,6 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        learned = data.take(~is_held_out[member])
         members.append(train_map(learned, settings, seed=seed, progress=report))
     num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
@@ -217,35 +217,28 @@ def fitted_base_logit(
     segments: Segments,
     parameters: AssessmentParameters,
 ) -> BaseLogit:
-    """Scales what the maps' heads say to one logit, by logistic regression.
+    """Scales what the ensemble's heads say to one logit, by logistic regression.
 
-    Each map is asked about the episodes that it has not learned from: of its own it is too sure.
-    Where those are all safe or all unsafe, all segments are taken.
+    It is asked about the episodes that no map has learned from: of its own it is too sure. Where
+    those are all safe or all unsafe, all segments are taken.
 
     Args:
         output: What the maps say of the training segments.
-        is_held_out: Which of them each map has not learned from, (K, N).
+        is_held_out: Which of them no map has learned from, (N,).
         segments: The training segments.
         parameters: Of the assessment.
     """
-    member, row = np.nonzero(is_held_out)
-    is_unsafe = segments.is_unsafe[row]
-    if not 0 < is_unsafe.sum() < len(is_unsafe):
-        member, row = np.nonzero(np.ones_like(is_held_out))
-        is_unsafe = segments.is_unsafe[row]
-    weight = _sample_weight(segments, parameters)[row]
+    if not 0 < segments.is_unsafe[is_held_out].sum() < is_held_out.sum():
+        is_held_out = np.ones_like(is_held_out)
     logit = BaseLogit(
         margin_unit=parameters.margin_unit,
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
-    heads = logit.heads(
-        EmbeddingOutput(
-            output.embedding[member, row][None],
-            output.unsafe_logit[member, row][None],
-            output.margins[member, row][None],
-        )
+    offset, safety_slope, margin_slope = _logistic(
+        logit.heads(output)[is_held_out],
+        segments.is_unsafe[is_held_out],
+        _sample_weight(segments, parameters)[is_held_out],
     )
-    offset, safety_slope, margin_slope = _logistic(heads, is_unsafe, weight)
     return replace(logit, offset=offset, safety_slope=safety_slope, margin_slope=margin_slope)
 
 

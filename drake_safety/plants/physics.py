@@ -7,7 +7,6 @@ and for the poses of geometry, but takes no step.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -44,10 +43,6 @@ from drake_safety.robots.robot import (
     require_motors,
 )
 from drake_safety.robots.robot_model import RobotModel
-
-# Drake warns, once a process, that a half space takes no part in deformable contact: nothing here
-# is deformable.
-logging.getLogger("drake").addFilter(lambda record: "half spaces" not in record.getMessage())
 
 
 @dataclass(kw_only=True)
@@ -285,6 +280,11 @@ def _furnish(
 ) -> tuple[ModelInstanceIndex, ModelInstanceIndex | None]:
     """Fills and finalises a plant; returns the model instances of robot and ball."""
     plant.set_name("plant")
+    # By default shapes are prepared for deformable contact too, and Drake warns that the ground's
+    # half space takes no part in it. Nothing here is deformable.
+    config = scene_graph.get_config()
+    config.default_proximity_properties.resolution_hint = None
+    scene_graph.set_config(config)
     instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
     add_ground(plant, variation.foot_friction or robot.foot_friction)
     ball = add_ball(plant) if scene.has_ball else None

@@ -11,6 +11,8 @@ from urllib.parse import urlparse
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_safety import package_folder
+
 _EXTRAS = {"example-robot-data": "robots"}
 """Packages of models that an extra installs."""
 
@@ -21,13 +23,7 @@ class MissingExtraError(ValueError):
 
 def models_package_xml() -> Path:
     """The ``package.xml`` behind ``package://drake_safety_models/``."""
-    import drake_safety
-
-    for folder in drake_safety.__path__:
-        candidate = Path(folder) / "models" / "package.xml"
-        if candidate.is_file():
-            return candidate
-    raise ValueError(f"no models/package.xml beside or inside {list(drake_safety.__path__)}")
+    return package_folder("models") / "package.xml"
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:

@@ -67,7 +67,6 @@ class SafetyAssessor(LeafSystem):
             "desired_preview", info.horizon * len(info.output_names)
         )
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
-        # In the order of the row that the assessment gives.
         sizes = {
             "safety_probability": 1,
             "normalized_safety_probability": 1,
@@ -154,13 +153,24 @@ class SafetyAssessor(LeafSystem):
         self.set_correction(context, adapted.correction_)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        said = self._assessment.predict_one(
+            self._state_port.Eval(context),
+            self._preview_port.Eval(context),
+            self._features_port.Eval(context) if self._uses_features else None,
+            beliefs=self.get_beliefs(context),
+            correction=self.get_correction(context) if self._has_heads else None,
+        )
+        # In the order of the ports.
         discrete_state.set_value(
-            self._assessment.predict_row(
-                self._state_port.Eval(context),
-                self._preview_port.Eval(context),
-                self._features_port.Eval(context) if self._uses_features else None,
-                self.get_beliefs(context),
-                self.get_correction(context) if self._has_heads else self._assessment.correction_,
+            np.concatenate(
+                [
+                    (said.safety_probability, said.normalized),
+                    said.belief,
+                    said.cause_probability,
+                    said.embedding,
+                    said.predicted_margins,
+                    (said.calibrated,),
+                ]
             )
         )
 
