@@ -1,11 +1,13 @@
 """A task of one's own, outside the package: a mass that glides, with failures to order."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.scenario import parse_scenario
 
 CONTROL_PERIOD_S = 0.01
 
@@ -107,3 +109,8 @@ episode_duration_s: 0.8
 step_s: 0.04
 variations: {nominal: {}, actual: {mass_scale: 1.2}}
 """
+
+
+def gliding(**parameters):
+    text = f"{SCENARIO}parameters: {parameters}\n"
+    return parse_scenario(text, name="gliding", folder=Path())

@@ -1,5 +1,6 @@
 """Recorded runs of our own loops, written as a robot's logs would be: tables, MCAP, ROS bags."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -7,6 +8,7 @@ import pandas as pd
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
+from cart_episodes import ARRAYS
 from drake_safety import load_scenario
 from drake_safety.logs.robot_log import RobotLog
 from drake_safety.robots.robot import PlantVariation
@@ -15,6 +17,8 @@ from drake_safety.simulation.rollouts import episode_rng
 ORIGIN_NS = 1_700_000_000_123_000_000
 POINT = ("x", "y", "z")
 FORMATS = ("csv", "parquet", "mcap", "ros2", "ros1")
+# Episodes of the short balancing below that end so.
+SAFE, UNSAFE = 0, 5
 
 
 @functools.cache
@@ -275,3 +279,23 @@ def _write_mcap(log, joints, path):
         }
         for topic, stamp, message in messages(log, joints, store, array=list):
             writer.write_message(topic, schemas[topic], message, stamp, stamp)
+
+
+def part(log, first, last):
+    """The rows of a log from one to another, with the time from the first of them."""
+    rows = slice(first, last)
+    values = {
+        name: getattr(log, name)[rows]
+        for name in ("q", "v", "desired_output", "foot_positions")
+        if getattr(log, name) is not None
+    }
+    times = log.time_s[rows] - log.time_s[first]
+    return dataclasses.replace(log, time_s=times, **values)
+
+
+def assert_same(episode, other, rows=slice(None), names=ARRAYS, atol=1e-9):
+    assert (episode.is_safe, episode.cause) == (other.is_safe, other.cause)
+    for name in names:
+        np.testing.assert_allclose(
+            getattr(episode, name)[rows], getattr(other, name)[rows], atol=atol, err_msg=name
+        )

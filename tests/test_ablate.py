@@ -1,11 +1,10 @@
 """The commands around ablations and pushed motions, on a task that is cheap."""
 
 import json
-import sys
 
 import pytest
 
-from drake_safety import cli
+from command_line import call
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation import ablation_study
 from drake_safety.learning.assessment import SafetyAssessment
@@ -13,13 +12,6 @@ from drake_safety.simulation import pushed_motions, rollouts
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
-
-
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return stop.value.code
 
 
 @pytest.fixture(scope="module")

@@ -16,32 +16,8 @@ from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncer
 from drake_safety.learning.feedback import feedback_sets, segments_of
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes
+from lip_assessments import NUM_PAIRS, QUICK, better, inputs, pairs_with, worse
 from lip_episodes import make_episodes
-from test_assessment import QUICK, inputs
-
-NUM_PAIRS = 40
-
-
-def pairs_with(flip, num=NUM_PAIRS, seed=3):
-    """Pairs of which `flip(episode)` says whether the actual one ends as the twin does not."""
-    nominal = make_episodes(num, seed=seed, noise=0.002)
-    actual = []
-    for episode in nominal:
-        if flip(episode):
-            is_safe = not episode.is_safe
-            cause = "" if is_safe else nominal.info.constraint_names[0]
-            episode = dataclasses.replace(episode, is_safe=is_safe, cause=cause)
-        actual.append(episode)
-    info = dataclasses.replace(nominal.info, variation="actual")
-    return feedback_sets(Episodes(info, actual), nominal)
-
-
-def worse(num=NUM_PAIRS):
-    return pairs_with(lambda episode: episode.is_safe and episode.index % 3 == 0, num)
-
-
-def better(num=NUM_PAIRS):
-    return pairs_with(lambda episode: not episode.is_safe and episode.index % 2 == 0, num)
 
 
 @pytest.fixture(scope="module")

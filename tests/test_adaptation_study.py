@@ -8,9 +8,8 @@ from drake_safety.evaluation.adaptation_losses import STEPS, losses
 from drake_safety.evaluation.adaptation_study import TestSet, scores, study, trained_rivals
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import Episodes
+from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
-from test_adaptation import pairs_with, worse
-from test_assessment import QUICK
 
 
 @pytest.fixture(scope="module")

@@ -16,51 +16,12 @@ from drake_safety.cli.target_run import alarm_row, named_push
 from drake_safety.cli.targets import join_targets, parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.planning.goal_verdict import assess_goal, goal_inputs
+from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.simulation.goal_motion import GoalMotion
-from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import load_scenario
+from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, made_up_episodes
 
 ROOT = Path(__file__).resolve().parents[1]
-SCENARIO = "atlas_reaching"
-BOUNDARY_M = 0.75
-CAUSE = "collision"
-NEAR, FAR = (0.6, 0.5, 1.05), (0.9, 0.5, 1.05)
-
-
-def made_up_episodes(loop):
-    """As many episodes as goals, from the standing posture, safe where x < `BOUNDARY_M`.
-
-    What the assessment sees of them is real; what came of them is not, so that it is known.
-    """
-    goals = np.random.default_rng(0).uniform(*loop.target_box, (160, 3))
-    episodes = []
-    columns = zip(goals, *goal_inputs(loop, goals), strict=True)
-    for index, (goal, state, preview, features) in enumerate(columns):
-        margins = np.full((loop.scenario.num_steps + 1, len(loop.constraint_names)), 0.1)
-        shape = (len(margins), 1)
-        is_safe = bool(goal[0] < BOUNDARY_M)
-        column = loop.constraint_names.index(CAUSE)
-        margins[:, column] = np.linspace(0.05, 0.05 if is_safe else -0.02, len(margins))
-
-        episodes.append(
-            Episode(
-                index=index,
-                time_s=loop.scenario.step_s * np.arange(len(margins)),
-                state=np.tile(state, shape),
-                true_state=np.tile(state, shape),
-                output=np.tile(goal, shape)
-                + np.linspace(0.0, 0.0025 * index, len(margins))[:, None],
-                desired_output=np.tile(goal, shape),
-                desired_preview=np.tile(preview, shape),
-                features=np.tile(features, shape),
-                margins=margins,
-                is_safe=is_safe,
-                cause="" if is_safe else CAUSE,
-            )
-        )
-    return Episodes(episodes_info(loop, seed=0), episodes)
 
 
 @pytest.fixture(scope="session")

@@ -9,16 +9,8 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import calibrate
 from drake_safety.learning.segments import split
+from lip_assessments import QUICK, inputs
 from lip_episodes import make_episodes
-
-QUICK = {
-    "perplexity": 15.0,
-    "epochs": 20,
-    "hidden_sizes": [48, 48],
-    "ensemble_size": 2,
-    "batch_size": 128,
-    "score_weight": 0.1,
-}
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +27,6 @@ def held_out():
 def assessment(request, episodes):
     parameters = AssessmentParameters(mode=request.param, **QUICK)
     return SafetyAssessment(parameters).fit(episodes)
-
-
-def inputs(segments, rows=slice(None)):
-    return segments.state[rows], segments.desired_preview[rows], segments.features[rows]
 
 
 def area_under_curve(score, is_positive):

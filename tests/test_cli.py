@@ -3,14 +3,14 @@
 import json
 import math
 import shutil
-import sys
 from types import SimpleNamespace
 
 import pytest
 import typer
 
+from command_line import call
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.cli import app, main
+from drake_safety.cli import app
 from drake_safety.cli.evaluate_plans import PlanOptions, check_options, parse_sizes
 from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import (
@@ -28,14 +28,6 @@ from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO
 from shuttle_task import SCENARIO as SHUTTLE_SCENARIO
-
-
-def call(monkeypatch, *arguments):
-    """Runs the command as a shell would; returns its exit code."""
-    monkeypatch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 def test_every_command_says_in_a_sentence_what_it_does():

@@ -1,6 +1,5 @@
 """ClosedLoop: the contract is checked when a task is built, not when someone trips over it."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,15 +14,10 @@ from drake_safety.simulation.closed_loop import (
     ClosedLoop,
 )
 from drake_safety.simulation.rollouts import run_episode
-from drake_safety.simulation.scenario import parse_scenario
-from gliding_task import SCENARIO, Gliding
+from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
 
 LOOP_NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
-
-
-def gliding():
-    return parse_scenario(SCENARIO, name="gliding", folder=Path())
 
 
 class Partial(ClosedLoop):

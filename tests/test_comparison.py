@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from command_line import call
 from drake_safety.evaluation import comparison
 from drake_safety.evaluation.comparison import (
     Effort,
@@ -19,7 +20,6 @@ from drake_safety.evaluation.comparison_figure import comparison_figure, standin
 from drake_safety.evaluation.metrics import Figure
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO, shuttling
-from test_ablate import call
 
 NAME = "laikago_balancing"
 ROW = {

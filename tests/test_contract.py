@@ -8,9 +8,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_safety import check_contract, load_scenario
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import REQUIRED_PORTS
-from gliding_task import Gliding
+from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
-from test_closed_loop import gliding
 
 
 class Constant(ClosedLoop):

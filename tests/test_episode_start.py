@@ -5,15 +5,13 @@ import copy
 import numpy as np
 import pytest
 
+from balancing_loops import PACKAGED, standing_loop
+from cart_episodes import ARRAYS
 from drake_safety import load_scenario, run_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episode_rng
-from gliding_task import SCENARIO
+from gliding_task import gliding
 from reaching_loops import EASY, easy_episode, evaluated, porter, started
-from test_balancing import PACKAGED, standing_loop
-from test_rollouts import ARRAYS, gliding
-
-assert SCENARIO
 
 
 def short_balancing(variation="nominal", **options):

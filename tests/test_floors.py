@@ -209,6 +209,15 @@ def named_robots(text, name, robots):
     return offences
 
 
+def borrowed_tests(source, name):
+    """Imports from a test module, whose own tests would be imported and its fixtures not found."""
+    return [
+        f"{name}:{line} imports {dotted}: what tests share stands in a module without `test_`"
+        for dotted, line, _ in imports_of(source, name)
+        if dotted.split(".")[0].startswith("test_")
+    ]
+
+
 def offences_in(rule, paths):
     return [
         offence
@@ -231,6 +240,10 @@ def test_control_has_no_ports():
 
 def test_nothing_pickles_or_imports_all_of_drake_or_the_folders_as_packages():
     assert offences_in(forbidden_anywhere, PYTHON) == []
+
+
+def test_no_test_module_imports_from_another():
+    assert offences_in(borrowed_tests, source_files("tests")) == []
 
 
 def test_every_package_the_library_imports_is_a_declared_dependency():
@@ -324,6 +337,8 @@ def test_a_folder_of_a_robot_is_no_python_package():
         (forbidden_anywhere, "tests/a.py", "from diagrams import balancing", "drake_safety.diag"),
         (forbidden_anywhere, "tests/a.py", f"np.load(f, allow_pickle={True})", "allows pickle"),
         (forbidden_anywhere, "tests/a.py", "torch.save(net, path)", "pickles"),
+        (borrowed_tests, "tests/test_a.py", "from test_b import c", "without `test_`"),
+        (borrowed_tests, "tests/a.py", "def f():\n    import test_b", "imports test_b"),
         (ports, "drake_safety/control/a.py", "class A(LeafSystem): pass", "LeafSystem"),
         (ports, "drake_safety/control/a.py", "s.DeclareVectorInputPort('u', 1)", "Port"),
         (ports, "drake_safety/control/a.py", "from p import LeafSystem as L", "LeafSystem"),
@@ -349,6 +364,7 @@ def test_each_rule_catches_its_offence(rule, name, source, message):
         ),
         (forbidden_anywhere, "tests/a.py", "np.load(path, allow_pickle=False)"),
         (forbidden_anywhere, "tests/a.py", "import drake_safety.models"),
+        (borrowed_tests, "tests/test_a.py", "from lip_episodes import make_episodes"),
     ],
 )
 def test_no_rule_forbids_what_is_allowed(rule, name, source):

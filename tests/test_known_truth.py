@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cart_episodes import make_episode, make_info
 from drake_safety.evaluation.known_truth import (
     KnownTruth,
     agreement,
@@ -16,7 +17,6 @@ from drake_safety.evaluation.known_truth_figure import known_truth_figure
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.state_plane import StatePlane
 from shuttle_task import shuttling
-from test_dataset import make_episode, make_info
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
 HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)

@@ -21,7 +21,7 @@ from drake_safety.live.session import (
     Pace,
 )
 from drake_safety.simulation.view import View
-from test_ask import NEAR, made_up_episodes
+from reaching_targets import NEAR, made_up_episodes
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from command_line import call
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
 from drake_safety.learning.segments import Episodes
@@ -10,7 +11,6 @@ from drake_safety.logs.episodes import cut_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
 from log_files import FORMATS, balancing_loop, balancing_scenario, map_text, recorded, write
-from test_cli import call
 
 INDICES = (10, 0)
 

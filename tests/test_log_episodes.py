@@ -6,33 +6,20 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cart_episodes import ARRAYS
 from drake_safety import run_episode
 from drake_safety.logs.episodes import cut_log, episodes_from_log
-from log_files import balancing_loop, balancing_scenario, record, recorded
+from log_files import (
+    SAFE,
+    UNSAFE,
+    assert_same,
+    balancing_loop,
+    balancing_scenario,
+    part,
+    record,
+    recorded,
+)
 from reaching_loops import EASY, easy_episode, porter
-from test_rollouts import ARRAYS
-
-SAFE, UNSAFE = 0, 5
-
-
-def part(log, first, last):
-    """The rows of a log from one to another, with the time from the first of them."""
-    rows = slice(first, last)
-    values = {
-        name: getattr(log, name)[rows]
-        for name in ("q", "v", "desired_output", "foot_positions")
-        if getattr(log, name) is not None
-    }
-    times = log.time_s[rows] - log.time_s[first]
-    return dataclasses.replace(log, time_s=times, **values)
-
-
-def assert_same(episode, other, rows=slice(None), names=ARRAYS, atol=1e-9):
-    assert (episode.is_safe, episode.cause) == (other.is_safe, other.cause)
-    for name in names:
-        np.testing.assert_allclose(
-            getattr(episode, name)[rows], getattr(other, name)[rows], atol=atol, err_msg=name
-        )
 
 
 def test_a_safe_run_of_the_loop_gives_the_episode_that_the_loop_recorded():

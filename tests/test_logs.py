@@ -11,8 +11,17 @@ from drake_safety.logs.episodes import episodes_from_log
 from drake_safety.logs.log_map import LogMap, load_log_map
 from drake_safety.logs.messages import field_of
 from drake_safety.logs.robot_log import read_log
-from log_files import FORMATS, balancing_loop, frame_of, map_text, recorded, write
-from test_log_episodes import UNSAFE, assert_same, part
+from log_files import (
+    FORMATS,
+    UNSAFE,
+    assert_same,
+    balancing_loop,
+    frame_of,
+    map_text,
+    part,
+    recorded,
+    write,
+)
 
 JOINTS = balancing_loop().kinematics.joint_names
 ROBOT = balancing_loop().robot

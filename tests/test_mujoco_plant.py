@@ -8,13 +8,13 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 import reaching_loops
+from balancing_loops import scenario_of
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import parse_scenario
 from drake_safety.simulation.throws import ViolationCounter
 from legged_robots import robot_kinematics
-from test_balancing import scenario_of
 
 MUJOCO = PlantVariation(engine="mujoco")
 

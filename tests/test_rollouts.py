@@ -5,21 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cart_episodes import ARRAYS
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import episode_rng, parallel_map
 from drake_safety.simulation.scenario import parse_scenario
-from gliding_task import SCENARIO, Gliding
+from gliding_task import SCENARIO, Gliding, gliding
 from shuttle_task import shuttling
-
-ARRAYS = ("time_s", "state", "true_state", "output", "desired_output", "desired_preview")
-ARRAYS += ("features", "margins")
-
-
-def gliding(**parameters):
-    text = f"{SCENARIO}parameters: {parameters}\n"
-    return parse_scenario(text, name="gliding", folder=Path())
 
 
 def assert_identical(episodes, others):

@@ -1,0 +1,43 @@
+"""What is learned of the stand-in data quickly, and feedback that contradicts it as one likes."""
+
+import dataclasses
+
+from drake_safety.learning.feedback import feedback_sets
+from drake_safety.learning.segments import Episodes
+from lip_episodes import make_episodes
+
+QUICK = {
+    "perplexity": 15.0,
+    "epochs": 20,
+    "hidden_sizes": [48, 48],
+    "ensemble_size": 2,
+    "batch_size": 128,
+    "score_weight": 0.1,
+}
+NUM_PAIRS = 40
+
+
+def inputs(segments, rows=slice(None)):
+    return segments.state[rows], segments.desired_preview[rows], segments.features[rows]
+
+
+def pairs_with(flip, num=NUM_PAIRS, seed=3):
+    """Pairs of which `flip(episode)` says whether the actual one ends as the twin does not."""
+    nominal = make_episodes(num, seed=seed, noise=0.002)
+    actual = []
+    for episode in nominal:
+        if flip(episode):
+            is_safe = not episode.is_safe
+            cause = "" if is_safe else nominal.info.constraint_names[0]
+            episode = dataclasses.replace(episode, is_safe=is_safe, cause=cause)
+        actual.append(episode)
+    info = dataclasses.replace(nominal.info, variation="actual")
+    return feedback_sets(Episodes(info, actual), nominal)
+
+
+def worse(num=NUM_PAIRS):
+    return pairs_with(lambda episode: episode.is_safe and episode.index % 3 == 0, num)
+
+
+def better(num=NUM_PAIRS):
+    return pairs_with(lambda episode: not episode.is_safe and episode.index % 2 == 0, num)
