@@ -129,10 +129,6 @@ class Survey:
         """Centres of a limb's contact spheres in the base's frame, (n, 3) [m]."""
         return (self.pose(limb.body) @ limb.points.T).T
 
-    def center_of_mass(self) -> np.ndarray:
-        """In the base's frame, (3,) [m]."""
-        return self.plant.CalcCenterOfMassPositionInWorld(self.context, [self.instance])
-
     def leaves(self) -> list[list[str]]:
         """Groups of bodies, welded to each other, beyond which nothing moves."""
         carries = {
