@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Sphere
+from pydrake.geometry import Capsule, Cylinder, GeometryId, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
@@ -296,8 +296,6 @@ class Survey:
                 X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
                 if isinstance(shape, Sphere):
                     found.append((name, X_WG.translation()[None], shape.radius(), True))
-                elif isinstance(shape, Box):
-                    found.append((name, *_corners(X_WG, np.array(shape.size()) / 2), False))
                 elif isinstance(shape, Capsule | Cylinder):
                     radius = shape.radius()
                     half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
