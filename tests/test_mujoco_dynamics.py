@@ -5,10 +5,15 @@ import numpy as np
 import pytest
 from pydrake.geometry import Mesh, SceneGraph
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import (
+    CoulombFriction,
+    ExternallyAppliedSpatialForce,
+    MultibodyPlant,
+)
 
 import legged_robots
-from drake_safety.plants.mujoco_dynamics import MujocoDynamics, PointForce
+from drake_safety.plants.mujoco_dynamics import MujocoDynamics
 from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import Payload, PlantVariation, add_robot, apply_masses
 
@@ -237,12 +242,10 @@ def test_a_force_at_the_centre_of_mass_accelerates_it(bench):
         )
     )
     command = np.zeros(bench.dynamics.num_command)
-    force = PointForce(
-        body=bench.robot.base,
-        p_BoBq_B=np.array([0.0, 0.1, 0.0]),
-        torque_W=np.zeros(3),
-        force_W=np.array([30.0, 0.0, 0.0]),
-    )
+    force = ExternallyAppliedSpatialForce()
+    force.body_index = bench.plant.GetBodyByName(bench.robot.base).index()
+    force.p_BoBq_B = np.array([0.0, 0.1, 0.0])
+    force.F_Bq_W = SpatialForce(np.zeros(3), np.array([30.0, 0.0, 0.0]))
 
     def momentum(state):
         plant_state = bench.dynamics.plant_state(state)
@@ -256,9 +259,11 @@ def test_a_force_at_the_centre_of_mass_accelerates_it(bench):
     pushed = bench.dynamics.step(state, command, [force])
     alone = bench.dynamics.step(state, command)
     gained = momentum(pushed) - momentum(alone)
-    np.testing.assert_allclose(gained, STEP_S * force.force_W, atol=5e-3 * 30 * STEP_S)
-    with pytest.raises(ValueError, match="no body 'tail' to push"):
-        force.body = "tail"
+    np.testing.assert_allclose(
+        gained, STEP_S * force.F_Bq_W.translational(), atol=5e-3 * 30 * STEP_S
+    )
+    with pytest.raises(ValueError, match="no body 'ground' to push"):
+        force.body_index = bench.plant.GetBodyByName("ground").index()
         bench.dynamics.step(state, command, [force])
 
 

@@ -12,7 +12,7 @@ from drake_safety.control.kinematics import (
     RobotKinematics,
 )
 
-_TOLERANCE_M = 1e-4
+_TOLERANCE_M = 1e-4  # Error of a contact point's coordinate at which the search ends.
 _DAMPING = 1e-8  # [m²/rad²]: keeps a stretched leg's step finite.
 _MAX_STEP_RAD = 0.5  # in one iteration.
 # What a Newton step leaves is of second order: with a leg of 1 m, some 1e-5 m after this step.
@@ -26,7 +26,6 @@ def solve_inverse_kinematics(
     guess: np.ndarray,
     *,
     max_iterations: int = 20,
-    tolerance_m: float = _TOLERANCE_M,
 ) -> np.ndarray:
     """Joint positions that put every contact point where it is wanted, base pose given.
 
@@ -40,19 +39,12 @@ def solve_inverse_kinematics(
         p_WC: Wanted positions of the contact spheres' centres, (n_c, 3) [m].
         guess: Joint positions to start from, (n_j,) [rad].
         max_iterations: Bound on the Newton steps.
-        tolerance_m: Largest error of a contact point's coordinate at which the search ends [m].
 
     Returns:
         Joint positions (n_j,) [rad].
     """
-    joints, _ = solve_from(
-        kinematics,
-        kinematics.positions_at(X_WB, guess),
-        p_WC,
-        max_iterations=max_iterations,
-        tolerance_m=tolerance_m,
-    )
-    return joints
+    q = kinematics.positions_at(X_WB, guess)
+    return solve_from(kinematics, q, p_WC, max_iterations=max_iterations)[0]
 
 
 def solve_from(
@@ -61,7 +53,6 @@ def solve_from(
     p_WC: np.ndarray,
     *,
     max_iterations: int = 20,
-    tolerance_m: float = _TOLERANCE_M,
 ) -> tuple[np.ndarray, np.ndarray]:
     """:func:`solve_inverse_kinematics` for a controller's tick, which goes on to use a Jacobian.
 
@@ -70,7 +61,6 @@ def solve_from(
         q: Base pose and joint positions to start from, (n_q,); the joints are overwritten.
         p_WC: Wanted positions of the contact spheres' centres, (n_c, 3) [m].
         max_iterations: Bound on the Newton steps.
-        tolerance_m: Largest error of a contact point's coordinate at which the search ends [m].
 
     Returns:
         Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last point of
@@ -83,7 +73,7 @@ def solve_from(
         q[NUM_BASE_POSITIONS:] = joints
         reached, J = kinematics.contact_positions_and_jacobian(q)
         error = (p_WC - reached).ravel()
-        if max(error.max(), -error.min()) < tolerance_m:
+        if max(error.max(), -error.min()) < _TOLERANCE_M:
             break
         # Columns of joints that move no foot are zero: the damping leaves those joints alone.
         J_joints = J[:, NUM_BASE_VELOCITIES:]

@@ -73,24 +73,20 @@ class RobotKinematics:
         self.base = base
         self.world_frame = self.plant.world_frame()
         self.foot_names = list(robot.feet)
-        self.foot_frames = []
-        self.foot_points = []
-        radii = []
-        for foot in robot.feet.values():
-            self.foot_frames.append(self.plant.GetFrameByName(foot.body))
-            self.foot_points.append(np.asfortranarray(np.array(foot.contact_points).T))
-            radii += [foot.radius_m] * len(foot.contact_points)
-        self._feet = list(zip(self.foot_frames, self.foot_points, strict=True))
-        self.foot_radii = np.array(radii)
+        feet = robot.feet.values()
+        self.foot_points = [np.asfortranarray(np.array(foot.contact_points).T) for foot in feet]
+        frames = [self.plant.GetFrameByName(foot.body) for foot in feet]
+        self._feet = list(zip(frames, self.foot_points, strict=True))
+        sizes = [len(foot.contact_points) for foot in feet]
+        stops = np.cumsum(sizes).tolist()
+        self.foot_slices = [
+            slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)
+        ]
+        self.foot_radii = np.repeat([foot.radius_m for foot in feet], sizes)
         self.num_contacts = len(self.foot_radii)
         posture = posture_positions(self.plant, robot)
         self.posture = np.array([posture[name] for name in self.joint_names])
         self.total_mass = self.plant.CalcTotalMass(self.context)
-        self.foot_slices = []
-        start = 0
-        for points in self.foot_points:
-            self.foot_slices.append(slice(start, start + points.shape[1]))
-            start += points.shape[1]
         self._set_standing()
 
     def _set_standing(self) -> None:
@@ -163,6 +159,10 @@ class RobotKinematics:
         return np.concatenate(
             [calculate(context, kind, frame, points, world, world) for frame, points in self._feet]
         )
+
+    def stance_pose(self, q: np.ndarray) -> np.ndarray:
+        """``[x, y, yaw]`` of the stance frame S of the feet in the world, (3,)."""
+        return fit_stance(self.contact_positions(q), self.nominal_contacts)
 
     def gravity_torques(
         self, q: np.ndarray, is_stance: np.ndarray, J: np.ndarray | None = None

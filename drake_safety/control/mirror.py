@@ -11,7 +11,6 @@ from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
     NUM_BASE_VELOCITIES,
     RobotKinematics,
-    fit_stance,
 )
 
 _POLAR = np.array([1.0, -1.0, 1.0])  # What the mirror does to a position or a velocity,
@@ -119,7 +118,7 @@ class Mirror:
         """
         kinematics = self._kinematics
         if stance_pose is None:
-            stance_pose = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
+            stance_pose = kinematics.stance_pose(q)
         x, y, yaw = stance_pose
         R_WS = RotationMatrix.MakeZRotation(yaw)
         across = (R_WS.matrix() * _POLAR) @ R_WS.matrix().T  # Reflection in the world.

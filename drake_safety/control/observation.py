@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance
+from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot import ObservationNoise
 
 
@@ -59,7 +59,7 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     """
     if not q.dot(q) + v.dot(v) < math.inf:
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
-    x, y, yaw = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
+    x, y, yaw = kinematics.stance_pose(q)
     R_SW = RotationMatrix.MakeZRotation(-yaw)
     R = R_SW.matrix()
     R_SB = R_SW @ RotationMatrix(quaternion_of(q))

@@ -10,7 +10,6 @@ from drake_safety.control.kinematic_preview import KinematicPreview, chain_joint
 from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
     NUM_BASE_VELOCITIES,
-    fit_stance,
     planar_pose,
 )
 from drake_safety.control.observation import is_rate
@@ -204,7 +203,7 @@ class ReachingSafeSet:
             return np.full(len(self.feature_names), np.nan)
         kinematics, model = self.kinematics, self.model
         p_WC = kinematics.contact_positions(q)
-        X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
+        X_WS = planar_pose(kinematics.stance_pose(q))
         R_SW = X_WS.rotation().matrix().T
         path = np.asarray(X_WS @ preview.T).T  # In the world.
         center_of_mass = kinematics.center_of_mass(q)  # Sets the positions.

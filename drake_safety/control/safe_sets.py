@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance
+from drake_safety.control.kinematics import RobotKinematics
 
 _GRAVITY = 9.81
 _NUM_DIRECTIONS = 8
@@ -216,7 +216,7 @@ class BalanceSafeSet:
             return np.full(len(self.feature_names), np.nan)
         kinematics, limits = self.kinematics, self.limits
         p_WC = kinematics.contact_positions(q)
-        x, y, yaw = fit_stance(p_WC, kinematics.nominal_contacts)
+        x, y, yaw = kinematics.stance_pose(q)
         c, s = math.cos(yaw), math.sin(yaw)
         R_SW = np.array([[c, s], [-s, c]])
         origin = np.array([x, y])

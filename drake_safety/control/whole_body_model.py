@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import Frame, RigidBody
 
-from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics, fit_stance
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.robots.robot_model import ReachingFrame
 
 EQUALITY = 5
@@ -157,7 +157,7 @@ class WholeBodyModel:
             posture: Joint positions (n_j,) [rad]; the robot's standing posture by default.
         """
         kinematics = self.kinematics
-        x, y, yaw = fit_stance(kinematics.contact_positions(q), kinematics.nominal_contacts)
+        x, y, yaw = kinematics.stance_pose(q)
         reference = WholeBodyReference(
             center_of_mass=PointReference(
                 position=np.array([x, y, kinematics.center_of_mass(q)[2]])

@@ -11,7 +11,6 @@ import hashlib
 import io
 import json
 import math
-import struct
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -278,29 +277,20 @@ def picture_board(png: bytes, width: float, height: float) -> InMemoryMesh:
     """
     w = 0.5 * width
     # glTF's y is up: Drake turns (x, y, z) into (x, -z, y).
-    corners = [(-w, 0.0, 0.0), (w, 0.0, 0.0), (w, height, 0.0), (-w, height, 0.0)]
-    in_picture = [(0.0, 1.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.0)]
-    triangles = (0, 1, 2, 0, 2, 3)
-    parts = [
-        b"".join(struct.pack("<3f", *corner) for corner in corners),
-        b"".join(struct.pack("<2f", *place) for place in in_picture),
-        struct.pack("<6H", *triangles),
-    ]
-    starts = [0, len(parts[0]), len(parts[0]) + len(parts[1])]
+    corners = np.array([(-w, 0, 0), (w, 0, 0), (w, height, 0), (-w, height, 0)], "<f4")
+    in_picture = np.array([(0, 1), (1, 1), (1, 0), (0, 0)], "<f4")
+    triangles = np.array([0, 1, 2, 0, 2, 3], "<u2")
+    parts = [part.tobytes() for part in (corners, in_picture, triangles)]
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
     floats, shorts = 5126, 5123  # Component types of glTF.
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
     content = {
         "asset": {"version": "2.0"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
         "materials": [
             {
                 "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
@@ -310,17 +300,16 @@ def picture_board(png: bytes, width: float, height: float) -> InMemoryMesh:
             }
         ],
         "textures": [{"source": 0}],
-        "images": [{"uri": f"data:image/png;base64,{base64.b64encode(png).decode()}"}],
+        "images": [{"uri": _data_uri("image/png", png)}],
         "buffers": [
             {
-                "byteLength": sum(map(len, parts)),
-                "uri": "data:application/octet-stream;base64,"
-                + base64.b64encode(b"".join(parts)).decode(),
+                "byteLength": starts[-1],
+                "uri": _data_uri("application/octet-stream", b"".join(parts)),
             }
         ],
         "bufferViews": [
             {"buffer": 0, "byteOffset": start, "byteLength": len(part)}
-            for start, part in zip(starts, parts, strict=True)
+            for start, part in zip(starts, parts, strict=False)
         ],
         "accessors": [
             {
@@ -336,3 +325,7 @@ def picture_board(png: bytes, width: float, height: float) -> InMemoryMesh:
         ],
     }
     return InMemoryMesh(mesh_file=MemoryFile(json.dumps(content), ".gltf", "board"))
+
+
+def _data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

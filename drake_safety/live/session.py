@@ -102,8 +102,11 @@ class LiveSession(ABC):
         self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
         self._fall_column = loop.constraint_names.index(loop.fall_name)
-        extent_m = self._extent_m()
-        self.panel = LivePanel(meshcat, loop.view, threshold=threshold, width_m=0.9 * extent_m)
+        # How large the robot is: twice the height of its base, or as long as its feet stand.
+        q = loop.kinematics.standing_positions()
+        contacts = loop.kinematics.contact_positions(q)
+        self._size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
+        self.panel = LivePanel(meshcat, loop.view, threshold=threshold, width_m=0.9 * self._size_m)
         self._add_button(STOP, "Escape")
         meshcat.AddSlider(PROBABILITY, 0.0, 1.0, 0.01, 0.0)
 
@@ -185,42 +188,25 @@ class LiveSession(ABC):
         """Whether the robot lies."""
         return bool(self._eval("margins")[self._fall_column] < 0)
 
-    def _extent_m(self) -> float:
-        """How large the robot is: twice the height of its base, or as long as its feet stand."""
-        kinematics = self.loop.kinematics
-        q = kinematics.standing_positions()
-        contacts = kinematics.contact_positions(q)
-        return float(max(2 * q[6], *np.ptp(contacts, axis=0)))
+    def _rightwards(self) -> np.ndarray:
+        """To the right of who looks through the camera, in the world, (3,)."""
+        azimuth = self.loop.view.azimuth_rad
+        return np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
 
     def _place_panel(self) -> None:
-        p_WB, extent_m = self._base(), self._extent_m()
-        azimuth = self.loop.view.azimuth_rad
-        rightwards = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-        place = np.array([p_WB[0], p_WB[1], 0.1 * extent_m]) + 1.1 * extent_m * rightwards
-        self.panel.place(place)
+        x, y, _ = self._base()
+        beside = np.array([x, y, 0.0]) + 1.1 * self._size_m * self._rightwards()
+        self.panel.place(beside + [0.0, 0.0, 0.1 * self._size_m])
 
     def _aim_camera(self) -> None:
-        p_WB, extent_m, view = self._base(), self._extent_m(), self.loop.view
-        azimuth = view.azimuth_rad
-        rightwards = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-        target = p_WB * [1.0, 1.0, 0.9] + 0.5 * extent_m * rightwards
-        reach = 1.9 * extent_m
+        view = self.loop.view
+        target = self._base() * [1.0, 1.0, 0.9] + 0.5 * self._size_m * self._rightwards()
+        level, up = math.cos(view.elevation_rad), math.sin(view.elevation_rad)
         away = np.array(
-            [
-                math.cos(azimuth) * math.cos(view.elevation_rad),
-                math.sin(azimuth) * math.cos(view.elevation_rad),
-                math.sin(view.elevation_rad),
-            ]
+            [level * math.cos(view.azimuth_rad), level * math.sin(view.azimuth_rad), up]
         )
-        self.meshcat.SetCameraPose(target + reach * away, target)
+        self.meshcat.SetCameraPose(target + 1.9 * self._size_m * away, target)
         self._place_panel()
-
-    def _words_of_cause(self, masses: np.ndarray, margins: np.ndarray, unit: float) -> str:
-        (column,) = likely_causes(masses[None], margins[None], unit)
-        if column == NO_CAUSE:
-            return ""
-        name = self.loop.constraint_names[column]
-        return name + _margin_words(margins[column], name in self.loop.angular_constraints)
 
 
 class LiveThrows(LiveSession):
@@ -290,10 +276,10 @@ class LiveThrows(LiveSession):
         elif self.probability >= self.threshold:
             self.panel.say("safe: balancing", note, rgb=SAFE_RGB)
         else:
-            name = self._words_of_cause(
-                self._eval("cause_probability"), self._eval("predicted_margins"), self._unit
-            ).split(",")[0]
-            self.panel.say("unsafe" + (f": {name}" if name else ""), note, rgb=UNSAFE_RGB)
+            masses, margins = self._eval("cause_probability"), self._eval("predicted_margins")
+            (cause,) = likely_causes(masses[None], margins[None], self._unit)
+            name = "" if cause == NO_CAUSE else f": {self.loop.constraint_names[cause]}"
+            self.panel.say("unsafe" + name, note, rgb=UNSAFE_RGB)
 
 
 class LiveGoals(LiveSession):
@@ -337,7 +323,7 @@ class LiveGoals(LiveSession):
             self._add_button(name, key)
         for name, low, high, value in zip(self.AXES, *box.tolist(), start, strict=True):
             meshcat.AddSlider(name, low, high, 0.01, value)
-        radius_m = 0.03 * self._extent_m()
+        radius_m = 0.03 * self._size_m
         meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*INK_RGB, 0.8))
         meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*SAFE_RGB, 0.8))
         self._goal = np.full(3, np.nan)
@@ -406,9 +392,8 @@ class LiveGoals(LiveSession):
         first = f"refused: Γ {verdict.safety_probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
-        cause = self._words_of_cause(
-            verdict.cause_probability, verdict.predicted_margins, verdict.margin_unit
-        )
+        is_angle = verdict.cause in self.loop.angular_constraints
+        cause = verdict.cause + _margin_words(verdict.cause_margin, is_angle)
         second = f"expected: {cause}" if cause else verdict.reason
         if is_thorough:
             if self.nearest is None:

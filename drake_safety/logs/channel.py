@@ -59,16 +59,3 @@ def listed(names: Iterable[str]) -> str:
     if len(names) <= _MANY:
         return str(names)
     return f"{names[:_MANY]} and {len(names) - _MANY} more"
-
-
-def require_columns(path: Path, topic: str, wanted: Iterable[str], existing: Iterable[str]) -> None:
-    """Refuses a log that lacks columns.
-
-    Raises:
-        ValueError: Names those that are missing and those that exist.
-    """
-    existing = list(existing)
-    missing = [name for name in wanted if name not in set(existing)]
-    if missing:
-        of = f" of topic '{topic}'" if topic else ""
-        raise ValueError(f"log '{path}'{of} has no columns {missing}; it has {listed(existing)}")

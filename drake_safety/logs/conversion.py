@@ -17,11 +17,11 @@ def points(position: Position, channels: Mapping[str, Channel]) -> np.ndarray:
     return LENGTH_UNITS[position.unit] * table
 
 
-def quaternions(log_map: LogMap, channels: Mapping[str, Channel]) -> np.ndarray:
-    """Orientations of the base at their topic's times, (N, 4): w, x, y, z."""
+def base_rotations(log_map: LogMap, channels: Mapping[str, Channel]) -> Rotation:
+    """Orientations of the base at their topic's times, (N,)."""
     orientation = log_map.base_orientation
     table = channels[orientation.topic].table(orientation.columns)
-    return table if orientation.order == "wxyz" else table[:, [3, 0, 1, 2]]
+    return Rotation.from_quat(table, scalar_first=orientation.order == "wxyz")
 
 
 def joint_table(
@@ -46,11 +46,6 @@ def base_velocities(
     units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
     table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
     return table if velocity.frame == "world" else rotations.apply(table)
-
-
-def rotations_of(wxyz: np.ndarray) -> Rotation:
-    """Rotations of quaternions (N, 4) in the order w, x, y, z."""
-    return Rotation.from_quat(wxyz, scalar_first=True)
 
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:

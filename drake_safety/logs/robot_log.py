@@ -7,19 +7,19 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.logs import checks
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.conversion import (
     angular_velocities,
+    base_rotations,
     base_velocities,
     joint_table,
     points,
-    quaternions,
     rates,
     rotations_at,
-    rotations_of,
     values_at,
 )
 from drake_safety.logs.log_map import LogMap, load_log_map
@@ -68,7 +68,9 @@ class RobotLog:
         Args:
             at_s: Times (M,) [s].
         """
-        rotations = rotations_at(self.time_s, rotations_of(self.q[:, :4]), at_s)
+        rotations = rotations_at(
+            self.time_s, Rotation.from_quat(self.q[:, :4], scalar_first=True), at_s
+        )
         rest = values_at(self.time_s, np.hstack([self.q[:, 4:], self.v]), at_s)
         return np.hstack([rotations.as_quat(scalar_first=True), rest])
 
@@ -193,7 +195,7 @@ def _converted(
     where = channels[log_map.base_position.topic].where(min(first_row, len(base_time) - 1))
 
     def positions(read_by: LogMap, at: np.ndarray) -> np.ndarray:
-        rotations = rotations_of(quaternions(read_by, channels))
+        rotations = base_rotations(read_by, channels)
         rotations = rotations_at(times[read_by.base_orientation.topic], rotations, at)
         base = values_at(base_time, points(read_by.base_position, channels), at)
         table = joint_table(read_by, channels, kinematics.joint_names, "joint_positions")
@@ -230,7 +232,7 @@ def _velocities(
     at_s: np.ndarray,
 ) -> np.ndarray:
     rotation_time = times[log_map.base_orientation.topic]
-    rotations = rotations_of(quaternions(log_map, channels))
+    rotations = base_rotations(log_map, channels)
     base_time = times[log_map.base_position.topic]
     joint_map = log_map.joint_positions
     joint_time = times[joint_map.topic]

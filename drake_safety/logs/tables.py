@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.logs.channel import Channel, require_columns
+from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
 
 if TYPE_CHECKING:
@@ -80,7 +80,9 @@ def _checked_names(
             f"{existing}"
         )
     names = list(dict.fromkeys([time.column, *wanted]))
-    require_columns(path, "", names, existing)
+    missing = [name for name in names if name not in existing]
+    if missing:
+        raise ValueError(f"log '{path}' has no columns {missing}; it has {listed(existing)}")
     twice = [name for name in names if existing.count(name) > 1]
     if twice:
         raise ValueError(f"log '{path}' has columns of the same name: {twice}")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 
 from drake_safety.plants.mujoco_model import build_model, import_mujoco
 from drake_safety.robots.robot import PlantVariation, servo_joints
@@ -15,19 +15,6 @@ from drake_safety.robots.robot_model import RobotModel
 
 _LOGGER = logging.getLogger("drake_safety")
 _NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
-
-
-@dataclass(kw_only=True)
-class PointForce:
-    """A force and a torque at a point of a body."""
-
-    body: str
-    p_BoBq_B: np.ndarray
-    """The point in the body's frame, (3,) [m]."""
-    torque_W: np.ndarray
-    """In the world, (3,) [N·m]."""
-    force_W: np.ndarray
-    """In the world, (3,) [N]."""
 
 
 class MujocoDynamics:
@@ -67,6 +54,7 @@ class MujocoDynamics:
             # MuJoCo would write its warnings to a file in whatever folder one is in.
             mujoco.set_mju_user_warning(lambda text: _LOGGER.debug("MuJoCo: %s", text))
         self.robot = robot
+        self._plant = plant
         self.model, commands = build_model(
             robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
         )
@@ -121,7 +109,10 @@ class MujocoDynamics:
         return plant_state
 
     def step(
-        self, state: np.ndarray, command: np.ndarray, forces: list[PointForce] | None = None
+        self,
+        state: np.ndarray,
+        command: np.ndarray,
+        forces: Sequence[ExternallyAppliedSpatialForce] = (),
     ) -> np.ndarray:
         """The state one step later.
 
@@ -129,7 +120,7 @@ class MujocoDynamics:
             state: MuJoCo's, (num_state,).
             command: Joint torques (n_j,) [N·m], or with servos joint positions and velocities
                 (2 n_j,) [rad, rad/s], in the order of ``joint_names``.
-            forces: What else acts during the step.
+            forces: What else acts during the step, on bodies of the Drake plant.
 
         Raises:
             RuntimeError: The simulation is unstable, or an argument is not finite.
@@ -143,7 +134,10 @@ class MujocoDynamics:
         scratch.ctrl[:] = command[self.command_places]
         scratch.qfrc_applied[:] = 0.0
         if forces:
-            self._apply(forces)
+            mujoco.mj_kinematics(model, scratch)
+            mujoco.mj_comPos(model, scratch)
+        for force in forces:
+            self._apply(force)
         mujoco.mj_step(model, scratch)
         failed = (
             mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -155,18 +149,20 @@ class MujocoDynamics:
             raise RuntimeError(f"robot '{self.robot.name}': MuJoCo's simulation is unstable")
         return np.concatenate([scratch.qpos, scratch.qvel, scratch.qacc_warmstart])
 
-    def _apply(self, forces: list[PointForce]) -> None:
+    def _apply(self, force: ExternallyAppliedSpatialForce) -> None:
         mujoco, model, scratch = self._mujoco, self.model, self._scratch
-        mujoco.mj_kinematics(model, scratch)
-        mujoco.mj_comPos(model, scratch)
-        for force in forces:
-            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, force.body)
-            if index < 0:
-                raise ValueError(
-                    f"robot '{self.robot.name}': MuJoCo has no body '{force.body}' to push"
-                )
-            R_WB = scratch.xmat[index].reshape(3, 3)
-            point = scratch.xpos[index] + R_WB @ force.p_BoBq_B
-            mujoco.mj_applyFT(
-                model, scratch, force.force_W, force.torque_W, point, index, scratch.qfrc_applied
-            )
+        body = self._plant.get_body(force.body_index).name()
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if index < 0:
+            raise ValueError(f"robot '{self.robot.name}': MuJoCo has no body '{body}' to push")
+        point = scratch.xpos[index] + scratch.xmat[index].reshape(3, 3) @ force.p_BoBq_B
+        F_Bq_W = force.F_Bq_W
+        mujoco.mj_applyFT(
+            model,
+            scratch,
+            F_Bq_W.translational(),
+            F_Bq_W.rotational(),
+            point,
+            index,
+            scratch.qfrc_applied,
+        )

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.plants.mujoco_dynamics import MujocoDynamics, PointForce
+from drake_safety.plants.mujoco_dynamics import MujocoDynamics
 
 
 class MujocoPlant(LeafSystem):
@@ -31,14 +31,13 @@ class MujocoPlant(LeafSystem):
 
     Args:
         dynamics: The robot in MuJoCo.
-        plant: The finalised Drake plant it was made of, which names the bodies of forces and
-            gives the default state. It is not simulated.
+        plant: The finalised Drake plant it was made of, which gives the default state. It is not
+            simulated.
     """
 
     def __init__(self, dynamics: MujocoDynamics, plant: MultibodyPlant):
         super().__init__()
         self.dynamics = dynamics
-        self._plant = plant
         n_q, n_v = dynamics.num_positions, dynamics.num_velocities
         self._n_q = n_q
         instance = plant.GetModelInstanceByName(dynamics.robot.name)
@@ -66,23 +65,11 @@ class MujocoPlant(LeafSystem):
     def _plant_state(self, context: Context) -> np.ndarray:
         return self.dynamics.plant_state(context.get_discrete_state_vector().get_value())
 
-    def _forces(self, context: Context) -> list[PointForce]:
-        if not self._force_port.HasValue(context):
-            return []
-        return [
-            PointForce(
-                body=self._plant.get_body(force.body_index).name(),
-                p_BoBq_B=force.p_BoBq_B,
-                torque_W=force.F_Bq_W.rotational(),
-                force_W=force.F_Bq_W.translational(),
-            )
-            for force in self._force_port.Eval(context)
-        ]
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = context.get_discrete_state_vector().get_value()
         command = self._command_port.Eval(context)
-        discrete_state.set_value(self.dynamics.step(state, command, self._forces(context)))
+        forces = self._force_port.Eval(context) if self._force_port.HasValue(context) else ()
+        discrete_state.set_value(self.dynamics.step(state, command, forces))
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._plant_state(context))

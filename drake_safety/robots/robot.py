@@ -28,7 +28,7 @@ from drake_safety.robots.robot_description import (
     add_stated_shapes,
     ignore_neighbours,
 )
-from drake_safety.robots.robot_model import Foot, ReachingFrame, RobotModel, by_pattern
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 
 ENGINES = ("drake", "mujoco")
 """Physics engines that a plant variation may choose."""
@@ -178,10 +178,10 @@ def add_robot(
     instance = add_description(plant, robot)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
-    limbs: list[Foot | ReachingFrame] = [*robot.feet.values(), *robot.reaching_frames.values()]
-    for name in (robot.base, *(limb.body for limb in limbs), *robot.whole_body.orientation):
+    ends = [limb.body for limb in robot.limbs()]
+    for name in (robot.base, *ends, *robot.whole_body.orientation):
         _require(robot, "body", name, bodies)
-    for name in (name for limb in limbs for name in limb.joints):
+    for name in (name for limb in robot.limbs() for name in limb.joints):
         _require(robot, "joint", name, joints)
     robot.mirror_partners(servo_joints(plant, robot))
     if robot.collision == "stated" and plant.geometry_source_is_registered():
@@ -241,9 +241,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     driven = {
         plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(instance)
     }
-    limbs = [foot.joints for foot in robot.feet.values()]
-    limbs += [frame.joints for frame in robot.reaching_frames.values()]
-    names = dict.fromkeys(name for joints in limbs for name in joints)
+    names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
     # A foot need not say what moves it.
     without = [name for name in names or servo_joints(plant, robot) if name not in driven]
     if without:

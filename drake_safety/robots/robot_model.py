@@ -229,6 +229,10 @@ class RobotModel:
                 f"robot '{self.name}': foot_friction must be positive; got {self.foot_friction}"
             )
 
+    def limbs(self) -> list[Foot | ReachingFrame]:
+        """Legs and arms, by what is at their ends."""
+        return [*self.feet.values(), *self.reaching_frames.values()]
+
     def reaching_frame(self, hand: str) -> ReachingFrame:
         """The reaching frame of a hand.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Sphere
+from pydrake.geometry import Capsule, Cylinder, GeometryId, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
@@ -128,10 +128,6 @@ class Survey:
     def positions(self, limb: Limb) -> np.ndarray:
         """Centres of a limb's contact spheres in the base's frame, (n, 3) [m]."""
         return (self.pose(limb.body) @ limb.points.T).T
-
-    def center_of_mass(self) -> np.ndarray:
-        """In the base's frame, (3,) [m]."""
-        return self.plant.CalcCenterOfMassPositionInWorld(self.context, [self.instance])
 
     def leaves(self) -> list[list[str]]:
         """Groups of bodies, welded to each other, beyond which nothing moves."""
@@ -300,8 +296,6 @@ class Survey:
                 X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
                 if isinstance(shape, Sphere):
                     found.append((name, X_WG.translation()[None], shape.radius(), True))
-                elif isinstance(shape, Box):
-                    found.append((name, *_corners(X_WG, np.array(shape.size()) / 2), False))
                 elif isinstance(shape, Capsule | Cylinder):
                     radius = shape.radius()
                     half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
