@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
+from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
@@ -96,7 +97,7 @@ def cut_log(
             f"log '{log.path}' lasts {log.duration_s:g} s: too short for a segment of {shortest} "
             f"steps of {scenario.step_s} s of scenario '{scenario.name}'"
         )
-    return Episodes(episodes_info(loop, seed=0), episodes), starts
+    return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
 
 def cut_logs(
@@ -123,7 +124,7 @@ def cut_logs(
         found, begins = cut_log(log, loop, desired_output=desired_output)
         episodes += [replace(one, index=len(episodes) + one.index) for one in found]
         starts += begins
-    return Episodes(episodes_info(loop, seed=0), episodes), starts
+    return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
 
 def _desired_output(
