@@ -30,7 +30,7 @@ _BESIDE = ("assessments", "diagrams", "models")
 
 
 def package_folder(name: str) -> Path:
-    """Where `models`, `diagrams` or `assessments` stands: in this package, or in a checkout beside it.
+    """Where `models`, `diagrams` or `assessments` stands: in this package, or else beside it.
 
     Args:
         name: One of the three.

@@ -240,9 +240,9 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     missed = report["calibration.sharpened.plan.miss_rate"]["value"]
     assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
     assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
-    assert "is the one that thresholds were calibrated with" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "begin as the 120 'nominal' episodes of its calibration did" in printed
+    assert "choose another seed, such as 2000001" in printed
 
 
 @pytest.mark.slow
@@ -269,7 +269,8 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
     assert all(again[key] == report[key] for key in report if key.startswith("planning."))
     monkeypatch.undo()
     assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
-    assert "0 is the training episodes' own seed" in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "seed 0 would give episodes that begin as the 60 'nominal' episodes of its" in printed
 
 
 @pytest.mark.slow
@@ -304,7 +305,7 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
         (["--learning-curve", "many"], "--learning-curve 'many': give numbers of episodes"),
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
-        (["--seed", "-3"], "-3, -2, -1, 0 would be used, and 0 is the training episodes' own"),
+        (["--seed", "-3"], "seed 0 would give episodes that begin as the 60 'nominal'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
@@ -315,7 +316,7 @@ def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
 
     monkeypatch.setattr(rollouts, "run_episode", forbidden)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) == 2
-    assert message in capsys.readouterr().out
+    assert message in " ".join(capsys.readouterr().out.split())
 
 
 def test_options_of_targets_are_refused_where_plans_have_no_goal():

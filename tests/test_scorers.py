@@ -19,6 +19,7 @@ class StandIn:
 
     def __init__(self, uses_features):
         self.uses_features = uses_features
+        self.used_ = []
         self.parameters = SimpleNamespace(is_sharpened=uses_features, initial_uncertainty=0.3)
 
     def predict(self, state, desired_preview, features):

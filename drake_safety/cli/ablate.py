@@ -21,6 +21,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
@@ -60,7 +61,7 @@ def ablate(
     ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of the fresh ones: those of `evaluate` by default.")
-    ] = 1_000_000,
+    ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Learn Γ anew with one choice made otherwise at a time, and judge it on the same episodes.
@@ -77,9 +78,11 @@ def ablate(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    base = load_assessment(assessment, MODES[0]).parameters
+    gamma = load_assessment(assessment, MODES[0])
+    base = gamma.parameters
     training = load_episodes(episodes_folder(assessment))
-    check_fresh(training.info, loaded, (seed, seed + 3))
+    seeds = EVALUATION.seeds(seed)
+    check_fresh(gamma, loaded, (seeds["evaluation"], seeds["thresholds"]))
     num_training = len(training)
     if quick:
         num_training = min(num_training, _QUICK_EPISODES)
@@ -110,7 +113,7 @@ def ablate(
             num_training,
             episodes or (_QUICK_TEST if quick else 1000),
             calibration_episodes or (_QUICK_CALIBRATION if quick else 300),
-            seed,
+            seeds,
             workers,
             stages,
         )
@@ -153,7 +156,7 @@ def _sets(
     num_training: int,
     num_test: int,
     num_calibration: int,
-    seed: int,
+    seeds: dict[str, int],
     workers: int | None,
     stages: Stages,
 ) -> AblationSets:
@@ -178,8 +181,8 @@ def _sets(
 
     return AblationSets(
         training=EpisodeSet(path=episodes_folder(folder), count=num_training),
-        test=fresh("fresh nominal episodes", num_test, seed),
-        calibration=fresh("calibration episodes", num_calibration, seed + 3),
+        test=fresh("fresh nominal episodes", num_test, seeds["evaluation"]),
+        calibration=fresh("calibration episodes", num_calibration, seeds["thresholds"]),
     )
 
 
@@ -199,7 +202,8 @@ def _counting(
         for pairs in sorted((folder / "feedback").glob(f"{hash_}-*")):
             own_seed = int(pairs.name.rpartition("-")[2])
             # Beside the pairs, `adapt` keeps what it has judged by.
-            fresh = pairs.with_name(f"{hash_}-{own_seed + 1}") / variation
+            judging = ADAPTATION.seeds(own_seed)["evaluation of the adaptation"]
+            fresh = pairs.with_name(f"{hash_}-{judging}") / variation
             if not ((pairs / "nominal").is_dir() and fresh.is_dir()):
                 continue
             nominal, actual = (load_episodes(pairs / name) for name in ("nominal", variation))

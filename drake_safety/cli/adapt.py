@@ -31,6 +31,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.adaptation_study import AdaptationStudy
@@ -72,7 +73,9 @@ def adapt(
     log_map: Annotated[
         Path | None, typer.Option("--map", help="What is where in the logs, a YAML file.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 2_000_000,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the feedback; those of judging follow it.")
+    ] = ADAPTATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Adapt Γ to what an actual robot does, and judge it before and after.
@@ -89,7 +92,10 @@ def adapt(
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
-    check_fresh(priors[MODES[0]].info_, loaded, range(seed, seed + 3))
+    seeds = ADAPTATION.seeds(seed)
+    for prior in priors.values():
+        check_fresh(prior, loaded, list(seeds.values())[1:] if evaluate else ())
+        prior.check_unused(seed, purpose="adaptation")
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log and --map go together: a log is read by its map")
@@ -121,7 +127,7 @@ def adapt(
                 pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
         studies: dict[str, AdaptationStudy] = {}
         if evaluate:
-            judge = _Judge(loaded, variation, seed, learned.out, workers, stages)
+            judge = _Judge(loaded, variation, seeds, learned.out, workers, stages)
             studies = judge.studies(priors, pairs, evaluate, orders, oracle, scratch)
             from drake_safety.evaluation.adaptation_figure import study_figure
 
@@ -204,18 +210,18 @@ class _Judge:
         self,
         scenario: Scenario,
         variation: str,
-        seed: int,
+        seeds: dict[str, int],
         folder: Path,
         workers: int | None,
         stages: Stages,
     ):
-        self._scenario, self._variation, self._seed = scenario, variation, seed
+        self._scenario, self._variation, self._seeds = scenario, variation, seeds
         self._folder, self._workers, self._stages = folder, workers, stages
 
-    def _run(self, what: str, num_episodes: int, offset: int) -> Episodes:
+    def _run(self, what: str, num_episodes: int, purpose: str) -> Episodes:
         from drake_safety.simulation.rollouts import run_episodes
 
-        seed = self._seed + offset
+        seed = self._seeds[purpose]
         scenario_hash = self._scenario.simulation_hash(self._variation)
         episodes = run_episodes(
             self._scenario,
@@ -243,10 +249,10 @@ class _Judge:
         from drake_safety.evaluation.adaptation_losses import losses
         from drake_safety.evaluation.adaptation_study import TestSet, study, trained_rivals
 
-        fresh = self._run("fresh actual episodes", num_test, 1)
+        fresh = self._run("fresh actual episodes", num_test, "evaluation of the adaptation")
         learned_from = {}
         if num_oracle:
-            learned_from["oracle"] = self._run("episodes of the oracle", num_oracle, 2)
+            learned_from["oracle"] = self._run("episodes of the oracle", num_oracle, "oracle")
         if has_scratch:
             learned_from |= {
                 f"scratch.{n}": pairs.actual[:n] for n in _SCRATCH_SIZES if n <= len(pairs.actual)
@@ -264,7 +270,7 @@ class _Judge:
                 pairs.feedback(),
                 test,
                 num_orders=num_orders,
-                seed=self._seed,
+                seed=self._seeds["adaptation"],
                 rivals=rivals,
                 progress=self._stages,
             )

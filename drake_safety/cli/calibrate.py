@@ -24,15 +24,13 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.learning.seeds import CALIBRATION
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from drake_safety.evaluation.calibration_study import PromiseKept
     from drake_safety.learning.calibration import Calibration
-
-SEED = 2_000_000
-"""Of the episodes that Γ is calibrated with: not those that `evaluate` judges by."""
 
 
 def calibrate(
@@ -53,7 +51,7 @@ def calibrate(
     splits: Annotated[
         int, typer.Option(help="How often to split them, to see promises kept; 0: not.", min=0)
     ] = 200,
-    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = SEED,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Choose thresholds that keep a promised miss rate, on fresh episodes.
@@ -80,7 +78,8 @@ def calibrate(
     }
     scenario_hash = loaded.simulation_hash()
     for gamma in learned.values():
-        check_fresh(gamma.info_, loaded, (seed,))
+        check_fresh(gamma, loaded)
+        gamma.check_unused(seed, purpose="calibration")
     judging = dict(loaded.task_class().judging_options)
     with open_stages() as stages:
         fresh = run_episodes(
@@ -115,7 +114,7 @@ def calibrate(
                     of_episodes, is_unsafe, confidence=confidence, num_splits=splits, seed=seed
                 )
     for mode, gamma in learned.items():
-        gamma.calibrations_ = {one.kind: one for one in found[mode]}
+        gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
         gamma.save(assessment_file(folder.out, mode))
     console.print(_table(found))
     for kind, promises in kept.items():

@@ -32,6 +32,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
@@ -94,7 +95,9 @@ def evaluate(
             help="State planes: starts simulated along either axis; 0 leaves them out.", min=0
         ),
     ] = 41,
-    seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
+    seed: Annotated[
+        int, typer.Option(help="First of the seeds of all that is fresh.")
+    ] = EVALUATION.first,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
@@ -142,37 +145,31 @@ def evaluate(
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
     train_set = load_episodes(episodes_folder(assessment))
-    # Episodes, throws or pushes, those that their alarms and other thresholds are chosen on.
-    used = range(seed, seed + 4)
-    check_fresh(train_set.info, loaded, used)
+    seeds = EVALUATION.seeds(seed)
+    for gamma in (sharpened, paper):
+        check_fresh(gamma, loaded, seeds.values())
     check_options(loop, options, len(train_set))
-    for one in (*sharpened.calibrations_.values(), *paper.calibrations_.values()):
-        if one.seed in used:
-            raise ValueError(
-                f"evaluate: seeds {used.start} to {used.stop - 1} would be used, and {one.seed} is "
-                "the one that thresholds were calibrated with; choose another"
-            )
     with open_stages() as stages:
 
-        def run_set(what: str, num_episodes: int, offset: int, **loop_options: Any) -> Episodes:
+        def run_set(what: str, num_episodes: int, purpose: str, **loop_options: Any) -> Episodes:
             path = None
             loop_options = {**loop.judging_options, **loop_options}
             if has_goals:
                 path = fresh_episodes_folder(
-                    assessment, loaded.simulation_hash(), seed + offset, loop_options
+                    assessment, loaded.simulation_hash(), seeds[purpose], loop_options
                 )
             return run_episodes(
                 loaded,
                 num_episodes,
-                seed=seed + offset,
+                seed=seeds[purpose],
                 num_workers=workers,
                 path=path,
                 progress=partial(stages, what),
                 **loop_options,
             )
 
-        test_set = run_set("fresh nominal episodes", episodes, 0)
-        calibration_set = run_set("calibration episodes", calibration_episodes, 3)
+        test_set = run_set("fresh nominal episodes", episodes, "evaluation")
+        calibration_set = run_set("calibration episodes", calibration_episodes, "thresholds")
         shortest = sharpened.parameters.shortest_segment or None
         judged = Judged(
             scenario=loaded,
@@ -194,12 +191,12 @@ def evaluate(
             ]
         )
         if has_goals:
-            findings.add(evaluate_plans(judged, options, partial(run_set, offset=0)))
+            findings.add(evaluate_plans(judged, options, partial(run_set, purpose="evaluation")))
         else:
             findings.add(_evaluate_segments(judged))
         findings.add(evaluate_calibration(judged))
         if throws:
-            findings.add(_evaluate_throws(judged, throws, calibration_throws, seed))
+            findings.add(_evaluate_throws(judged, throws, calibration_throws, seeds))
         if pushes:
             findings.add(
                 evaluate_pushes(
@@ -207,8 +204,8 @@ def evaluate(
                     pushes,
                     pushes,
                     threshold=findings.figures["plans.sharpened.threshold"].value,
-                    seed=seed + 1,
-                    calibration_seed=seed + 2,
+                    seed=seeds["disturbances"],
+                    calibration_seed=seeds["disturbance thresholds"],
                 )
             )
         if loop.state_planes and truth_resolution:
@@ -259,7 +256,9 @@ def _evaluate_segments(judged: Judged) -> Findings:
     )
 
 
-def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed: int) -> Findings:
+def _evaluate_throws(
+    judged: Judged, num_throws: int, num_calibration: int, seeds: dict[str, int]
+) -> Findings:
     """Everyone as a trigger of recovery."""
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
@@ -278,8 +277,8 @@ def _evaluate_throws(judged: Judged, num_throws: int, num_calibration: int, seed
         rules,
         num_throws=num_throws,
         num_calibration=num_calibration,
-        seed=seed + 1,
-        calibration_seed=seed + 2,
+        seed=seeds["disturbances"],
+        calibration_seed=seeds["disturbance thresholds"],
         num_workers=judged.workers,
         progress=judged.stages,
     )

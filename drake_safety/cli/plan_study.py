@@ -26,6 +26,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     planning_folder,
 )
+from drake_safety.learning.seeds import PLANNING
 
 
 def plan_study(
@@ -35,7 +36,7 @@ def plan_study(
     candidates: Annotated[
         int, typer.Option(help="Plans of each start, all of them simulated.", min=2)
     ] = 9,
-    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 3_000_000,
+    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = PLANNING.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
         Path | None,
@@ -58,7 +59,7 @@ def plan_study(
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     gamma = load_assessment(learned.path, mode)
-    check_fresh(gamma.info_, loaded, (seed,))
+    check_fresh(gamma, loaded, (seed,))
     rule = goal_threshold(learned.path, mode, gamma)
     print_shipped(learned)
     with open_stages() as stages:

@@ -15,6 +15,7 @@ from drake_safety.cli.arguments import ScenarioArgument, WorkersOption
 from drake_safety.cli.console import Stages, console, new_table, open_stages, print_path
 from drake_safety.cli.provenance import command_line
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.learning.seeds import TRAINING
 
 if TYPE_CHECKING:
     from drake_safety.learning.segments import Episodes
@@ -25,7 +26,7 @@ def train(
     scenario: ScenarioArgument,
     out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
     episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=1)] = 2048,
-    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = TRAINING.first,
     mode: Annotated[
         str, typer.Option(help="'sharpened', 'paper' (literally the paper's), or 'both'.")
     ] = "both",

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import EpisodesInfo
     from drake_safety.simulation.scenario import Scenario
 
 
@@ -159,18 +158,21 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     return SafetyAssessment.load(path)
 
 
-def check_fresh(trained: EpisodesInfo, scenario: Scenario, seeds: Sequence[int]) -> None:
-    """Refuses what a training cannot be judged by.
+def check_fresh(
+    assessment: SafetyAssessment, scenario: Scenario, seeds: Iterable[int] = ()
+) -> None:
+    """Refuses what an assessment cannot be judged by.
 
     Args:
-        trained: Of the episodes that it learned from.
+        assessment: The assessment.
         scenario: That fresh episodes are simulated of.
         seeds: Of the fresh sets.
 
     Raises:
-        ValueError: The scenario is no longer the one that was learned from, or a set would be the
-            training's own.
+        ValueError: The scenario is no longer the one that was learned from, or the assessment has
+            used one of the seeds.
     """
+    trained = assessment.info_
     scenario_hash = scenario.simulation_hash()
     if trained.scenario_hash != scenario_hash:
         raise ValueError(
@@ -178,11 +180,7 @@ def check_fresh(trained: EpisodesInfo, scenario: Scenario, seeds: Sequence[int])
             f"{trained.scenario_hash[:12]}, but '{scenario.name}' now has hash "
             f"{scenario_hash[:12]}: train again"
         )
-    if trained.seed in seeds:
-        raise ValueError(
-            f"seeds {', '.join(f'{seed}' for seed in seeds)} would be used, and {trained.seed} is "
-            "the training episodes' own seed; choose another --seed"
-        )
+    assessment.check_unused(*seeds)
 
 
 def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> GoalThreshold:

@@ -16,6 +16,7 @@ from drake_safety.evaluation.metrics import Figure
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
@@ -87,6 +88,7 @@ def compare_scenario(
             return stored["row"]
     run = partial(run_episodes, scenario, num_workers=num_workers)
     seed, robot = effort.seed, scenario.robot
+    seeds = EVALUATION.seeds(EVALUATION.first + seed)
     judging = dict(scenario.task_class().judging_options)
     training = run(
         effort.num_episodes,
@@ -97,14 +99,14 @@ def compare_scenario(
     fresh, calibration = (
         run(
             number,
-            seed=seed + offset,
+            seed=seeds[purpose],
             path=folder / name,
             progress=partial(progress, f"{scenario.name}: {name}"),
             **judging,
         )
-        for name, number, offset in (
-            ("fresh", effort.num_fresh, 1_000_000),
-            ("calibration", max(effort.num_fresh // 2, 20), 1_000_001),
+        for name, number, purpose in (
+            ("fresh", effort.num_fresh, "evaluation"),
+            ("calibration", max(effort.num_fresh // 2, 20), "thresholds"),
         )
     )
     assessment = SafetyAssessment(scenario.assessment).fit(
@@ -123,8 +125,8 @@ def compare_scenario(
             [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
             num_throws=effort.num_throws,
             num_calibration=0,
-            seed=seed + 1_000_002,
-            calibration_seed=seed + 1_000_003,
+            seed=seeds["disturbances"],
+            calibration_seed=seeds["disturbance thresholds"],
             num_workers=num_workers,
             progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
         )

@@ -15,6 +15,7 @@ from drake_safety.evaluation.metrics import (
     threshold_at,
 )
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import Episodes, split
 
 
@@ -34,7 +35,12 @@ def evaluate_episodes(
     Returns:
         The figures by dotted key, the unsafe score of every test segment by scorer, (N,) each, and
         whether each segment's episode ends unsafely, (N,).
+
+    Raises:
+        ValueError: Some of the episodes are none that a scorer has not seen.
     """
+    for scorer in scorers:
+        check_unused(scorer.used, (calibration.info.seed, test.info.seed), f"'{scorer.name}'")
     segments = split(test, stride=1, discount=1.0)
     seen = split(calibration, stride=1, discount=1.0)
     # Per kind of figure, the segments it is about in either set.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
 
 StageProgress = Callable[[str, int, int], None]
@@ -25,11 +26,13 @@ class Scorer:
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
             (N, n_f); NaN where it does not know.
         uses_true_state: Whether nominal episodes show it the state without noise.
+        used: The episodes that it was learned, calibrated or adapted with.
     """
 
     name: str
     probability: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     uses_true_state: bool = False
+    used: Sequence[UsedEpisodes] = ()
 
     def unsafe_score(self, segments: Segments) -> np.ndarray:
         """How unsafe it takes each segment to be, as the metrics expect it, (N,)."""
@@ -64,6 +67,7 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
         name=name,
         probability=probability,
         uses_true_state=not assessment.parameters.is_sharpened,
+        used=assessment.used_,
     )
 
 
@@ -81,16 +85,18 @@ def classifier_scorers(
     for i, kind in enumerate(KINDS):
         if progress is not None:
             progress("direct classifiers", i, len(KINDS))
-        scorers.append(_classifier_scorer(DirectClassifier(kind, shortest=shortest).fit(episodes)))
+        classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
+        used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
+        scorers.append(_classifier_scorer(classifier, used))
     if progress is not None:
         progress("direct classifiers", len(KINDS), len(KINDS))
     return scorers
 
 
-def _classifier_scorer(classifier: DirectClassifier) -> Scorer:
+def _classifier_scorer(classifier: DirectClassifier, used: Sequence[UsedEpisodes]) -> Scorer:
     def probability(
         state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
     ) -> np.ndarray:
         return 1.0 - classifier.predict_unsafe(state, desired_preview, features)
 
-    return Scorer(name=classifier.kind, probability=probability)
+    return Scorer(name=classifier.kind, probability=probability, used=used)

@@ -23,11 +23,13 @@ from drake_safety.learning.feedback import (
     FeedbackSet,
     check_feedback,
     segments_of,
+    used_episodes,
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import check_width, inputs
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
-from drake_safety.learning.segments import Episodes
+from drake_safety.learning.seeds import UsedEpisodes, check_unused
+from drake_safety.learning.segments import Episodes, EpisodesInfo
 from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.training import fitted_base_logit, learned_maps, segments_for
 
@@ -60,6 +62,8 @@ class SafetyAssessment:
     - `base_logit_`: L, which scales the maps' heads to one logit; None without heads.
     - `correction_`: the `Correction`, what feedback adds to L; nothing before any.
     - `adaptation_`: the `Adaptation` to feedback; None before any.
+    - `used_`: every set of episodes that was learned from, calibrated or adapted with, as
+      `UsedEpisodes`: what judges the assessment must be drawn with other seeds.
     - `calibrations_`: the `Calibration` by its kind, of these maps and `beliefs_`; empty until it
       is set.
 
@@ -134,6 +138,7 @@ class SafetyAssessment:
             )
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
+        self.used_ = [UsedEpisodes.of("training", info, len(episodes))]
         self.correction_ = Correction.none(self.embedding_, self.grid_)
         self.beliefs_ = adaptation.prior_beliefs(
             self._training, self.grid_, parameters, self.num_causes
@@ -191,6 +196,8 @@ class SafetyAssessment:
                 f"methods are {list(ADAPTATION_METHODS)}, and 'recalibration' takes maps with heads"
             )
         check_feedback(feedback, self.info_)
+        drawn = used_episodes(feedback)
+        self.check_unused(*{one.seed for one in drawn}, purpose="adaptation")
         segments = self.feedback_segments(feedback)
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
@@ -198,6 +205,7 @@ class SafetyAssessment:
         adapted.parameters = copy.deepcopy(self.parameters)
         # What was promised was promised of other beliefs.
         adapted.calibrations_ = {}
+        adapted.used_ = [*(one for one in self.used_ if one.purpose != "adaptation"), *drawn]
         arguments = (self.grid_, self.parameters, self.num_causes)
         adapted.correction_ = Correction.none(self.embedding_, self.grid_)
         if method == "paper":
@@ -233,6 +241,39 @@ class SafetyAssessment:
             num_differing=sum(one.differs for one in feedback),
         )
         return adapted
+
+    def check_unused(self, *seeds: int, purpose: str = "") -> None:
+        """Refuses seeds of episodes that were used to learn, calibrate or adapt.
+
+        Args:
+            *seeds: Of the sets.
+            purpose: "calibration" or "adaptation" where the sets take the place of those of an
+                earlier one, which then do not count; by default they are to judge by.
+
+        Raises:
+            ValueError: One was used; says for what, and which seed is free.
+        """
+        self._check_fitted()
+        used = [one for one in self.used_ if one.purpose != purpose]
+        check_unused(used, seeds, f"SafetyAssessment of '{self.info_.scenario}'")
+
+    def adopt_calibrations(
+        self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
+    ) -> None:
+        """Keeps thresholds in place of earlier ones, and what they were chosen on.
+
+        Args:
+            calibrations: One of each kind.
+            info: What the episodes share that they were chosen on.
+            num_episodes: How many there were.
+
+        Raises:
+            ValueError: These episodes were learned from or adapted with.
+        """
+        self.check_unused(info.seed, purpose="calibration")
+        kept = [one for one in self.used_ if one.purpose != "calibration"]
+        self.calibrations_ = {one.kind: one for one in calibrations}
+        self.used_ = [*kept, UsedEpisodes.of("calibration", info, num_episodes)]
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
         """The segments of feedback sets, cut as the training episodes were."""

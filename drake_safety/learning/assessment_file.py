@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import num_inputs
 from drake_safety.learning.prediction import BaseLogit, Correction
+from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
@@ -60,6 +61,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         "num_margins": embedding.num_margins,
         "base_logit": None if base_logit is None else asdict(base_logit),
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
+        "used": [asdict(one) for one in learned["used_"]],
     }
     metadata = {
         "schema": SCHEMA,
@@ -144,6 +146,7 @@ def _learned(
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
         "calibrations_": {one.kind: one for one in calibrations},
+        "used_": _used(info, calibrations, numbers.get("used")),
         "adaptation_": None if adaptation is None else Adaptation(**adaptation),
     }
     for name, (_, used) in _TRAINING.items():
@@ -161,6 +164,19 @@ def _learned(
         if tensors[name].shape != shape:
             raise ValueError(f"the shape of its {name} is {tensors[name].shape}, expected {shape}")
     return learned
+
+
+def _used(
+    info: EpisodesInfo, calibrations: list[Calibration], stored: list[dict[str, Any]] | None
+) -> list[UsedEpisodes]:
+    """What was used; in a file that does not say, what its other entries tell of it."""
+    if stored is not None:
+        return [UsedEpisodes(**one) for one in stored]
+    used = [UsedEpisodes.of("training", info, None)]
+    for one in calibrations[:1]:
+        seen = replace(info, seed=one.seed, scenario_hash=one.scenario_hash)
+        used.append(UsedEpisodes.of("calibration", seen, one.num_unsafe + one.num_safe))
+    return used
 
 
 def single(values: np.ndarray) -> np.ndarray:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import DIVERGED, Episodes, EpisodesInfo, split, unsafety_score
 
 START_TOLERANCE = 1e-2
@@ -25,6 +27,7 @@ class FeedbackSet:
     Attributes:
         info: What the actual episodes share.
         nominal_hash: Scenario hash of the twin.
+        twin_seed: Seed of the twin's set.
         index: Number of the pair.
         state: State as the assessor sees it, (N, n_s).
         true_state: State without observation noise, (N, n_s).
@@ -43,6 +46,7 @@ class FeedbackSet:
 
     info: EpisodesInfo
     nominal_hash: str
+    twin_seed: int
     index: int
     state: np.ndarray
     true_state: np.ndarray
@@ -109,6 +113,7 @@ def feedback_sets(
             FeedbackSet(
                 info=actual.info,
                 nominal_hash=nominal_hash or nominal.info.scenario_hash,
+                twin_seed=nominal.info.seed,
                 index=episode.index,
                 state=segments.state,
                 true_state=segments.true_state,
@@ -169,6 +174,22 @@ def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> No
                     f"feedback set {one.index} and the assessment differ in {what}: the feedback "
                     f"has {got}, the assessment was learned with {expected}"
                 )
+
+
+def used_episodes(feedback: Sequence[FeedbackSet]) -> list[UsedEpisodes]:
+    """The sets of actual episodes and of twins that feedback is of."""
+    sides = [(one.info.variation, one.info.scenario_hash, one.info.seed) for one in feedback]
+    sides += [("nominal", one.nominal_hash, one.twin_seed) for one in feedback]
+    return [
+        UsedEpisodes(
+            purpose="adaptation",
+            variation=variation,
+            scenario_hash=scenario_hash,
+            seed=seed,
+            num_episodes=count,
+        )
+        for (variation, scenario_hash, seed), count in Counter(sides).items()
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
+from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
@@ -70,7 +71,7 @@ def cut_log(
         for episode, start in _cut(one, loop, _desired_output(one, loop, desired_output)):
             episodes.append(replace(episode, index=len(episodes)))
             starts.append(start)
-    return Episodes(episodes_info(loop, seed=0), episodes), starts
+    return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
 
 def _cut(

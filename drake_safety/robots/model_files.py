@@ -11,7 +11,7 @@ from urllib.parse import urlparse
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_safety import package_folder
+import drake_safety
 
 _EXTRAS = {"example-robot-data": "robots"}
 """Packages of models that an extra installs."""
@@ -23,7 +23,7 @@ class MissingExtraError(ValueError):
 
 def models_package_xml() -> Path:
     """The ``package.xml`` behind ``package://drake_safety_models/``."""
-    return package_folder("models") / "package.xml"
+    return drake_safety.package_folder("models") / "package.xml"
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:

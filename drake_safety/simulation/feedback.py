@@ -12,6 +12,7 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -60,7 +61,7 @@ def run_pairs(
     num_pairs: int,
     *,
     variation: str = "actual",
-    seed: int = 0,
+    seed: int = ADAPTATION.first,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | None = None,
@@ -122,7 +123,7 @@ def make_recorder(
         capacity: Finished windows that are kept until they are taken.
     """
     return FeedbackRecorder(
-        episodes_info(loop, seed=0),
+        episodes_info(loop, seed=NOT_DRAWN),
         num_steps=num_steps or loop.scenario.num_steps,
         plant_state_size=loop.GetOutputPort("plant_state").size(),
         watch_period_s=loop.scenario.control_period_s,
@@ -153,7 +154,7 @@ def run_twins(
     scenario: Scenario,
     windows: Sequence[RecordedWindow],
     *,
-    seed: int = 0,
+    seed: int = ADAPTATION.first,
     num_workers: int | None = None,
     progress: Progress | None = None,
 ) -> Episodes:
@@ -190,7 +191,11 @@ def run_twins(
 
 
 def pair_starts(
-    scenario: Scenario, actual: Episodes, starts: Sequence[EpisodeStart], *, seed: int = 0
+    scenario: Scenario,
+    actual: Episodes,
+    starts: Sequence[EpisodeStart],
+    *,
+    seed: int = ADAPTATION.first,
 ) -> EpisodePairs:
     """Simulates, in this process, the nominal twins of episodes whose starts are known.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
-from drake_safety import package_folder
+import drake_safety
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
@@ -204,12 +204,15 @@ def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
 
 def scenario_names() -> list[str]:
     """Names of the scenarios that come with the package."""
-    return sorted(path.stem for path in package_folder("diagrams").glob("*.yaml"))
+    return sorted(path.stem for path in drake_safety.package_folder("diagrams").glob("*.yaml"))
 
 
 def task_names() -> list[str]:
     """Import paths of the modules of tasks that come with the package: those of its scenarios."""
-    texts = (path.read_text(encoding="utf-8") for path in package_folder("diagrams").glob("*.yaml"))
+    texts = (
+        path.read_text(encoding="utf-8")
+        for path in drake_safety.package_folder("diagrams").glob("*.yaml")
+    )
     return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
 
 
@@ -226,7 +229,7 @@ def load_scenario(name: str | Path) -> Scenario:
     """
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        path = package_folder("diagrams") / f"{name}.yaml"
+        path = drake_safety.package_folder("diagrams") / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(
                 f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give "

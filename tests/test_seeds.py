@@ -1,0 +1,163 @@
+"""Sets of episodes that do not overlap, and assessments that know which ones they have used."""
+
+import dataclasses
+import inspect
+import json
+from itertools import combinations
+
+import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+
+from drake_safety.cli import adapt, calibrate, evaluate, train
+from drake_safety.cli.ablate import ablate
+from drake_safety.cli.plan_study import plan_study
+from drake_safety.evaluation.episode_study import evaluate_episodes
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.calibration import calibrate as choose
+from drake_safety.learning.feedback import feedback_sets
+from drake_safety.learning.seeds import (
+    ADAPTATION,
+    BLOCKS,
+    CALIBRATION,
+    NOT_DRAWN,
+    TRAINING,
+    UsedEpisodes,
+    check_unused,
+)
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.feedback import run_pairs
+from lip_episodes import make_episodes
+
+
+def default_seed(function):
+    return inspect.signature(function).parameters["seed"].default
+
+
+def used(seed, purpose="training", num_episodes=7):
+    return UsedEpisodes(
+        purpose=purpose,
+        variation="nominal",
+        scenario_hash="0",
+        seed=seed,
+        num_episodes=num_episodes,
+    )
+
+
+def paired(seed, num=12):
+    nominal = make_episodes(num, seed=seed)
+    actual = Episodes(dataclasses.replace(nominal.info, variation="actual"), list(nominal))
+    return feedback_sets(actual, nominal)
+
+
+def calibrated(assessment, seed):
+    score = [i / 99 for i in range(100)]
+    found = choose(score, [one > 0.4 for one in score], kind="plan", miss_rate=0.1)
+    assessment.adopt_calibrations([found], make_episodes(20, seed=seed).info, 20)
+
+
+@pytest.fixture
+def assessment():
+    parameters = AssessmentParameters(
+        epochs=1, perplexity=5.0, ensemble_size=2, hidden_sizes=[16, 16]
+    )
+    return SafetyAssessment(parameters).fit(make_episodes(40))
+
+
+def test_no_two_purposes_have_a_seed_in_common_whatever_their_sizes():
+    seeds = [seed for block in BLOCKS for seed in block.seeds().values()]
+    assert len(seeds) == len(set(seeds))
+    for one, other in combinations(BLOCKS, 2):
+        assert abs(one.first - other.first) >= 1_000_000
+
+
+def test_every_command_takes_its_default_seed_from_the_table():
+    commands = (train.train, evaluate.evaluate, calibrate.calibrate, plan_study, adapt.adapt)
+    assert [default_seed(command) for command in commands] == [block.first for block in BLOCKS[:5]]
+    assert default_seed(ablate) == default_seed(evaluate.evaluate)
+    assert default_seed(run_pairs) == ADAPTATION.first
+
+
+def test_calibration_and_adaptation_share_no_episode_by_default():
+    calibration, adaptation = CALIBRATION.seeds(), ADAPTATION.seeds()
+    assert not set(calibration.values()) & set(adaptation.values())
+
+
+def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():
+    spent = [used(3), used(5, "calibration", None), used(NOT_DRAWN, "adaptation")]
+    check_unused(spent, (0, 1, 2, 4, NOT_DRAWN), "who")
+    with pytest.raises(ValueError, match=r"^who: seed 3 .* the 7 'nominal' episodes of its train"):
+        check_unused(spent, (3,), "who")
+    with pytest.raises(ValueError, match=r"seed 5 .* the 'nominal' .* calibration .* such as 6$"):
+        check_unused(spent, (4, 5), "who")
+
+
+def test_an_assessment_knows_all_that_it_was_learned_calibrated_and_adapted_with(
+    assessment, tmp_path
+):
+    calibrated(assessment, 30)
+    adapted = assessment.adapt(paired(40))
+    found = [(one.purpose, one.variation, one.seed, one.num_episodes) for one in adapted.used_]
+    assert found == [
+        ("training", "nominal", 0, 40),
+        ("calibration", "nominal", 30, 20),
+        ("adaptation", "actual", 40, 12),
+        ("adaptation", "nominal", 40, 12),
+    ]
+    adapted.save(tmp_path / "gamma.safetensors")
+    loaded = SafetyAssessment.load(tmp_path / "gamma.safetensors")
+    assert loaded.used_ == adapted.used_
+    # Others take the place of what has gone; what has been learned from stays.
+    calibrated(adapted, 31)
+    again = adapted.adapt(paired(40) + paired(41))
+    assert [one.seed for one in again.used_] == [0, 31, 40, 41, 40, 41]
+    for seed in (0, 31, 40, 41):
+        with pytest.raises(ValueError, match=f"seed {seed} would give"):
+            again.check_unused(seed)
+    again.check_unused(30)
+
+
+def test_what_has_been_used_otherwise_is_neither_calibrated_nor_adapted_with(assessment):
+    with pytest.raises(ValueError, match="episodes of its training"):
+        assessment.adapt(paired(0))
+    with pytest.raises(ValueError, match="episodes of its training"):
+        calibrated(assessment, 0)
+    calibrated(assessment, 30)
+    with pytest.raises(ValueError, match="the 20 'nominal' episodes of its calibration"):
+        assessment.adapt(paired(30))
+    with pytest.raises(ValueError, match="episodes of its adaptation"):
+        calibrated(assessment.adapt(paired(40)), 40)
+
+
+def test_who_is_judged_has_not_seen_the_episodes(assessment):
+    calibrated(assessment, 30)
+    gamma = assessment_scorer("gamma", assessment, "calibrated")
+    fresh = make_episodes(20, seed=5)
+    for calibration, test in (
+        (fresh, make_episodes(20, seed=30)),
+        (make_episodes(20), fresh),
+    ):
+        with pytest.raises(ValueError, match=r"'gamma': seed \d+ would give"):
+            evaluate_episodes([gamma], calibration, test)
+    stranger = Scorer(name="stranger", probability=gamma.probability)
+    evaluate_episodes([stranger], make_episodes(20, seed=30), fresh)
+
+
+def test_a_file_of_an_earlier_version_tells_what_its_other_entries_know(assessment, tmp_path):
+    calibrated(assessment, 30)
+    path = tmp_path / "gamma.safetensors"
+    assessment.save(path)
+    with safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    numbers = json.loads(metadata["numbers"])
+    del numbers["used"]
+    numbers["calibrations"][0]["seed"] = 30
+    save_file(load_file(path), path, metadata | {"numbers": json.dumps(numbers)})
+    loaded = SafetyAssessment.load(path)
+    assert [(one.purpose, one.seed) for one in loaded.used_] == [
+        ("training", TRAINING.first),
+        ("calibration", 30),
+    ]
+    with pytest.raises(ValueError, match="as the 'nominal' episodes of its training"):
+        loaded.check_unused(0)
