@@ -165,7 +165,7 @@ class Balancing(ClosedLoop):
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
         monitor = builder.AddNamedSystem(
             "safety_monitor",
-            SafetyMonitor(safe_set, n_q, n_v, period_s=scenario.control_period_s),
+            SafetyMonitor(safe_set, n_q, n_v),
         )
         builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
         features = builder.AddNamedSystem(

@@ -90,7 +90,7 @@ class Pendulum(ClosedLoop):
         safe_set = PendulumSafeSet(parameters, scenario.episode_duration_s / (_NUM_OUTLOOK - 1))
         monitor = builder.AddNamedSystem(
             "safety_monitor",
-            SafetyMonitor(safe_set, 1, 1, period_s=scenario.control_period_s),
+            SafetyMonitor(safe_set, 1, 1),
         )
         builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
         features = builder.AddNamedSystem(

@@ -174,7 +174,7 @@ class Reaching(ClosedLoop):
         )
         monitor = builder.AddNamedSystem(
             "safety_monitor",
-            SafetyMonitor(self.safe_set, n_q, n_v, period_s=parameters.monitor_period_s),
+            SafetyMonitor(self.safe_set, n_q, n_v),
         )
         builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
         features = builder.AddNamedSystem(

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
+from drake_safety.plants.mujoco_dynamics import DivergenceError
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario
 
@@ -19,12 +20,12 @@ class GlidingParameters:
     speed_m_s: float = 2.0
     """Largest speed at the start."""
     failure: str = ""
-    """How the simulation fails beyond x = 0.5: "raise", "nan", "inf" or not at all."""
+    """How the simulation fails beyond x = 0.5: "raise", "nan", "inf", "bug" or not at all."""
     fails_at_start: bool = False
     """Whether it fails before the first row already."""
 
     def __post_init__(self) -> None:
-        if self.failure not in ("", "raise", "nan", "inf"):
+        if self.failure not in ("", "raise", "nan", "inf", "bug"):
             raise ValueError(f"gliding: unknown failure '{self.failure}'")
 
 
@@ -70,7 +71,9 @@ class Mass(LeafSystem):
         x += CONTROL_PERIOD_S * v
         if x > 0.5:
             if self.parameters.failure == "raise":
-                raise RuntimeError("the solver failed")
+                raise DivergenceError("the solver failed")
+            if self.parameters.failure == "bug":
+                raise ValueError("operands could not be broadcast together")
             if self.parameters.failure:
                 x = float(self.parameters.failure)
         discrete_state.set_value([x, v])

@@ -98,6 +98,7 @@ def make_episodes(
         output_names=["x", "y", "z"],
         feature_names=[f"feature_{i}" for i in range(max(num_features, 5))],
         versions={"lip": "1"},
+        num_steps=NUM_STEPS,
     )
     return Episodes(info, episodes)
 

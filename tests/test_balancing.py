@@ -15,7 +15,7 @@ from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS
-from drake_safety.simulation.rollouts import Recorder
+from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.scenario import parse_scenario
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
 

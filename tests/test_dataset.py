@@ -219,6 +219,20 @@ def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_pa
     assert read_info(tmp_path)[0].versions == {"numpy": "2.4.6"}
 
 
+def test_a_set_that_other_source_code_began_is_refused_unless_that_is_accepted(tmp_path):
+    with EpisodeWriter(tmp_path, make_info(code="ab" * 32)) as writer:
+        writer.append(make_episode(0))
+    other = make_info(code="cd" * 32)
+    with pytest.raises(ValueError, match=r"choose another folder.*--accept-code-change"):
+        EpisodeWriter(tmp_path, other)
+    with EpisodeWriter(tmp_path, other, accept_code_change=True) as writer:
+        writer.append(make_episode(1))
+    info, extra = read_info(tmp_path)
+    assert info.code == "cd" * 32
+    assert extra["earlier_code"] == ["ab" * 32]
+    EpisodeWriter(tmp_path, other).close()  # Accepted once, it is not asked for again.
+
+
 def test_names_given_as_a_tuple_are_the_same_set(tmp_path):
     write(tmp_path, [0])
     with EpisodeWriter(tmp_path, make_info(state_names=("x", "v", "a"))) as writer:

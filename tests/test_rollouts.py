@@ -1,17 +1,24 @@
 """Rollouts: the same bits for any number of workers, after any interruption, whatever diverges."""
 
+import logging
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LinearSystem
 
 from cart_episodes import ARRAYS
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.episode_recorder import EpisodeError, Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng, parallel_map
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO, Gliding, gliding
+from legged_robots import write_hexapod
 from shuttle_task import shuttling
 
 
@@ -88,6 +95,82 @@ def test_seeds_and_variations_are_kept_in_the_info():
 def test_an_own_task_runs_in_worker_processes():
     alone = run_episodes(gliding(), 10, num_workers=1)
     assert_identical(run_episodes(gliding(), 10, num_workers=2), alone)
+
+
+def test_an_error_in_somebodys_code_is_not_a_diverged_simulation():
+    with pytest.raises(
+        EpisodeError, match=r"episode \d+ of 'gliding' \(seed 3\): ValueError: op"
+    ) as e:
+        run_episodes(gliding(failure="bug"), 20, seed=3, num_workers=1)
+    assert isinstance(e.value.__cause__, ValueError)
+    # And it can be reproduced by what the message says.
+    index = int(re.search(r"episode (\d+)", str(e.value))[1])
+    with pytest.raises(EpisodeError):
+        run_episode(gliding(failure="bug").make_loop(), index, seed=3)
+
+
+def test_an_error_in_a_worker_keeps_its_message_and_its_traceback():
+    with pytest.raises(EpisodeError, match=r"\(seed 0\): ValueError: operands") as caught:
+        run_episodes(gliding(failure="bug"), 20, num_workers=2)
+    assert "gliding_task.py" in str(caught.value.__cause__)
+
+
+def test_how_many_simulations_diverged_is_said_at_the_end(caplog):
+    with caplog.at_level(logging.WARNING, logger="drake_safety"):
+        episodes = run_episodes(gliding(failure="nan"), 20, num_workers=1)
+        run_episodes(gliding(), 2, num_workers=1)
+    (record,) = caplog.records
+    assert f"{episodes.num_diverged} of 20 simulations of 'gliding' diverged" in record.getMessage()
+
+
+def test_a_row_is_recorded_whole_or_not_at_all():
+    loop = gliding().make_loop()
+    context = loop.CreateDefaultContext()
+    recorder = Recorder(loop)
+    recorder.record(context)
+    recorder._ports["margins"] = Refusing()
+    with pytest.raises(ValueError, match="no margins today"):
+        recorder.record(context)
+    arrays = recorder.arrays()
+    assert {len(rows) for rows in arrays.values()} == {1}
+
+
+class Refusing:
+    """A port that raises."""
+
+    def Eval(self, context):
+        raise ValueError("no margins today")
+
+    def size(self):
+        return 2
+
+
+def test_margins_are_those_of_their_row():
+    loop = balancing(0.4).make_loop()
+    monitor = loop.GetSubsystemByName("safety_monitor")
+    n_q = loop.kinematics.num_positions
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, episode_rng(0, 1))
+    for row in range(1, 11):
+        advance_to(simulator, row * 0.04)
+        q, v = np.split(loop.GetOutputPort("plant_state").Eval(context), [n_q])
+        margins = loop.GetOutputPort("margins").Eval(context)
+        np.testing.assert_array_equal(margins, monitor._safe_set.margins(q, v))
+
+
+def test_a_row_is_read_before_the_step_that_begins_at_it_whatever_the_rounding():
+    # 3 * 0.1 is more than Drake's 120 * 0.0025: the step that begins there would be taken.
+    assert 3 * 0.1 > 120 * 0.0025
+    builder = DiagramBuilder()
+    A, B, C, D = (np.full((1, 1), entry) for entry in (1.0, 1.0, 1.0, 0.0))
+    counter = builder.AddSystem(LinearSystem(A, B, C, D, time_period=0.0025))
+    one = builder.AddSystem(ConstantVectorSource([1.0]))
+    builder.Connect(one.get_output_port(), counter.get_input_port())
+    simulator = Simulator(builder.Build())
+    for row in range(1, 200):
+        advance_to(simulator, row * 0.1)
+        assert simulator.get_context().get_discrete_state_vector()[0] == 40 * row
 
 
 @pytest.mark.parametrize("failure", ["raise", "nan", "inf"])
@@ -227,6 +310,23 @@ def test_sixty_four_episodes_are_the_same_to_the_bit_with_one_and_two_workers():
     alone = run_episodes(scenario, 64, num_workers=1)
     assert_identical(run_episodes(scenario, 64, num_workers=2), alone)
     assert 0.2 < alone.num_unsafe / 64 < 0.8
+
+
+def test_a_robot_whose_file_has_changed_is_simulated_anew(tmp_path):
+    robot = write_hexapod(tmp_path)
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
+        "episode_duration_s: 0.4\nvariations: {nominal: {}}\n"
+    )
+    stiff = run_episodes(load_scenario(path), 6, num_workers=1)
+    robot.write_text(robot.read_text().replace("stiffness: 200.0", "stiffness: 60.0"))
+    soft = run_episodes(load_scenario(path), 6, num_workers=1)
+    assert stiff.info.scenario_hash != soft.info.scenario_hash
+    moved = [pair for pair in zip(stiff, soft, strict=True) if len(pair[0].time_s) > 1]
+    assert moved
+    for one, other in moved:
+        assert one.true_state[1].tobytes() != other.true_state[1].tobytes()
 
 
 class Aimed(Gliding):

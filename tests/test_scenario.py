@@ -1,15 +1,18 @@
 """A scenario is one YAML file; what it misspells is answered with what exists."""
 
 import importlib
+import sys
 from pathlib import Path
 
 import pytest
 
+import gliding_task
 from drake_safety import load_scenario
 from drake_safety.robots.robot import PlantVariation
+from drake_safety.simulation import scenario as scenario_module
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
-from gliding_task import SCENARIO, Gliding
+from gliding_task import SCENARIO, Gliding, GlidingParameters
 from legged_robots import write_hexapod
 
 BALANCING = "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\n"
@@ -186,6 +189,38 @@ def test_the_same_text_has_the_same_hash_and_order_does_not_matter():
 )
 def test_what_changes_a_rollout_changes_the_hash(text):
     assert parsed(text).simulation_hash() != parsed(SCENARIO).simulation_hash()
+
+
+def test_a_default_that_changes_is_another_simulation(monkeypatch):
+    before = parsed(SCENARIO).simulation_hash()
+    default = GlidingParameters.__init__.__kwdefaults__
+    monkeypatch.setitem(default, "speed_m_s", 2.5)
+    assert parsed(SCENARIO).parameters.speed_m_s == 2.5
+    assert parsed(SCENARIO).simulation_hash() != before
+
+
+def test_a_value_that_is_stated_and_is_the_default_does_not_change_the_hash():
+    assert parsed(with_parameters("{speed_m_s: 2.0}")).simulation_hash() == (
+        parsed(SCENARIO).simulation_hash()
+    )
+
+
+def test_the_digest_of_the_code_knows_the_tasks_module_wherever_it_lies(tmp_path, monkeypatch):
+    source = Path(gliding_task.__file__).read_text()
+    digests = []
+    for folder, text in (("a", source), ("b", source), ("c", source + "\nMORE = 1\n")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "one_task.py").write_text(text)
+        monkeypatch.syspath_prepend(tmp_path / folder)
+        monkeypatch.delitem(sys.modules, "one_task", raising=False)
+        scenario = parsed(SCENARIO.replace("gliding_task", "one_task"))
+        digests.append(scenario.code_digest())
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_the_digest_of_the_code_knows_the_modules_beside_the_task():
+    files = scenario_module._own_files(sys.modules["drake_safety.diagrams.balancing"])
+    assert {path.name for path in files} == {"balancing.py", "balancing_parameters.py"}
 
 
 def test_how_the_assessment_is_learned_does_not_change_the_hash():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.learning.segments import Episodes, split, unsafety_score
-from lip_episodes import HORIZON, make_episodes
+from lip_episodes import HORIZON, NUM_STEPS, make_episodes
 
 
 @pytest.fixture(scope="module")
@@ -17,11 +17,11 @@ def test_the_score_is_discounted_by_the_steps_left_and_zero_when_safe():
     np.testing.assert_allclose(score, [1.0, 0.9, 0.81, 0.0])
 
 
-def test_a_safe_episode_gives_only_segments_that_fit_and_an_unsafe_one_every_start(episodes):
+def test_both_labels_give_segments_from_the_same_rows(episodes):
     segments = split(episodes, stride=1, discount=0.99)
     for position, episode in enumerate(episodes):
         rows = segments.start_row[segments.episode == position]
-        num_starts = episode.num_steps - HORIZON + 1 if episode.is_safe else episode.num_steps
+        num_starts = min(NUM_STEPS - HORIZON + 1, episode.num_steps)
         np.testing.assert_array_equal(rows, np.arange(max(num_starts, 0)))
 
 
@@ -95,11 +95,11 @@ def test_a_set_without_one_whole_segment_is_refused(episodes):
 
 
 @pytest.mark.parametrize("shortest", [1, 4, HORIZON])
-def test_what_is_left_of_a_safe_episode_is_enough_where_a_segment_may_be_short(episodes, shortest):
+def test_what_is_left_of_a_whole_episode_is_enough_where_a_segment_may_be_short(episodes, shortest):
     segments = split(episodes, stride=1, discount=0.99, shortest=shortest)
     for position, episode in enumerate(episodes):
         rows = segments.start_row[segments.episode == position]
-        num_starts = episode.num_steps - shortest + 1 if episode.is_safe else episode.num_steps
+        num_starts = min(NUM_STEPS - shortest + 1, episode.num_steps)
         np.testing.assert_array_equal(rows, np.arange(max(num_starts, 0)))
     assert segments.remaining_steps[~segments.is_unsafe].min() == shortest
     expected = np.minimum(HORIZON, segments.remaining_steps + 1)
@@ -109,9 +109,29 @@ def test_what_is_left_of_a_safe_episode_is_enough_where_a_segment_may_be_short(e
 def test_short_segments_change_none_of_the_others(episodes):
     whole = split(episodes, stride=1, discount=0.99)
     short = split(episodes, stride=1, discount=0.99, shortest=2)
-    kept = short.take(short.is_unsafe | (short.remaining_steps >= HORIZON))
+    kept = short.take(short.start_row <= NUM_STEPS - HORIZON)
     for field in dataclasses.fields(whole):
         np.testing.assert_array_equal(getattr(kept, field.name), getattr(whole, field.name))
+
+
+def test_an_episode_that_never_fills_the_horizon_gives_no_segment_whatever_its_label(episodes):
+    late = NUM_STEPS - HORIZON + 1  # Where a safe one has less than the horizon left.
+    pushed = [
+        dataclasses.replace(episode, first_step=late)
+        for episode in episodes
+        if episode.num_steps > late
+    ]
+    assert len({episode.is_safe for episode in pushed}) == 2
+    mixed = Episodes(episodes.info, [*pushed, episodes[0]])
+    assert set(split(mixed, stride=1, discount=0.99).episode) == {len(pushed)}
+
+
+def test_the_longest_episode_stands_in_for_a_length_that_is_not_known(episodes):
+    info = dataclasses.replace(episodes.info, num_steps=0)
+    unknown, known = (
+        split(Episodes(which, episodes), stride=1, discount=0.99) for which in (info, episodes.info)
+    )
+    np.testing.assert_array_equal(unknown.start_row, known.start_row)
 
 
 @pytest.mark.parametrize("shortest", [0, -1, HORIZON + 1])

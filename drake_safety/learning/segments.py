@@ -39,6 +39,8 @@ class EpisodesInfo:
         output_names: Names of the n_z columns of `output`.
         feature_names: Names of the n_f columns of `features`.
         versions: Package versions the episodes were made with.
+        num_steps: T, steps of an episode that is not cut short; 0 where it is not known.
+        code: SHA-256 of the source code that simulated; "" where it is not known.
     """
 
     scenario: str
@@ -52,6 +54,8 @@ class EpisodesInfo:
     output_names: list[str]
     feature_names: list[str]
     versions: dict[str, str]
+    num_steps: int = 0
+    code: str = ""
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
@@ -62,6 +66,20 @@ class EpisodesInfo:
             raise ValueError(
                 f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0"
             )
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Columns of each recorded array, by its name."""
+        num_states, num_outputs = len(self.state_names), len(self.output_names)
+        return {
+            "state": num_states,
+            "true_state": num_states,
+            "output": num_outputs,
+            "desired_output": num_outputs,
+            "desired_preview": self.horizon * num_outputs,
+            "features": len(self.feature_names),
+            "margins": len(self.constraint_names),
+        }
 
 
 @dataclass(kw_only=True, eq=False)
@@ -154,17 +172,7 @@ class Episodes(Sequence[Episode]):
 def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
     who = f"episode {episode.index} of '{info.scenario}'"
     num_rows = len(episode.time_s)
-    num_states, num_outputs = len(info.state_names), len(info.output_names)
-    widths = {
-        "state": num_states,
-        "true_state": num_states,
-        "output": num_outputs,
-        "desired_output": num_outputs,
-        "desired_preview": info.horizon * num_outputs,
-        "features": len(info.feature_names),
-        "margins": len(info.constraint_names),
-    }
-    for name, width in widths.items():
+    for name, width in info.widths.items():
         shape = np.shape(getattr(episode, name))
         if shape != (num_rows, width):
             raise ValueError(f"{who}: {name} has shape {shape}, expected {(num_rows, width)}")
@@ -248,16 +256,17 @@ def split(
 ) -> Segments:
     """Cuts episodes into segments of the assessment horizon H.
 
-    A safe episode gives segments that fit whole into it, or at least ``shortest`` steps of them:
-    where nothing happens after an episode's end, what is left of it is enough. An unsafe one gives
-    a segment from every start before its end; those that reach beyond the end are cut short and
-    keep the terminal sample. Diverged episodes give none.
+    Segments start where at least ``shortest`` steps of a whole episode are left: where nothing
+    happens after an episode's end, part of the horizon is enough. The rule is the same for both
+    labels, so that the row at which a segment starts says nothing about its label: an unsafe
+    episode gives a segment from every such row before its end. Segments that reach beyond the end
+    are cut short and keep the terminal sample. Diverged episodes give none.
 
     Args:
         episodes: The episodes; H is `episodes.info.horizon`.
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
-        shortest: Steps that a safe episode's segment has at least; H by default.
+        shortest: Steps of a whole episode that are left at a segment's start; H by default.
 
     Raises:
         ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
@@ -272,11 +281,14 @@ def split(
     offsets = np.arange(horizon)
     names = episodes.info.constraint_names
     pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
+    # Where T is not known, it is the longest that was seen.
+    whole = episodes.info.num_steps or max((e.num_steps for e in episodes), default=0)
     for position, episode in enumerate(episodes):
         if episode.cause == DIVERGED:
             continue
         num_steps = episode.num_steps
-        end = num_steps - shortest + 1 if episode.is_safe else num_steps
+        # A safe episode may be shorter than a whole one, as a stretch of a robot's log is.
+        end = min(num_steps, (num_steps if episode.is_safe else whole) - shortest + 1)
         rows = np.arange(episode.first_step, end, stride)
         if rows.size == 0:
             continue

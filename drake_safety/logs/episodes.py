@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -16,8 +16,9 @@ from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
 from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
+from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.rollouts import Recorder, episodes_info
+from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import Scenario
 
 _ROUNDING_S = 1e-9
@@ -161,22 +162,18 @@ def _episode(log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float) 
     scenario = loop.scenario
     length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
     period_s = loop.monitor_period_s
-    ticks = period_s * np.arange(max(math.ceil(length_s / period_s - 1e-6), 1))
+    ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
     margins = _margins(log, loop, context, begin_s, ticks)
     is_out = (margins < 0).any(axis=1)
     times = scenario.step_s * np.arange(int(length_s / scenario.step_s + 1e-6) + 1)
     if is_out.any():
-        tick = int(np.argmax(is_out))
-        # The loop ends once its plant has made the step after the tick that saw it.
-        end_s = min(ticks[tick] + scenario.time_step_s, length_s) if tick else 0.0
+        end_s = ticks[int(np.argmax(is_out))]
         times = np.append(times[times < end_s - _ROUNDING_S], end_s)
-    # A row shows the monitor's last look: the one before, not at, its own instant.
-    seen = np.maximum(np.ceil(times / period_s - 1e-6).astype(int) - 1, 0)
-    recorder = Recorder(loop, [name for name in RECORDED_PORTS if name != "margins"])
+    recorder = Recorder(loop, RECORDED_PORTS)
     for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
         _set_state(loop, context, time_s, state)
         recorder.record(context)
-    arrays = recorder.arrays() | {"margins": margins[seen]}
+    arrays: dict[str, Any] = recorder.arrays()
     cause = ""
     if is_out.any():
         cause = loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
@@ -191,7 +188,6 @@ def _margins(
     rows = []
     for time_s, state in zip(ticks, log.states_at(begin_s + ticks), strict=True):
         _set_state(loop, context, time_s, state)
-        loop.ExecuteInitializationEvents(context)
         rows.append(port.Eval(context).copy())
         if (rows[-1] < 0).any():
             break

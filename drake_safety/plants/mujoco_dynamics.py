@@ -17,6 +17,10 @@ _LOGGER = logging.getLogger("drake_safety")
 _NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
 
 
+class DivergenceError(RuntimeError):
+    """A plant's numbers ran away: what a simulation says after that means nothing."""
+
+
 class MujocoDynamics:
     """One robot and its scene in MuJoCo.
 
@@ -123,11 +127,11 @@ class MujocoDynamics:
             forces: What else acts during the step, on bodies of the Drake plant.
 
         Raises:
-            RuntimeError: The simulation is unstable, or an argument is not finite.
+            DivergenceError: The simulation is unstable, or an argument is not finite.
             ValueError: A force acts on a body that the robot does not have.
         """
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
-            raise RuntimeError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")
+            raise DivergenceError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")
         mujoco, model, scratch = self._mujoco, self.model, self._scratch
         scratch.time = 0.0
         scratch.qpos[:], scratch.qvel[:], scratch.qacc_warmstart[:] = self._parts(state)
@@ -146,7 +150,7 @@ class MujocoDynamics:
         )
         if any(scratch.warning[int(kind)].number for kind in failed):
             mujoco.mj_resetData(model, scratch)
-            raise RuntimeError(f"robot '{self.robot.name}': MuJoCo's simulation is unstable")
+            raise DivergenceError(f"robot '{self.robot.name}': MuJoCo's simulation is unstable")
         return np.concatenate([scratch.qpos, scratch.qvel, scratch.qacc_warmstart])
 
     def _apply(self, force: ExternallyAppliedSpatialForce) -> None:

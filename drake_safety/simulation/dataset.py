@@ -39,6 +39,7 @@ __all__ = [
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
 _FAILURES = "num_controller_failures"
+_EARLIER_CODE = "earlier_code"
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 _LOGGER = logging.getLogger("drake_safety")
 
@@ -58,6 +59,7 @@ class EpisodeWriter:
         flush_episodes: Number of pending episodes that make a shard.
         flush_seconds: Age of the oldest pending episode that makes a shard [s]; looked at when an
             episode is appended.
+        accept_code_change: As :func:`open_folder`.
 
     Raises:
         ValueError: The folder holds episodes of another set, or is not such a folder.
@@ -71,6 +73,7 @@ class EpisodeWriter:
         *,
         flush_episodes: int = 64,
         flush_seconds: float = 10.0,
+        accept_code_change: bool = False,
     ) -> None:
         if flush_episodes < 1:
             raise ValueError(f"EpisodeWriter: flush_episodes must be >= 1; got {flush_episodes}")
@@ -85,7 +88,7 @@ class EpisodeWriter:
         self._is_closed = False
         # Before info.json is written: a folder with shards but no info.json is refused.
         self._indices = completed(self.path)
-        open_folder(self.path, info, extra)
+        open_folder(self.path, info, extra, accept_code_change=accept_code_change)
         self._next_shard = 1 + max(
             (_shard_number(shard) for shard in _shards(self.path)), default=-1
         )
@@ -119,7 +122,7 @@ class EpisodeWriter:
         import pyarrow.parquet as pq
 
         table = _to_table(self._pending, self.info)
-        columns = [f"{name}.list.element" for name, width in _widths(self.info).items() if width]
+        columns = [f"{name}.list.element" for name, width in self.info.widths.items() if width]
         final = self.path / f"episodes-{self._next_shard:05d}.parquet"
         with replacing(final) as temporary:
             # Byte streams of float64 compress better split by significance; checksums tell a
@@ -153,7 +156,11 @@ class EpisodeWriter:
 
 
 def open_folder(
-    path: str | os.PathLike[str], info: EpisodesInfo, extra: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str],
+    info: EpisodesInfo,
+    extra: Mapping[str, Any] | None = None,
+    *,
+    accept_code_change: bool = False,
 ) -> None:
     """Makes the folder of a set, or checks that the one that is there is of the same set.
 
@@ -162,16 +169,30 @@ def open_folder(
         info: What the set shares.
         extra: What else ``info.json`` holds, as JSON types. It replaces entries of the same names:
             a set that goes on is told by the command that it goes on with.
+        accept_code_change: Whether a set that other source code began goes on with this one; the
+            digests of the earlier code are kept in ``info.json``.
 
     Raises:
-        ValueError: The folder holds another set, or is not such a folder.
+        ValueError: The folder holds another set, one that other source code began, or is not such
+            a folder.
     """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if (path / _INFO_NAME).exists():
         stored, known = read_info(path)
         _check_same_set(path, stored, info)
-        if known != (told := {**known, **(extra or {})}):
+        told = {**known, **(extra or {})}
+        if stored.code != info.code:
+            if not accept_code_change:
+                raise ValueError(
+                    f"{path} holds episodes that other source code simulated (digest there "
+                    f"'{stored.code[:12]}', here '{info.code[:12]}'), so they may differ from new "
+                    "ones; choose another folder, or accept it: accept_code_change=True, on the "
+                    "command line --accept-code-change"
+                )
+            told[_EARLIER_CODE] = [*known.get(_EARLIER_CODE, []), stored.code]
+            stored = dataclasses.replace(stored, code=info.code)
+        if known != told:
             _write_info(path, stored, told)
     else:
         _write_info(path, info, extra or {})
@@ -195,12 +216,14 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
         raise ValueError(
             f"{file} has schema version {schema_version!r}; expected {_SCHEMA_VERSION}"
         )
-    names = [field.name for field in dataclasses.fields(EpisodesInfo)]
     fields, extra = content.get("info"), content.get("extra")
-    if not isinstance(fields, dict) or not isinstance(extra, dict) or set(fields) != set(names):
-        got = sorted(fields) if isinstance(fields, dict) else fields
-        raise ValueError(f"{file} does not describe episodes: info has {got}; expected {names}")
-    return EpisodesInfo(**fields), extra
+    try:
+        if not isinstance(extra, dict):
+            raise TypeError("it has no extra")
+        # Fields that older folders do not have say by their defaults that they are not known.
+        return EpisodesInfo(**fields), extra
+    except TypeError as error:
+        raise ValueError(f"{file} does not describe episodes: {error}") from error
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
@@ -287,6 +310,7 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
         if there[name] != here[name]
     }
     versions = differences.pop("versions", None)
+    differences.pop("code", None)  # Which may be accepted.
     if differences:
         raise ValueError(
             f"{path} holds episodes of another set and cannot be continued "
@@ -294,20 +318,6 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
         )
     if versions:
         _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
-
-
-def _widths(info: EpisodesInfo) -> dict[str, int]:
-    """Number of columns of each array of an episode."""
-    num_states, num_outputs = len(info.state_names), len(info.output_names)
-    return {
-        "state": num_states,
-        "true_state": num_states,
-        "output": num_outputs,
-        "desired_output": num_outputs,
-        "desired_preview": info.horizon * num_outputs,
-        "features": len(info.feature_names),
-        "margins": len(info.constraint_names),
-    }
 
 
 def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
@@ -323,7 +333,7 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
         "step": np.concatenate([np.arange(count, dtype=np.int32) for count in counts]),
         "time_s": np.concatenate([np.asarray(e.time_s, dtype=np.float64) for e in episodes]),
     }
-    for name, width in _widths(info).items():
+    for name, width in info.widths.items():
         # Parquet has no lists of length 0: such an array has no column and is restored from info.
         if width:
             rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
@@ -338,7 +348,7 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
 
 
 def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Episode]:
-    widths = _widths(info)
+    widths = info.widths
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
     # Shards from before failures were counted are as good: nothing is learned from the count.

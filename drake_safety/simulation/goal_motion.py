@@ -10,8 +10,9 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.mishap import Mishap
-from drake_safety.simulation.rollouts import Recorder, episode_rng
+from drake_safety.simulation.rollouts import episode_rng
 
 _PORTS = ("output", "margins", "plant_state")
 
@@ -88,7 +89,7 @@ def run_to_goal(
     cause = ""
     for row in range(round(duration_s / log_period_s) + 1):
         time = row * log_period_s
-        _advance(simulator, time)
+        advance_to(simulator, time)
         recorder.record(context)
         margins = margins_port.Eval(context)
         if margins.min() < 0 and not cause:
@@ -109,9 +110,3 @@ def run_to_goal(
         fall_time_s=fall_s,
         extra=extra,
     )
-
-
-def _advance(simulator: Simulator, time: float) -> None:
-    # To advance to the present would already take the step that begins now.
-    if time > simulator.get_context().get_time():
-        simulator.AdvanceTo(time)

@@ -7,17 +7,18 @@ import importlib.metadata
 import inspect
 import logging
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, EventStatus
 
+import drake_safety
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
-from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
+from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
+from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
 
@@ -65,36 +66,16 @@ def episodes_info(
         state_names=list(loop.state_names),
         output_names=list(loop.output_names),
         feature_names=list(loop.feature_names),
-        versions={
-            name: importlib.metadata.version(name)
-            for name in dict.fromkeys(("drake", "numpy", loop.variation.engine))
-        },
+        versions=package_versions("numpy", loop.variation.engine),
+        num_steps=scenario.num_steps,
+        code=scenario.code_digest(),
     )
 
 
-class Recorder:
-    """Reads the contract's output ports of a loop, a row at a time.
-
-    Args:
-        loop: The closed loop.
-        names: Ports to read.
-    """
-
-    def __init__(self, loop: ClosedLoop, names: Iterable[str] = RECORDED_PORTS):
-        self._ports = {name: loop.GetOutputPort(name) for name in names}
-        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in self._ports}
-        self._times: list[float] = []
-
-    def record(self, context: Context) -> None:
-        """Appends a row."""
-        for name, port in self._ports.items():
-            self._rows[name].append(port.Eval(context).copy())
-        self._times.append(context.get_time())
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What was recorded: ``time_s`` (N,) [s], and (N, size) for each port by its name."""
-        arrays = {name: np.array(rows) for name, rows in self._rows.items()}
-        return {"time_s": np.array(self._times), **arrays}
+def package_versions(*names: str) -> dict[str, str]:
+    """Versions of the packages that simulate: this one, Drake, and others by name."""
+    versions = {name: importlib.metadata.version(name) for name in ("drake", *names)}
+    return {"drake_safety": drake_safety.__version__, **versions}
 
 
 def run_episode(
@@ -127,6 +108,7 @@ def run_episode(
 
     Raises:
         ValueError: The task takes no goal or start, or not this one, or both are given.
+        EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if start is not None and (goal is not None or is_standing):
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
@@ -149,56 +131,21 @@ def run_episode(
         first_step = loop.reset(context, rng, goal)
     if plan is not None:
         loop.set_plan(context, plan)
-    safe = loop.GetOutputPort("safe")
-    nothing = EventStatus.DidNothing()
-
-    def stop_when_unsafe(root: Context) -> EventStatus:
-        if safe.Eval(root)[0] < 1:
-            return EventStatus.ReachedTermination(loop, "the state left the safe set")
-        return nothing
-
-    recorder = Recorder(loop)
-    is_diverged = False
-    # A mistake in the diagram shows here; what fails once it runs is the simulation.
-    simulator.Initialize()
-    recorder.record(context)
-    try:
-        if safe.Eval(context)[0] >= 1:
-            simulator.set_monitor(stop_when_unsafe)
-            for step in range(1, scenario.num_steps + 1):
-                simulator.AdvanceTo(step * scenario.step_s)
-                recorder.record(context)
-                if safe.Eval(context)[0] < 1:
-                    break
-    except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
-        _LOGGER.info("episode %d of '%s' diverged: %s", index, scenario.name, error)
-        is_diverged = True
-    arrays = recorder.arrays()
-    is_finite = np.all(
-        [np.isfinite(rows).all(axis=1) for name, rows in arrays.items() if name != "time_s"],
-        axis=0,
-    )
-    if is_diverged or not is_finite.all():
-        num_rows = len(is_finite) if is_finite.all() else int(np.argmin(is_finite))
-        if num_rows == 0:
-            raise RuntimeError(
-                f"episode {index} of '{scenario.name}' (seed {seed}) has no finite initial state"
-            )
-        cause = DIVERGED
-        arrays = {name: rows[:num_rows] for name, rows in arrays.items()}
-    else:
-        worst = int(np.argmin(arrays["margins"][-1]))
-        is_safe = safe.Eval(context)[0] >= 1
-        cause = "" if is_safe else loop.constraint_names[worst]
-    first_step = min(first_step, len(arrays["time_s"]) - 1)
-    return Episode(
+    episode = record_episode(
+        simulator,
+        {name: name for name in REQUIRED_PORTS},
+        EpisodeTiming(
+            step_s=scenario.step_s,
+            num_steps=scenario.num_steps,
+            monitor_period_s=loop.monitor_period_s,
+        ),
+        constraint_names=loop.constraint_names,
+        who=f"episode {index} of '{scenario.name}' (seed {seed})",
         index=index,
-        **arrays,
-        is_safe=cause == "",
-        cause=cause,
         first_step=first_step,
-        num_controller_failures=loop.num_controller_failures(context),
     )
+    episode.num_controller_failures = loop.num_controller_failures(context)
+    return episode
 
 
 def run_episodes(
@@ -213,6 +160,7 @@ def run_episodes(
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
     is_standing: bool = False,
+    accept_code_change: bool = False,
     **loop_options: Any,
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
@@ -233,11 +181,14 @@ def run_episodes(
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             are not kept.
         is_standing: Whether episodes begin in the robot's own posture; takes goals.
+        accept_code_change: Whether a folder's set goes on although other source code began it.
         **loop_options: For the task; part of what a folder's set is known by.
 
     Raises:
-        ValueError: The folder holds another set, the task takes no goals, there is not one finite
-            goal an episode, or a folder was given for what is not kept.
+        ValueError: The folder holds another set or one of other source code, the task takes no
+            goals, there is not one finite goal an episode, or a folder was given for what is not
+            kept.
+        EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if path is not None and goals is not None:
         # What a folder holds is known by scenario, variation, options and seed alone.
@@ -245,47 +196,88 @@ def run_episodes(
     loop = scenario.make_loop(variation, **loop_options)
     if goals is not None:
         goals = _checked_goals(loop, goals, num_episodes)
-    info = episodes_info(loop, seed, loop_options)
+    return collect_episodes(
+        episodes_info(loop, seed, loop_options),
+        num_episodes,
+        lambda batch: (
+            _episode_batch,
+            scenario,
+            variation,
+            loop_options,
+            seed,
+            batch,
+            None if goals is None else goals[batch],
+            is_standing,
+        ),
+        num_workers=num_workers,
+        path=path,
+        progress=progress,
+        extra=extra,
+        accept_code_change=accept_code_change,
+    )
+
+
+def collect_episodes(
+    info: EpisodesInfo,
+    num_episodes: int,
+    task: Callable[[list[int]], tuple],
+    *,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | None = None,
+    extra: dict[str, Any] | None = None,
+    accept_code_change: bool = False,
+) -> Episodes:
+    """Has a set of episodes simulated in worker processes, but for those that a folder holds.
+
+    Args:
+        info: What the set shares.
+        num_episodes: Size of the set.
+        task: Gives, for the numbers of a few episodes, a function at module level and its
+            arguments; it returns those episodes.
+        num_workers: As :func:`run_episodes`, and so are all that follow.
+        path: The folder.
+        progress: What is called.
+        extra: What is stored beside the info.
+        accept_code_change: Whether other source code may have begun the set.
+    """
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
     if progress is not None:
         progress(len(done), num_episodes)
-    finished: list[Episode] = []
-    writer = EpisodeWriter(path, info, extra) if path is not None else None
-    results = parallel_map(
-        _episode_batch,
-        [
-            (
-                scenario,
-                variation,
-                loop_options,
-                seed,
-                batch,
-                None if goals is None else goals[batch],
-                is_standing,
-            )
-            for batch in batches(remaining)
-        ],
-        num_workers,
-    )
+    episodes: list[Episode] = []
+    writer = None
+    if path is not None:
+        writer = EpisodeWriter(path, info, extra, accept_code_change=accept_code_change)
+        episodes += (e for e in load_episodes(path) if e.index in done) if done else ()
+    results = parallel_map(_call, [task(batch) for batch in batches(remaining)], num_workers)
     try:
-        count = len(done)
         for batch in results:
             for episode in batch:
-                finished.append(episode)
+                episodes.append(episode)
                 if writer is not None:
                     writer.append(episode)
-            count += len(batch)
             if progress is not None:
-                progress(count, num_episodes)
+                progress(len(episodes), num_episodes)
     finally:
         results.close()
         if writer is not None:
             writer.close()
-    if path is not None and done:
-        stored = [e for e in load_episodes(path) if e.index in done]
-        finished += stored
-    return Episodes(info, sorted(finished, key=lambda episode: episode.index))
+    collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
+    if collected.num_diverged:
+        which = [episode.index for episode in collected if episode.cause == DIVERGED]
+        _LOGGER.warning(
+            "%d of %d simulations of '%s' diverged and say nothing about safety: episodes %s",
+            len(which),
+            num_episodes,
+            info.scenario,
+            ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
+        )
+    return collected
+
+
+def _call(function: Callable[..., list[Episode]], *arguments: Any) -> list[Episode]:
+    return function(*arguments)
 
 
 def _check_takes_goal(loop: ClosedLoop) -> None:
@@ -358,8 +350,13 @@ _LOOPS: dict[tuple, ClosedLoop] = {}
 
 
 def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> ClosedLoop:
-    """The loop of a worker process, built once per scenario, variation and options."""
-    key = (scenario.to_yaml(), variation, repr(sorted(options.items())))
+    """The loop of a worker process, built once per scenario, variation, options and robot.
+
+    The scenario's text does not say what stands in the robot's files; the hash does, but not what
+    it leaves out, such as a threshold.
+    """
+    hash_ = scenario.simulation_hash(variation)
+    key = (hash_, scenario.to_yaml(), variation, repr(sorted(options.items())))
     if key not in _LOOPS:
         _LOOPS.clear()
         _LOOPS[key] = scenario.make_loop(variation, **options)

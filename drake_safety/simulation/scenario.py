@@ -4,9 +4,12 @@ import hashlib
 import importlib
 import inspect
 import re
+import sys
 import textwrap
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import yaml
@@ -120,9 +123,10 @@ class Scenario:
     def simulation_hash(self, variation: str = "nominal") -> str:
         """SHA-256 of all that decides what a rollout does and records, robot included.
 
-        How Γ is learned is left out, but for the horizon that shapes the preview, and so are the
-        task's online parameters, the other variations, and whatever has its default: episodes stay
-        valid when only the learning, a threshold or another plant changes, or a parameter is new.
+        Defaults count, so that episodes of before and after a default was changed do not mix. How Γ
+        is learned is left out, but for the horizon that shapes the preview, and so are the task's
+        online parameters and the other variations: episodes stay valid when only the learning, a
+        threshold or another plant changes. Source code is known by :meth:`code_digest`.
 
         Args:
             variation: The plant that is simulated. The nominal one always counts: controllers
@@ -133,17 +137,16 @@ class Scenario:
         """
         if variation != "nominal":
             self.variation(variation)
-        text = yaml.safe_load(yaml_dump_typed(self, schema=Scenario, defaults=Scenario()))
+        text = yaml.safe_load(self.to_yaml())
         text["assessment"] = {"horizon": self.assessment.horizon}
         text["variations"] = {
-            name: _differing(self.variations[name])
+            name: text["variations"][name]
             for name in ("nominal", variation)
             if name in self.variations
         }
         # A robot of one's own is known by its files, wherever their folder lies.
         text["robot"] = Path(self.robot).name
         task = self.task_class()
-        text["parameters"] = _differing(self.parameters)
         for name in task.online_parameters:
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
@@ -151,15 +154,50 @@ class Scenario:
             digest.update(_LOOKS.sub(b"", Path(path).read_bytes()))
         return digest.hexdigest()
 
+    def code_digest(self) -> str:
+        """SHA-256 of the source code that simulates: this package's, and the task's module's.
+
+        Of the task's module count the modules beside it that it imports, too.
+        """
+        return source_digest(_own_files(sys.modules[self.task_class().__module__]))
+
+
+def source_digest(files: Iterable[Path] = ()) -> str:
+    """SHA-256 of this package's source code that decides a simulation, and of further files.
+
+    Args:
+        files: Of a task's module; they are known by their names, wherever their folder lies.
+    """
+    root = Path(__file__).parents[1]
+    package = [path for room in _SIMULATING_ROOMS for path in (root / room).rglob("*.py")]
+    named = {path.relative_to(root).as_posix(): path for path in package}
+    named |= {path.name: path for path in files}
+    digest = hashlib.sha256()
+    for name in sorted(named):
+        digest.update(name.encode() + b"\0" + named[name].read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+_SIMULATING_ROOMS = ("control", "plants", "robots", "simulation", "systems")
+
+
+def _own_files(module: ModuleType) -> set[Path]:
+    """The file of a module, and those in its folder that it imports from, directly or not."""
+    files: dict[Path, ModuleType] = {}
+    waiting = [module]
+    while waiting:
+        one = waiting.pop()
+        file = Path(getattr(one, "__file__", None) or "")
+        if file in files or (files and file.parent != next(iter(files)).parent):
+            continue
+        files[file] = one
+        names = {getattr(value, "__module__", None) for value in vars(one).values()}
+        waiting += [sys.modules[name] for name in names if name in sys.modules]
+    return set(files)
+
 
 _LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
 """What a robot.yaml says that decides nothing."""
-
-
-def _differing(values: Any) -> dict[str, Any]:
-    """The fields of a dataclass that differ from their defaults."""
-    schema = type(values)
-    return yaml.safe_load(yaml_dump_typed(values, schema=schema, defaults=schema())) or {}
 
 
 def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:

@@ -19,10 +19,10 @@ from pydrake.systems.framework import Context
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.mishap import Mishap
 from drake_safety.simulation.rollouts import (
     Progress,
-    Recorder,
     batches,
     episode_rng,
     parallel_map,
@@ -173,16 +173,10 @@ def play_throws(
         while waiting and waiting[0].time_s - _FLIGHT_S <= time:
             throw = waiting.pop(0)
             release_s = max(throw.time_s - _FLIGHT_S, 0.0)
-            _advance(simulator, release_s)
+            advance_to(simulator, release_s)
             loop.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
-        _advance(simulator, time)
+        advance_to(simulator, time)
         yield time
-
-
-def _advance(simulator: Simulator, time: float) -> None:
-    # To advance to the present would already take the step that begins now.
-    if time > simulator.get_context().get_time():
-        simulator.AdvanceTo(time)
 
 
 def run_throw(

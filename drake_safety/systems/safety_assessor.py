@@ -6,7 +6,14 @@ import math
 from dataclasses import fields
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+    OutputPort,
+)
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import Correction
@@ -173,6 +180,53 @@ class SafetyAssessor(LeafSystem):
                 ]
             )
         )
+
+
+def AddSafetyAssessor(
+    builder: DiagramBuilder,
+    assessment: SafetyAssessment,
+    *,
+    state: OutputPort,
+    desired_preview: OutputPort,
+    features: OutputPort | None = None,
+    period_s: float | None = None,
+) -> SafetyAssessor:
+    """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
+
+    Args:
+        builder: Of the diagram.
+        assessment: A fitted assessment.
+        state: What it was fitted with as ``state``.
+        desired_preview: The same of ``desired_preview``.
+        features: The same of ``features``; not needed where it was fitted without.
+        period_s: Time between two evaluations [s]; that between two rows of an episode by default.
+
+    Returns:
+        The assessor; its outputs are free to be connected, exported and logged.
+
+    Raises:
+        ValueError: The assessment reads features and there are none, or a port has another size
+            than what it was fitted with.
+    """
+    info = assessment.info_
+    assessor = SafetyAssessor(assessment, period_s=info.step_s if period_s is None else period_s)
+    given = {"state": state, "desired_preview": desired_preview, "features": features}
+    ports = {name: port for name, port in given.items() if port is not None}
+    if assessment.uses_features and info.feature_names and features is None:
+        raise ValueError(
+            f"AddSafetyAssessor: the assessment was fitted with features {info.feature_names}; "
+            "give the port that carries them"
+        )
+    for name, port in ports.items():
+        if port.size() != (size := assessor.GetInputPort(name).size()):
+            raise ValueError(
+                f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
+                f"the assessment was fitted with {size}"
+            )
+    builder.AddNamedSystem("safety_assessor", assessor)
+    for name, port in ports.items():
+        builder.Connect(port, assessor.GetInputPort(name))
+    return assessor
 
 
 def _packed(correction: Correction) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 
 class SafeSet(Protocol):
@@ -27,48 +27,41 @@ class SafetyMonitor(LeafSystem):
         input_ports:
         - plant_state
         output_ports:
-        - safe
         - margins
+        - safe
 
-    Margins are evaluated every ``period_s`` and held: ``safe`` is 1 while none is negative. A
-    state that is not finite has margins of minus infinity.
+    Both are direct functions of the state, so that what is recorded of an instant belongs to it:
+    margins that were sampled and held would be those of the period before. ``safe`` is 1 while no
+    margin is negative. A state that is not finite has margins of minus infinity.
 
     Args:
         safe_set: The constraints.
         num_positions: n_q of the plant state.
         num_velocities: n_v of the plant state.
-        period_s: Time between two evaluations [s].
     """
 
-    def __init__(
-        self, safe_set: SafeSet, num_positions: int, num_velocities: int, *, period_s: float
-    ):
+    def __init__(self, safe_set: SafeSet, num_positions: int, num_velocities: int):
         super().__init__()
         self._safe_set = safe_set
         self._n_q = num_positions
         self.constraint_names = list(safe_set.names)
-        n_c = len(self.constraint_names)
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", num_positions + num_velocities
         )
-        state = self.DeclareDiscreteState(n_c)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
-        ticket = {self.discrete_state_ticket(state)}
+        ticket = {self.input_port_ticket(self._state_port.get_index())}
+        self._margins_port = self.DeclareVectorOutputPort(
+            "margins", BasicVector(len(self.constraint_names)), self._calc_margins, ticket
+        )
         self.DeclareVectorOutputPort("safe", BasicVector(1), self._calc_safe, ticket)
-        self.DeclareVectorOutputPort("margins", BasicVector(n_c), self._calc_margins, ticket)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _calc_margins(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)
         if np.isfinite(state).all():
             margins = self._safe_set.margins(state[: self._n_q], state[self._n_q :])
         else:
             margins = np.full(len(self.constraint_names), -np.inf)
-        discrete_state.set_value(margins)
+        output.SetFromVector(margins)
 
     def _calc_safe(self, context: Context, output: BasicVector) -> None:
-        margins = context.get_discrete_state_vector().get_value()
+        margins = self._margins_port.Eval(context)
         output.SetAtIndex(0, float(margins.min() >= 0))
-
-    def _calc_margins(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().get_value())

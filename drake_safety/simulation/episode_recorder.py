@@ -1,0 +1,206 @@
+"""Episodes of a running diagram: rows read from its ports, and what its failures mean."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from drake_safety.learning.segments import DIVERGED, RECORDED, Episode
+from drake_safety.plants.mujoco_dynamics import DivergenceError
+
+_LOGGER = logging.getLogger("drake_safety")
+
+
+class EpisodeError(RuntimeError):
+    """A system of the diagram raised an error in mid-episode; its cause is that error."""
+
+
+class Recorder:
+    """Reads output ports of a diagram, a row at a time.
+
+    Args:
+        diagram: The diagram.
+        names: Ports to read; a mapping gives them other names in what is recorded.
+    """
+
+    def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):
+        named = names if isinstance(names, Mapping) else {name: name for name in names}
+        self._ports = {name: diagram.GetOutputPort(port) for name, port in named.items()}
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._times: list[float] = []
+
+    def record(self, context: Context) -> dict[str, np.ndarray]:
+        """Appends a row, whole or, where a port raises, not at all; returns it."""
+        row = {name: port.Eval(context).copy() for name, port in self._ports.items()}
+        self._rows.append(row)
+        self._times.append(context.get_time())
+        return row
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was recorded: ``time_s`` (N,) [s], and (N, size) for each port by its name."""
+        arrays = {
+            name: np.array([row[name] for row in self._rows]).reshape(len(self._rows), port.size())
+            for name, port in self._ports.items()
+        }
+        return {"time_s": np.array(self._times), **arrays}
+
+
+def advance_to(simulator: Simulator, time_s: float) -> None:
+    """Advances a simulation to an instant, before the updates that are due then.
+
+    A discrete plant's state is then that of the instant. Its next step, which begins at the
+    instant, would already take it to the one after: neither ``AdvancePendingEvents`` nor a time
+    that rounding puts behind that of the update reads a row that belongs to its time.
+
+    Args:
+        simulator: The simulator.
+        time_s: The instant [s]; nothing happens when it is not later than the present.
+    """
+    # Both the instant and Drake's time of an update are a product, rounded at its last bit or two.
+    before_s = time_s - 4.0 * math.ulp(time_s)
+    if before_s > simulator.get_context().get_time():
+        simulator.AdvanceTo(before_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeTiming:
+    """When an episode's rows are read.
+
+    Attributes:
+        step_s: Time between two rows [s].
+        num_steps: T, steps of an episode that is not cut short.
+        monitor_period_s: Time between two looks at the safe set, counted from each row [s].
+    """
+
+    step_s: float
+    num_steps: int
+    monitor_period_s: float
+
+    def looks(self, step: int) -> list[float]:
+        """Instants of the looks during a step, its end included [s].
+
+        Args:
+            step: 1 for the step that leads to row 1.
+        """
+        count = max(math.ceil(self.step_s / self.monitor_period_s - 1e-6), 1)
+        begin_s = (step - 1) * self.step_s
+        within = [begin_s + look * self.monitor_period_s for look in range(1, count)]
+        return [*within, step * self.step_s]
+
+
+def record_episode(
+    simulator: Simulator,
+    ports: Mapping[str, str],
+    timing: EpisodeTiming,
+    *,
+    constraint_names: list[str],
+    who: str,
+    index: int = 0,
+    first_step: int = 0,
+) -> Episode:
+    """Simulates an episode: until it leaves the safe set, or its time is over.
+
+    Args:
+        simulator: Of the diagram, whose Context is set to the start.
+        ports: The diagram's port for each of the names in ``RECORDED``, and for ``safe``. Without
+            ``safe`` it is that no margin is negative; without ``true_state`` it is ``state``,
+            without ``desired_output`` the preview's first sample, without ``features`` none.
+        timing: When rows are read.
+        constraint_names: The n_c constraints.
+        who: The episode, for messages.
+        index: Number of the episode in its set.
+        first_step: First row whose future is undisturbed.
+
+    Returns:
+        The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
+        that were finite.
+
+    Raises:
+        EpisodeError: A system raised an error that is not the simulation's failure.
+    """
+    context = simulator.get_mutable_context()
+    diagram = simulator.get_system()
+    recorder = Recorder(diagram, {name: port for name, port in ports.items() if name != "safe"})
+    margins = diagram.GetOutputPort(ports["margins"])
+    safe = diagram.GetOutputPort(ports["safe"]) if "safe" in ports else None
+    is_finite_at_start = np.isfinite(_state(context))
+
+    def is_safe() -> bool:
+        return bool(margins.Eval(context).min() >= 0 if safe is None else safe.Eval(context) >= 1)
+
+    is_diverged = has_left = False
+    try:
+        simulator.Initialize()
+        recorder.record(context)
+        has_left = not is_safe()
+        for step in range(1, timing.num_steps + 1):
+            if has_left:
+                break
+            for time_s in timing.looks(step):
+                advance_to(simulator, time_s)
+                if has_left := not is_safe():
+                    break
+            recorder.record(context)
+    except (Exception, SystemExit) as error:
+        is_diverged = _is_divergence(error, context, is_finite_at_start)
+        if not is_diverged or not recorder.arrays()["time_s"].size:
+            raise EpisodeError(f"{who}: {type(error).__name__}: {error}") from error
+        _LOGGER.info("%s diverged: %s", who, error)
+    arrays: dict[str, Any] = recorder.arrays()
+    arrays.setdefault("true_state", arrays["state"])
+    arrays.setdefault("desired_output", arrays["desired_preview"][:, : arrays["output"].shape[1]])
+    arrays.setdefault("features", np.empty((len(arrays["time_s"]), 0)))
+    is_finite = np.all([np.isfinite(arrays[name]).all(axis=1) for name in RECORDED], axis=0)
+    if is_diverged or not is_finite.all():
+        num_rows = len(is_finite) if is_finite.all() else int(np.argmin(is_finite))
+        if num_rows == 0:
+            wrong = [name for name in RECORDED if not np.isfinite(arrays[name][0]).all()]
+            raise EpisodeError(f"{who}: ports {wrong} are not finite at the start")
+        cause = DIVERGED
+        arrays = {name: rows[:num_rows] for name, rows in arrays.items()}
+    else:
+        worst = int(np.argmin(arrays["margins"][-1]))
+        cause = constraint_names[worst] if has_left else ""
+    return Episode(
+        index=index,
+        **arrays,
+        is_safe=cause == "",
+        cause=cause,
+        first_step=min(first_step, len(arrays["time_s"]) - 1),
+    )
+
+
+_NUMERICAL_FAILURE = re.compile(
+    r"solver failed to converge|Detected NaN|is NaN\b|non-finite value|step smaller than minimum"
+    r"|Failure at .*(solver|multibody|integrator)"
+)
+"""How Drake says that its contact solver, SceneGraph or integrator was given no sound numbers.
+
+It throws ``std::exception`` for these as for anything else, and its failed assertions, such as
+TAMSI's on a huge force, end the interpreter by SystemExit."""
+
+
+def _is_divergence(error: BaseException, context: Context, is_finite_at_start: np.ndarray) -> bool:
+    """Whether an error is the simulation's own failure, and not a mistake in somebody's code."""
+    if isinstance(error, DivergenceError):
+        return True
+    if type(error) in (RuntimeError, SystemExit) and _NUMERICAL_FAILURE.search(str(error)):
+        return True
+    # Whatever was computed from a state that had run away.
+    state = _state(context)
+    return bool((is_finite_at_start & ~np.isfinite(state)).any())
+
+
+def _state(context: Context) -> np.ndarray:
+    """Continuous and discrete state of a Context."""
+    discrete = context.get_discrete_state()
+    groups = [discrete.value(i) for i in range(discrete.num_groups())]
+    return np.concatenate([context.get_continuous_state_vector().CopyToVector(), *groups])

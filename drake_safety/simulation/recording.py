@@ -1,0 +1,265 @@
+"""Episodes of any diagram that has the contract's output ports, on all cores."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+from drake_safety.simulation.contract import REQUIRED_PORTS
+from drake_safety.simulation.episode_recorder import EpisodeError, EpisodeTiming, record_episode
+from drake_safety.simulation.rollouts import (
+    Progress,
+    collect_episodes,
+    episode_rng,
+    package_versions,
+)
+from drake_safety.simulation.scenario import source_digest
+
+_OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
+
+Reset = Callable[[Diagram, Context, np.random.Generator], int | None]
+"""Samples a start into the root Context; see :func:`record_episodes`."""
+
+
+def record_episodes(
+    make_diagram: Callable[..., Diagram],
+    num_episodes: int,
+    *,
+    reset: Reset,
+    duration_s: float,
+    step_s: float,
+    parameters: Mapping[str, Any] | None = None,
+    ports: Mapping[str, str] | None = None,
+    state_names: Sequence[str] | None = None,
+    output_names: Sequence[str] | None = None,
+    feature_names: Sequence[str] | None = None,
+    constraint_names: Sequence[str] | None = None,
+    name: str | None = None,
+    monitor_period_s: float | None = None,
+    seed: int = 0,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | None = None,
+    accept_code_change: bool = False,
+) -> Episodes:
+    """Simulates a set of episodes of a diagram of one's own, in worker processes.
+
+    The diagram exports these ports, under these names or as ``ports`` says:
+
+    =================== ======= ===============================================================
+    output port         size    meaning
+    =================== ======= ===============================================================
+    ``state``           n_s     what an assessor shall see of the state
+    ``output``          n_z     what shall follow the plan
+    ``desired_preview`` H n_z   the plan at the next H steps, now included, row-major in time;
+                                its size says what H is
+    ``margins``         n_c     signed distance to each constraint, negative where violated
+    ``true_state``      n_s     optional: ``state`` without noise; ``state`` by default
+    ``desired_output``  n_z     optional: the plan now, in the frame of ``output``; the first
+                                sample of ``desired_preview`` by default
+    ``features``        n_f     optional: what else tells how safe the plan is; none by default
+    ``safe``            1       optional: below 1 once the state is unsafe; by default it is as
+                                long as no margin is negative
+    =================== ======= ===============================================================
+
+    A row shows its ports as they are at its time. A port that a system samples and holds shows
+    what was sampled before. Episode i depends on the diagram, the seed and i alone: its bits are
+    the same for any number of workers.
+
+    Args:
+        make_diagram: Builds the diagram; called with ``parameters``, once in each worker.
+        num_episodes: Size of the set.
+        reset: Called with diagram, root Context and generator; samples a start into the Context,
+            which is the diagram's default one. It may return the first row whose future is
+            undisturbed, where that is not 0.
+        duration_s: Length of an episode that stays safe [s].
+        step_s: Time between two rows, the unit of H [s].
+        parameters: For ``make_diagram``, part of what a folder's set is known by.
+        ports: The diagram's own names of ports, by those above.
+        state_names: What the entries of ``state`` are called, n_s of them; numbered by default.
+        output_names: The same of ``output``.
+        feature_names: The same of ``features``.
+        constraint_names: The same of ``margins``.
+        name: Of the set; by default that of ``make_diagram``.
+        monitor_period_s: Time between two looks at whether the state is safe [s]; a tenth of
+            ``step_s`` by default.
+        seed: Seed of the set.
+        num_workers: Processes; as many as there are cores by default. 1 runs in this process.
+        path: Folder where episodes are kept as they finish; those of the same set that it
+            already holds are not simulated again. A set is the same if name, parameters, ports,
+            times and the source text of ``make_diagram`` and ``reset`` are; what these call is
+            not looked at.
+        progress: Called with the number done and the number wanted.
+        accept_code_change: Whether a folder's set goes on although another version of this
+            package began it.
+
+    Returns:
+        The episodes, as ``SafetyAssessment.fit`` takes them. Those whose simulation failed are
+        among them, with the cause ``diverged``, and are counted in a warning.
+
+    Raises:
+        ValueError: A port is missing or of a size that fits no other, there are not as many names
+            as entries, a time does not fit, or the folder holds another set.
+        EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
+    """
+    name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
+    if not (step_s > 0 and round(duration_s / step_s) >= 1):
+        raise ValueError(
+            f"record_episodes: an episode lasts a step at least; got duration_s {duration_s} and "
+            f"step_s {step_s}"
+        )
+    period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
+    if not period_s > 0:
+        raise ValueError(f"record_episodes: monitor_period_s must be positive; got {period_s}")
+    timing = EpisodeTiming(
+        step_s=step_s, num_steps=round(duration_s / step_s), monitor_period_s=period_s
+    )
+    make = partial(make_diagram, **dict(parameters or {}))
+    used, sizes = _used_ports(make(), dict(ports or {}))
+    info = EpisodesInfo(
+        scenario=name,
+        scenario_hash=_hash(
+            name, timing, used, sorted((parameters or {}).items()), make_diagram, reset
+        ),
+        variation="nominal",
+        seed=seed,
+        step_s=step_s,
+        horizon=sizes["desired_preview"] // sizes["output"],
+        state_names=_names("state", state_names, sizes["state"]),
+        output_names=_names("output", output_names, sizes["output"]),
+        feature_names=_names("feature", feature_names, sizes.get("features", 0)),
+        constraint_names=_names("constraint", constraint_names, sizes["margins"]),
+        versions=package_versions("numpy"),
+        num_steps=timing.num_steps,
+        code=source_digest(),
+    )
+    # Nothing that is known of a function says that what it builds has not changed.
+    run = uuid.uuid4().hex
+    return collect_episodes(
+        info,
+        num_episodes,
+        lambda batch: (_record_batch, run, make, reset, used, timing, info, batch),
+        num_workers=num_workers,
+        path=path,
+        progress=progress,
+        accept_code_change=accept_code_change,
+    )
+
+
+def _record_batch(
+    run: str,
+    make: Callable[[], Diagram],
+    reset: Reset,
+    ports: dict[str, str],
+    timing: EpisodeTiming,
+    info: EpisodesInfo,
+    indices: list[int],
+) -> list[Episode]:
+    diagram = _worker_diagram(make, run)
+    episodes = []
+    for index in indices:
+        who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
+        simulator = Simulator(diagram)
+        try:
+            rng = episode_rng(info.seed, index)
+            first_step = reset(diagram, simulator.get_mutable_context(), rng)
+        except Exception as error:
+            raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
+        episodes.append(
+            record_episode(
+                simulator,
+                ports,
+                timing,
+                constraint_names=info.constraint_names,
+                who=who,
+                index=index,
+                first_step=first_step or 0,
+            )
+        )
+    return episodes
+
+
+def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
+    """The diagram's name of each port of the contract that it has, and their sizes."""
+    unknown = set(given) - set(REQUIRED_PORTS)
+    if unknown:
+        raise ValueError(
+            f"record_episodes: ports has {sorted(unknown)}; the contract's are {REQUIRED_PORTS}"
+        )
+    there = {
+        port.get_name(): port.size()
+        for port in (diagram.get_output_port(i) for i in range(diagram.num_output_ports()))
+    }
+    used = {name: given.get(name, name) for name in REQUIRED_PORTS}
+    missing = {
+        name: port
+        for name, port in used.items()
+        if port not in there and (name in given or name not in _OPTIONAL_PORTS)
+    }
+    if missing:
+        raise ValueError(
+            f"record_episodes: the diagram exports no port {sorted(missing.values())} for "
+            f"{sorted(missing)}; it exports {sorted(there)}. Call builder.ExportOutput(port, NAME) "
+            "for each, or give its name by 'ports'"
+        )
+    used = {name: port for name, port in used.items() if port in there}
+    sizes = {name: there[port] for name, port in used.items()}
+    n_z = sizes["output"]
+    expected = {"true_state": sizes["state"], "desired_output": n_z, "safe": 1}
+    for name, size in expected.items():
+        if sizes.get(name, size) != size:
+            raise ValueError(
+                f"record_episodes: port '{used[name]}' for {name} has size {sizes[name]}; "
+                f"expected {size}"
+            )
+    if n_z < 1 or sizes["desired_preview"] < 1 or sizes["desired_preview"] % n_z:
+        raise ValueError(
+            f"record_episodes: port '{used['desired_preview']}' has size "
+            f"{sizes['desired_preview']}; expected H times the size {n_z} of the output"
+        )
+    return used, sizes
+
+
+def _names(what: str, given: Sequence[str] | None, size: int) -> list[str]:
+    if given is None:
+        return [f"{what}_{i}" for i in range(size)]
+    if len(given) != size:
+        raise ValueError(
+            f"record_episodes: {what}_names has {len(given)} names, the port has {size} entries"
+        )
+    return list(given)
+
+
+def _hash(*parts: Any) -> str:
+    """SHA-256 of values and of the source text of functions and classes."""
+    digest = hashlib.sha256()
+    for part in parts:
+        text = repr(part)
+        if isinstance(part, partial):
+            text = _hash(part.func, part.args, sorted(part.keywords.items()))
+        elif callable(part):
+            is_text = inspect.isroutine(part) or inspect.isclass(part)
+            text = inspect.getsource(part if is_text else type(part))
+        digest.update(text.encode() + b"\0")
+    return digest.hexdigest()
+
+
+_DIAGRAMS: dict[str, Diagram] = {}
+
+
+def _worker_diagram(make: Callable[[], Diagram], run: str) -> Diagram:
+    """The diagram of a worker process, built once for each call of :func:`record_episodes`."""
+    if run not in _DIAGRAMS:
+        _DIAGRAMS.clear()
+        _DIAGRAMS[run] = make()
+    return _DIAGRAMS[run]

@@ -1,0 +1,59 @@
+"""What a user writes: from an empty file to Γ in a diagram of pydrake's own parts."""
+
+import numpy as np
+from pydrake.examples import QuadrotorPlant, StabilizingLQRController
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+
+from drake_safety import (
+    AddSafetyAssessor,
+    AssessmentParameters,
+    SafetyAssessment,
+    record_episodes,
+)
+
+HORIZON, STEP_S, GOAL = 10, 0.1, np.array([0.0, 0.0, 1.0])
+START = np.array([0.5, 0.5, 0.5, 0.9, 0.9, 0.5, 2, 2, 2, 3, 3, 1])  # As far as it may begin.
+
+
+class Flight(LeafSystem):  # Where it is, where it shall hover, how far from floor and tipping.
+    def __init__(self):
+        super().__init__()
+        x = self.DeclareVectorInputPort("state", 12)
+        for name, size, calc in (
+            ("output", 3, lambda c: x.Eval(c)[:3]),
+            ("desired_preview", 3 * HORIZON, lambda c: np.tile(GOAL, HORIZON)),
+            ("margins", 2, lambda c: [x.Eval(c)[2] - 0.1, 1.2 - abs(x.Eval(c)[3:5]).max()]),
+        ):
+            calc = lambda c, value, calc=calc: value.SetFromVector(calc(c))  # noqa: E731
+            self.DeclareVectorOutputPort(name, BasicVector(size), calc)
+
+
+def make_diagram(assessment=None):
+    builder = DiagramBuilder()
+    quadrotor = builder.AddNamedSystem("quadrotor", QuadrotorPlant())
+    state = quadrotor.get_output_port()
+    flight = builder.AddSystem(Flight())
+    controller = builder.AddSystem(StabilizingLQRController(quadrotor, GOAL))
+    builder.Connect(state, controller.get_input_port())
+    builder.Connect(controller.get_output_port(), quadrotor.get_input_port())
+    builder.Connect(state, flight.get_input_port())
+    builder.ExportOutput(state, "state")
+    for name in ("output", "desired_preview", "margins"):
+        builder.ExportOutput(flight.GetOutputPort(name), name)
+    if assessment is not None:
+        preview = flight.GetOutputPort("desired_preview")
+        assessor = AddSafetyAssessor(builder, assessment, state=state, desired_preview=preview)
+        builder.ExportOutput(assessor.GetOutputPort("normalized_safety_probability"), "gamma")
+    return builder.Build()
+
+
+def reset(diagram, context, rng):
+    quadrotor = diagram.GetSubsystemByName("quadrotor")
+    start = np.append(GOAL, np.zeros(9)) + START * rng.uniform(-1, 1, 12)
+    quadrotor.GetMyMutableContextFromRoot(context).SetContinuousState(start)
+
+
+def learn(num_episodes=1000, **options):
+    times = {"duration_s": 2.0, "step_s": STEP_S}
+    episodes = record_episodes(make_diagram, num_episodes, reset=reset, **times, **options)
+    return SafetyAssessment(AssessmentParameters(horizon=HORIZON)).fit(episodes)
