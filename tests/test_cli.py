@@ -99,7 +99,7 @@ def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simula
     file = tmp_path / "gliding.yaml"
     file.write_text(SCENARIO)
     assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path, "--throws", 5) == 2
-    assert "has no recovery to judge: pass --throws 0" in capsys.readouterr().out
+    assert "pass --throws 0: task 'Gliding' has no ball to throw" in capsys.readouterr().out
 
 
 def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
@@ -311,7 +311,7 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
         (["--learning-curve", "61"], "60 training episodes; got sizes [61]"),
         (["--learning-curve", "many"], "--learning-curve 'many': give numbers of episodes"),
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
-        (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
+        (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
         (["--seed", "-3"], "-3, -2, -1, 0 would be used, and 0 is the training episodes' own"),
     ],
 )
@@ -330,7 +330,9 @@ def test_options_of_targets_are_refused_where_plans_have_no_goal():
     loop = load_scenario("laikago_balancing").make_loop()
     check_options(loop, PlanOptions(), 100)
     for options in (PlanOptions(other_hand=5), PlanOptions(learning_curve=(64,))):
-        with pytest.raises(ValueError, match="Balancing have no goal: leave out --other-hand"):
+        with pytest.raises(
+            ValueError, match=r"leave out --other-hand.*'Balancing' has no plans with a"
+        ):
             check_options(loop, options, 100)
 
 

@@ -14,8 +14,9 @@ from drake_safety.control.kinematics import planar_pose
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
-from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
+from drake_safety.simulation.closed_loop import RECORDED_PORTS
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import Recorder, episodes_info
 from drake_safety.simulation.scenario import Scenario
 
@@ -23,7 +24,7 @@ _ROUNDING_S = 1e-9
 
 
 def episodes_from_log(
-    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+    log: RobotLog, loop: LeggedLoop | Scenario, *, desired_output: np.ndarray | None = None
 ) -> Episodes:
     """Turns a log into episodes of the actual robot; see :func:`cut_log`.
 
@@ -41,7 +42,7 @@ def episodes_from_log(
 
 
 def cut_log(
-    log: RobotLog, loop: ClosedLoop | Scenario, *, desired_output: np.ndarray | None = None
+    log: RobotLog, loop: LeggedLoop | Scenario, *, desired_output: np.ndarray | None = None
 ) -> tuple[Episodes, list[EpisodeStart]]:
     """Turns a log into episodes, and says what each begins with, for its nominal twin.
 
@@ -101,7 +102,7 @@ def cut_log(
 
 def cut_logs(
     logs: Sequence[RobotLog],
-    loop: ClosedLoop | Scenario,
+    loop: LeggedLoop | Scenario,
     *,
     desired_output: np.ndarray | None = None,
 ) -> tuple[Episodes, list[EpisodeStart]]:
@@ -127,7 +128,7 @@ def cut_logs(
 
 
 def _desired_output(
-    log: RobotLog, loop: ClosedLoop, desired_output: np.ndarray | None
+    log: RobotLog, loop: LeggedLoop, desired_output: np.ndarray | None
 ) -> np.ndarray:
     who = f"log '{log.path}'"
     if log.robot != loop.robot.name:
@@ -151,7 +152,7 @@ def _desired_output(
     return np.tile(value, (len(log.time_s), 1))
 
 
-def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
+def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
     """The logged state at a time, and the logged z* from then on as a plan."""
     kinematics = loop.kinematics
     begin = np.array([begin_s])
@@ -179,7 +180,7 @@ def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float)
 
 
 def _episode(
-    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, index: int
+    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, index: int
 ) -> Episode:
     scenario = loop.scenario
     length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
@@ -207,7 +208,7 @@ def _episode(
 
 
 def _margins(
-    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, ticks: np.ndarray
+    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, ticks: np.ndarray
 ) -> np.ndarray:
     """Margins at the monitor's ticks up to the first violation, (n, n_c) [m or rad]."""
     port = loop.GetOutputPort("margins")
@@ -221,7 +222,7 @@ def _margins(
     return np.array(rows)
 
 
-def _set_state(loop: ClosedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
+def _set_state(loop: LeggedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
     context.SetTime(float(time_s))
     plant_context = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)
