@@ -1,57 +1,202 @@
 """Pendulum: an inverted pendulum with a weak motor follows a point; its true safe set is known."""
 
 import math
-from dataclasses import fields
-from itertools import pairwise
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
-from pydrake.examples import PendulumGeometry, PendulumParams, PendulumPlant
+from pydrake.examples import PendulumGeometry, PendulumPlant
 from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    OutputPort,
-)
-from pydrake.systems.primitives import Saturation, ZeroOrderHold
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.diagrams.pendulum_parameters import GRAVITY, PendulumParameters
-from drake_safety.diagrams.pendulum_systems import (
-    PendulumController,
-    PendulumObserver,
-    PendulumSafeSet,
-    bob_position,
-)
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
+from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.state_plane import StatePlane
-from drake_safety.systems.plan_features import PlanFeatures
-from drake_safety.systems.safety_monitor import SafetyMonitor
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
+from drake_safety.systems.trajectory_planner import interpolate
 
 _NUM_OUTLOOK = 41  # Samples of the plan from now to its end that the features see.
-_VARIED = ("mass_scale", "joint_damping")  # What a variation can change of this plant.
+_GRAVITY = 9.81  # [m/s^2].
 
 
-class Pendulum(ClosedLoop):
-    """The diagram of the pendulum: Drake's plant, its torque limited, behind a PD controller.
+@dataclass(kw_only=True)
+class PendulumParameters:
+    """The task's part of the scenario file. Angles are from upright, positive to the front."""
+
+    mass_kg: float = 1.0
+    length_m: float = 0.5
+    damping: float = 0.05
+    """Of the hinge [N·m·s/rad]."""
+    effort_share: float = 0.35
+    """The motor's torque, as a share of what holds the pendulum when it is horizontal."""
+    stiffness: float = 20.0
+    """Gain of the angle's error [N·m/rad]."""
+    rate_gain: float = 3.0
+    """Gain of the rate's error [N·m·s/rad]."""
+    largest_angle_rad: float = 0.6
+    """Beyond this angle the pendulum has left the safe set."""
+    start_angle_rad: float = 0.6
+    """Half-width of the angles at which episodes begin."""
+    start_rate_rad_s: float = 2.0
+    """Half-width of the rates at which episodes begin."""
+    plan_angle_rad: float = 0.3
+    """Half-width of the angles at which plans begin and end."""
+    plan_duration_s: list[float] = field(default_factory=lambda: [0.5, 1.5])
+    """Shortest and longest duration of the planned motion."""
+
+    def __post_init__(self) -> None:
+        for name, value in ((entry.name, getattr(self, entry.name)) for entry in fields(self)):
+            if not np.all(np.isfinite(value)) or np.min(value) <= 0:
+                raise ValueError(f"pendulum: {name} must be finite and positive; got {value}")
+        if self.plan_duration_s != sorted(self.plan_duration_s)[:2]:
+            expected = "plan_duration_s must be [shortest, longest]"
+        elif self.start_angle_rad > self.largest_angle_rad:
+            limit = f"largest_angle_rad {self.largest_angle_rad}"
+            expected = f"start_angle_rad must not exceed {limit}, or episodes begin unsafe"
+        elif self.effort_share >= 1:
+            expected = "effort_share must be below 1, or nothing can go wrong"
+        else:
+            return
+        raise ValueError(f"pendulum: {expected}; got {self}")
+
+    @property
+    def hold_angle_rad(self) -> float:
+        """The largest angle that the motor can hold."""
+        return math.asin(self.effort_share)
+
+
+class PendulumSafeSet:
+    """The pendulum leans less than its largest angle to the front and to the back.
+
+    The capture angle φ + φ̇ √(l/g) is where a small pendulum that is left alone goes to; beyond the
+    angle that the motor can hold there is no way back. Following the plan takes the torque
+    (l/g) φ̈ - sin φ, in units of what holds the pendulum when it is horizontal.
+
+    Args:
+        parameters: The task's numbers.
+        preview_step_s: Time between two points that the features are given of a plan [s].
+    """
+
+    names = ("front", "back")
+
+    def __init__(self, parameters: PendulumParameters, preview_step_s: float):
+        self._parameters, self._step_s = parameters, preview_step_s
+        self._time_s = math.sqrt(parameters.length_m / _GRAVITY)
+        points = ("capture", "goal", "plan", "plan_capture", "plan_effort")
+        reserves = ["now_margin", *(f"{point}_reserve" for point in points)]
+        self.feature_names = [f"{reserve}_{side}" for reserve in reserves for side in self.names]
+        self.feature_names += ["tracking_error", "goal_from_capture"]
+
+    def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Angle left to either side (2,) [rad] of an angle (1,) [rad]; its rate is not used."""
+        del v
+        return _reserves(self._parameters.largest_angle_rad, q)
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """The margins now, and what the motor has in reserve along the plan, (n_f,).
+
+        Of the angle (1,) [rad], its rate (1,) [rad/s] and the points that are to be followed, from
+        now to the end, (M, 3) [m]; in [rad], those of the effort in its unit.
+        """
+        hold, capture = self._parameters.hold_angle_rad, q + self._time_s * v
+        planned = np.arctan2(preview[:, 0], preview[:, 2])
+        rate = np.gradient(planned, self._step_s)
+        plan_capture = planned + self._time_s * rate
+        reserves = [_reserves(hold, x) for x in (capture, planned[-1:], planned, plan_capture)]
+        # What keeps it from falling to the front pulls it to the back.
+        pull = np.sin(planned) - self._time_s**2 * np.gradient(rate, self._step_s)
+        reserves.append(_reserves(self._parameters.effort_share, pull))
+        errors = [planned[:1] - q, planned[-1:] - capture]
+        return np.concatenate([self.margins(q, v), *reserves, *errors])
+
+
+def _reserves(limit: float, values: np.ndarray) -> np.ndarray:
+    return np.array([limit - values.max(), limit + values.min()])
+
+
+def bob_position(angle: float, length_m: float) -> np.ndarray:
+    """The bob over the hinge, (3,) [m]; an angle to the front is positive."""
+    return length_m * np.array([math.sin(angle), 0.0, math.cos(angle)])
+
+
+class PendulumObserver(LeafSystem):
+    """Tells the pendulum's state from upright, and where the bob is.
+
+    .. pydrake_system::
+
+        name: PendulumObserver
+        input_ports:
+        - pendulum_state
+        output_ports:
+        - plant_state
+        - output
+
+    ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
+    rad/s], and ``output`` the bob over the hinge, (3,) [m], ``length_m`` from it.
+    """
+
+    def __init__(self, length_m: float):
+        super().__init__()
+        port = self.DeclareVectorInputPort("pendulum_state", 2)
+
+        def calc_state(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(port.Eval(context) - [math.pi, 0.0])
+
+        def calc_output(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(bob_position(port.Eval(context)[0] - math.pi, length_m))
+
+        self.DeclareVectorOutputPort("plant_state", 2, calc_state)
+        self.DeclareVectorOutputPort("output", 3, calc_output)
+
+
+class PendulumController(LeafSystem):
+    """A PD controller on the angle, with the weight compensated and the torque limited.
+
+    .. pydrake_system::
+
+        name: PendulumController
+        input_ports:
+        - plant_state
+        - desired_output
+        - desired_output_rate
+        output_ports:
+        - torque
+
+    Inputs as in the loop, ``torque`` (1,) [N·m]; it is held for ``period_s`` [s].
+    """
+
+    def __init__(self, parameters: PendulumParameters, period_s: float):
+        super().__init__()
+        weight = parameters.mass_kg * _GRAVITY * parameters.length_m
+        limit = parameters.effort_share * weight
+        sizes = {"plant_state": 2, "desired_output": 3, "desired_output_rate": 3}
+        ports = [self.DeclareVectorInputPort(name, size) for name, size in sizes.items()]
+
+        def update(context: Context, state: Any) -> None:
+            (angle, rate), (x, _, z), (vx, _, vz) = (port.Eval(context) for port in ports)
+            desired_rate = (vx * z - vz * x) / (x * x + z * z)
+            torque = (
+                parameters.stiffness * (math.atan2(x, z) - angle)
+                + parameters.rate_gain * (desired_rate - rate)
+                - weight * math.sin(angle)
+            )
+            state.set_value([min(max(torque, -limit), limit)])
+
+        self.DeclareStateOutputPort("torque", self.DeclareDiscreteState(1))
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, update)
+
+
+class Pendulum(PlannedLoop):
+    """The diagram of the pendulum: Drake's plant behind a controller with a limited torque.
 
     The output is the position of the bob over the hinge, and plans are points for it to follow.
-    The torque is that of a PD controller on the angle, with the weight compensated, held for a
-    control period and limited.
 
     Args:
         scenario: The scenario.
-        variation: Name of the plant variation.
+        variation: Name of the plant variation; masses and damping can vary.
         assessment: Γ; adds the assessor.
         meshcat: Adds a visualiser.
-
-    Raises:
-        ValueError: A variation that asks for what this plant has not, or an assessment of another
-            diagram.
     """
 
     Parameters = PendulumParameters
@@ -66,80 +211,29 @@ class Pendulum(ClosedLoop):
         meshcat: Meshcat | None = None,
     ):
         super().__init__(scenario, variation, assessment)
-        _check_variation(self.variation, variation)
-        parameters = scenario.parameters
+        self._check_variation("mass_scale", "joint_damping")
+        parameters, period_s = scenario.parameters, scenario.control_period_s
+        outlook_s = scenario.episode_duration_s
         builder = DiagramBuilder()
-        self._pendulum = builder.AddNamedSystem("pendulum", PendulumPlant())
-        pendulum_state = self._pendulum.get_state_output_port()
+        pendulum = self._pendulum = builder.AddNamedSystem("pendulum", PendulumPlant())
         observer = builder.AddNamedSystem("observer", PendulumObserver(parameters.length_m))
-        builder.Connect(pendulum_state, observer.get_input_port())
-        plant_state = observer.GetOutputPort("plant_state")
-
-        planner = builder.AddNamedSystem(
-            "trajectory_planner",
-            TrajectoryPlanner(
-                horizon=scenario.assessment.horizon,
-                step_s=scenario.step_s,
-                outlook_s=scenario.episode_duration_s,
-                num_outlook=_NUM_OUTLOOK,
-            ),
-        )
-        self._planner = planner
-        self._add_controller(builder, parameters, plant_state)
-
-        safe_set = PendulumSafeSet(parameters, scenario.episode_duration_s / (_NUM_OUTLOOK - 1))
-        monitor = builder.AddNamedSystem(
-            "safety_monitor",
-            SafetyMonitor(safe_set, 1, 1),
-        )
-        builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
-        features = builder.AddNamedSystem(
-            "plan_features", PlanFeatures(safe_set, 1, 1, horizon=_NUM_OUTLOOK)
-        )
-        builder.Connect(plant_state, features.GetInputPort("plant_state"))
-        builder.Connect(
-            planner.GetOutputPort("desired_outlook"), features.GetInputPort("desired_preview")
-        )
-
+        builder.Connect(pendulum.get_state_output_port(), observer.get_input_port())
+        state = observer.GetOutputPort("plant_state")
+        self._add_planner(builder, outlook_s=outlook_s, num_outlook=_NUM_OUTLOOK)
+        controller = builder.AddNamedSystem("controller", PendulumController(parameters, period_s))
+        self._connect_controller(builder, controller, state)
+        builder.Connect(controller.get_output_port(), pendulum.get_input_port())
+        safe_set = PendulumSafeSet(parameters, outlook_s / (_NUM_OUTLOOK - 1))
+        self._add_safe_set(builder, safe_set, (1, 1), plant_state=state)
         self.state_names = ["angle", "angle_rate"]
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
-        self.feature_names = features.feature_names
-        self.constraint_names = monitor.constraint_names
-        self.add_assessor(
-            builder,
-            period_s=scenario.control_period_s,
-            state=plant_state,
-            desired_preview=planner.GetOutputPort("desired_preview"),
-            features=features.GetOutputPort("features"),
-        )
-        builder.ExportOutput(plant_state, "state")
-        builder.ExportOutput(plant_state, "true_state")
-        builder.ExportOutput(observer.GetOutputPort("output"), "output")
-        builder.ExportOutput(planner.GetOutputPort("desired_output"), "desired_output")
-        builder.ExportOutput(planner.GetOutputPort("desired_preview"), "desired_preview")
-        builder.ExportOutput(features.GetOutputPort("features"), "features")
-        builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
-        builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
+        output = observer.GetOutputPort("output")
+        self._export(builder, assessment_period_s=period_s, state=state, output=output)
         if meshcat is not None:
             scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-            PendulumGeometry.AddToBuilder(builder, pendulum_state, scene_graph)
+            PendulumGeometry.AddToBuilder(builder, pendulum.get_state_output_port(), scene_graph)
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self.finish(builder)
-        self._default = self.CreateDefaultContext()
-
-    def _add_controller(
-        self, builder: DiagramBuilder, parameters: PendulumParameters, plant_state: OutputPort
-    ) -> None:
-        """Adds what follows the planner's point: PD, hold, limit."""
-        controller = builder.AddNamedSystem("controller", PendulumController(parameters))
-        builder.Connect(plant_state, controller.GetInputPort("plant_state"))
-        for name in ("desired_output", "desired_output_rate"):
-            builder.Connect(self._planner.GetOutputPort(name), controller.GetInputPort(name))
-        hold = builder.AddNamedSystem("hold", ZeroOrderHold(self.scenario.control_period_s, 1))
-        limit = parameters.effort_limit()
-        saturation = builder.AddNamedSystem("effort_limit", Saturation([-limit], [limit]))
-        for before, after in pairwise((controller, hold, saturation, self._pendulum)):
-            builder.Connect(before.get_output_port(), after.get_input_port())
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an angle, a rate and a plan."""
@@ -151,85 +245,38 @@ class Pendulum(ClosedLoop):
         return 0
 
     def plan(self, start_rad: float, goal_rad: float, duration_s: float) -> PiecewisePolynomial:
-        """A plan for the bob, from one angle to another.
-
-        Args:
-            start_rad: Where it begins.
-            goal_rad: Where it ends.
-            duration_s: How long it takes [s].
-        """
+        """A plan for the bob, from one angle to another within a duration [s]."""
         length_m = self.scenario.parameters.length_m
         ends = [bob_position(angle, length_m) for angle in (start_rad, goal_rad)]
         return interpolate(*ends, duration_s)
-
-    def reset_to(
-        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
-    ) -> None:
-        """Begins with a given angle, rate and plan; see :meth:`ClosedLoop.reset_to`."""
-        for name in ("q", "v"):
-            value = getattr(start, name)
-            if np.shape(value) != (1,) or not np.isfinite(value).all():
-                raise ValueError(f"pendulum: {name} must be one finite number; got {value}")
-        self._enter(context, start)
-
-    def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with."""
-        q, v = np.split(self.GetOutputPort("true_state").Eval(context), 2)
-        plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
-        return EpisodeStart(q=q, v=v, plan=plan)
 
     @property
     def state_planes(self) -> dict[str, StatePlane]:
         """Nearly all starts, for a plan that holds still and for two that move."""
         parameters = self.scenario.parameters
         # The border of the starts may be the safe set's own, where rounding decides.
-        half = 0.95 * np.array([parameters.start_angle_rad, parameters.start_rate_rad_s])
-        far = 0.8 * parameters.plan_angle_rad
+        angle, rate = 0.95 * parameters.start_angle_rad, 0.95 * parameters.start_rate_rad_s
         duration_s = float(np.mean(parameters.plan_duration_s))
-        plans = {"hold": (0.0, 0.0), "lean forward": (0.0, far), "from back to front": (-far, far)}
-        return {
-            name: StatePlane(
+
+        def plane(*angles: float) -> StatePlane:
+            plan = self.plan(*angles, duration_s)
+            return StatePlane(
                 axes=("angle [rad]", "rate [rad/s]"),
-                lowest=(-half[0], -half[1]),
-                highest=(half[0], half[1]),
-                start=lambda point, angles=angles: EpisodeStart(
-                    q=point[:1], v=point[1:], plan=self.plan(*angles, duration_s)
-                ),
+                lowest=(-angle, -rate),
+                highest=(angle, rate),
+                start=lambda point: EpisodeStart(q=point[:1], v=point[1:], plan=plan),
             )
-            for name, angles in plans.items()
-        }
 
-    def _enter(self, context: Context, start: EpisodeStart) -> None:
-        # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
-        context.SetTime(0.0)
-        context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
-        parameters = self.scenario.parameters
+        far = 0.8 * parameters.plan_angle_rad
+        ends = {"hold": (0.0, 0.0), "lean forward": (0.0, far), "from back to front": (-far, far)}
+        return {name: plane(*angles) for name, angles in ends.items()}
+
+    def _set_state(self, context: Context, start: EpisodeStart) -> None:
+        parameters, variation = self.scenario.parameters, self.variation
         pendulum_context = self._pendulum.GetMyMutableContextFromRoot(context)
-        pendulum_context.get_mutable_numeric_parameter(0).SetFromVector(
-            _pendulum_parameters(parameters, self.variation)
-        )
+        values = self._pendulum.get_mutable_parameters(pendulum_context)
+        values.set_mass(variation.mass_scale * parameters.mass_kg)
+        values.set_length(parameters.length_m)
+        values.set_damping(parameters.damping + variation.joint_damping)
+        values.set_gravity(_GRAVITY)
         pendulum_context.SetContinuousState([math.pi + start.q[0], start.v[0]])
-        self._planner.set_plan(
-            self._planner.GetMyMutableContextFromRoot(context), start.plan, np.zeros(3)
-        )
-
-
-def _pendulum_parameters(parameters: PendulumParameters, variation: PlantVariation) -> np.ndarray:
-    values = PendulumParams()
-    values.set_mass(variation.mass_scale * parameters.mass_kg)
-    values.set_length(parameters.length_m)
-    values.set_damping(parameters.damping + variation.joint_damping)
-    values.set_gravity(GRAVITY)
-    return values.get_value()
-
-
-def _check_variation(variation: PlantVariation, name: str) -> None:
-    plain = PlantVariation()
-    for entry in fields(PlantVariation):
-        if entry.name not in _VARIED and getattr(variation, entry.name) != getattr(
-            plain, entry.name
-        ):
-            raise ValueError(
-                f"pendulum: variation '{name}' sets {entry.name}, which this plant has not; it "
-                f"has {list(_VARIED)}"
-            )

@@ -5,38 +5,34 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance
+from drake_safety.control.kinematics import fit_stance
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
 from drake_safety.diagrams.reaching_side import ReachingSide
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
-from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.obstacles import Clearance
-from drake_safety.plants.physics import Scene, add_physics
+from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.robot import ObservationNoise, model_file
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.robots.robot import model_file
+from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.push_source import PushSource
-from drake_safety.systems.safety_monitor import SafetyMonitor
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
+from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
 
 
-class Reaching(ClosedLoop):
+class Reaching(LeggedLoop):
     """The diagram of the reaching task, for any robot.yaml with feet and reaching frames.
 
     The other hand is the trained one in the mirror: ``state``, ``desired_preview`` and
@@ -81,65 +77,35 @@ class Reaching(ClosedLoop):
         exploring: bool = True,
     ):
         super().__init__(scenario, variation, assessment)
+        self.monitor_period_s = scenario.parameters.monitor_period_s
         parameters = scenario.parameters
-        horizon = scenario.assessment.horizon
-        robot = load_robot(scenario.robot)
+        robot, kinematics = self.robot, self.kinematics
         if not robot.reaching_frames:
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
         self._is_exploring = exploring
-        nominal = scenario.variation("nominal")
-        kinematics = RobotKinematics(robot, nominal)
-        self.kinematics = kinematics
         trained_hand = parameters.hand or next(iter(robot.reaching_frames))
         self._side = ReachingSide(kinematics, trained_hand, hand, scenario_name=scenario.name)
         self.hand, self.mirror = self._side.hand, self._side.mirror
+        self.named_targets, self.pushes = parameters.named_targets, parameters.pushes
+        self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
         builder = DiagramBuilder()
 
-        physics = add_physics(
-            builder,
-            robot,
-            self.variation,
-            Scene(obstacles=parameters.obstacles, decorations=parameters.decorations),
-            time_step_s=scenario.time_step_s,
-            servos=False,
+        scene = Scene(obstacles=parameters.obstacles, decorations=parameters.decorations)
+        physics = self._add_robot(builder, scene, servos=False)
+        measured = self._add_observers(builder, hand=self.hand, mirror=self.mirror)
+        planner = self._add_planner(
+            builder, outlook_s=parameters.plan_duration_s, num_outlook=_NUM_OUTLOOK
         )
-        self._physics = physics
-        self.plant, self.robot, self.robot_instance = physics.plant, robot, physics.instance
-        self.scene_graph = physics.scene_graph
-
-        n_q, n_v = kinematics.num_positions, kinematics.num_velocities
-        plant_state = physics.state
-
-        noise = self.variation.observation_noise
-        self._observers = Observers(
-            builder,
-            kinematics,
-            plant_state,
-            scenario.control_period_s,
-            hand=self.hand,
-            mirror=self.mirror,
-        )
-        observer = self._observers.add("observer", noise)
-        assessor_observer = self._observers.add(
-            "assessor_observer", combined(noise, self.variation.input_noise)
-        )
-        true_observer = self._observers.add("true_observer", ObservationNoise())
-
-        planner = builder.AddNamedSystem(
-            "trajectory_planner",
-            TrajectoryPlanner(
-                horizon=horizon,
-                step_s=scenario.step_s,
-                outlook_s=parameters.plan_duration_s,
-                num_outlook=_NUM_OUTLOOK,
-            ),
-        )
-        self._planner = planner
         desired_preview = planner.GetOutputPort("desired_preview")
         if self.mirror is not None:
             reflection = builder.AddNamedSystem(
                 "preview_reflection",
-                MatrixGain(D=np.kron(np.eye(horizon), np.diag(self.mirror.points(np.ones(3))))),
+                MatrixGain(
+                    D=np.kron(
+                        np.eye(scenario.assessment.horizon),
+                        np.diag(self.mirror.points(np.ones(3))),
+                    )
+                ),
             )
             builder.Connect(desired_preview, reflection.get_input_port())
             desired_preview = reflection.get_output_port()
@@ -156,11 +122,7 @@ class Reaching(ClosedLoop):
             ),
         )
         self._controller = controller
-        builder.Connect(
-            observer.GetOutputPort("measured_plant_state"), controller.GetInputPort("plant_state")
-        )
-        for name in ("desired_output", "desired_output_rate"):
-            builder.Connect(planner.GetOutputPort(name), controller.GetInputPort(name))
+        self._connect_controller(builder, controller, measured)
         physics.connect_torques(builder, controller.GetOutputPort("actuation"))
         self._push_source = builder.AddNamedSystem(
             "push_source",
@@ -172,59 +134,22 @@ class Reaching(ClosedLoop):
         self.safe_set = ReachingSafeSet(
             controller.model, clearance, parameters.safe_set, is_mirrored=self.mirror is not None
         )
-        monitor = builder.AddNamedSystem(
-            "safety_monitor",
-            SafetyMonitor(self.safe_set, n_q, n_v),
-        )
-        builder.Connect(plant_state, monitor.GetInputPort("plant_state"))
-        features = builder.AddNamedSystem(
-            "plan_features", PlanFeatures(self.safe_set, n_q, n_v, horizon=_NUM_OUTLOOK)
-        )
-        builder.Connect(
-            assessor_observer.GetOutputPort("measured_plant_state"),
-            features.GetInputPort("plant_state"),
-        )
-        builder.Connect(
-            planner.GetOutputPort("desired_outlook"), features.GetInputPort("desired_preview")
-        )
-
-        self.state_names = assessor_observer.state_names
-        self.output_names = assessor_observer.output_names
-        self.feature_names = features.feature_names
-        self.constraint_names = monitor.constraint_names
-        self.fall_name = self.safe_set.fall_name
-        self.watched_features = self.safe_set.watched_features
         self.angular_constraints = self.safe_set.angular_names
-        self.named_targets = parameters.named_targets
-        self.pushes = parameters.pushes
-        self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
-        self.add_assessor(
+        self._watch(builder, self.safe_set)
+        self._export_robot(
             builder,
-            period_s=parameters.assessment_period_s,
-            state=assessor_observer.GetOutputPort("state"),
+            assessment_period_s=parameters.assessment_period_s,
             desired_preview=desired_preview,
-            features=features.GetOutputPort("features"),
+            meshcat=meshcat,
         )
-        builder.ExportOutput(assessor_observer.GetOutputPort("state"), "state")
-        builder.ExportOutput(true_observer.GetOutputPort("state"), "true_state")
-        builder.ExportOutput(observer.GetOutputPort("output"), "output")
-        builder.ExportOutput(planner.GetOutputPort("desired_output"), "desired_output")
-        builder.ExportOutput(desired_preview, "desired_preview")
-        builder.ExportOutput(features.GetOutputPort("features"), "features")
-        builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
-        builder.ExportOutput(monitor.GetOutputPort("safe"), "safe")
         builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
-        builder.ExportOutput(plant_state, "plant_state")
-        if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, physics.scene_graph, meshcat)
         self.finish(builder)
-        self._default = self.CreateDefaultContext()
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file, and the obstacles' files."""
         files = [model_file(obstacle.model) for obstacle in scenario.parameters.obstacles]
-        return [*robot_files(scenario.robot), *files]
+        return [*super().model_files(scenario), *files]
 
     @property
     def target_box(self) -> np.ndarray:
@@ -252,7 +177,7 @@ class Reaching(ClosedLoop):
         path = points_of_plan(self._shape_of_plan(episode), _NUM_OUTLOOK)
         radius_m = self.robot.reaching_frame(self.hand).radius_m
         is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
-        return bool(is_clear) and super().is_fair(episode)
+        return bool(is_clear) and is_in_box(self.goal_of(episode), self.fair_box)
 
     def _shape_of_plan(self, episode: Episode) -> np.ndarray:
         """Start, goal and detour of the hand's motion in the world, (3, 3) [m]."""
@@ -263,11 +188,6 @@ class Reaching(ClosedLoop):
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
-
-    @property
-    def monitor_period_s(self) -> float:
-        """Time between two looks at the margins [s]."""
-        return self.scenario.parameters.monitor_period_s
 
     def num_controller_failures(self, context: Context) -> int:
         """Ticks whose quadratic program had no solution."""
@@ -333,17 +253,11 @@ class Reaching(ClosedLoop):
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
         return self._side.push(push)
 
-    @property
-    def rate_names(self) -> list[str]:
-        """Velocities of the state, and the features that they enter."""
-        return [*super().rate_names, *self.safe_set.rate_features]
-
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
     ) -> list[PiecewisePolynomial]:
         """The plan that there is, and ones that make detours as training has drawn them."""
-        planned = self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
-        detours = self.scenario.parameters.detours
+        planned, detours = self._plan_of(context), self.scenario.parameters.detours
         if not detours.share or planned.start_time() < context.get_time():
             return [planned]
         start, end = planned.start_time(), planned.end_time()
@@ -353,10 +267,6 @@ class Reaching(ClosedLoop):
             detour = self._side.points(detours.draw(rng))
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
-
-    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
-        """Sets a plan; see :meth:`ClosedLoop.set_plan`."""
-        self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
@@ -375,31 +285,8 @@ class Reaching(ClosedLoop):
         self._observers.reseed(context, rng)
         self._observers.silence(context)
 
-    def reset_to(
-        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
-    ) -> None:
-        """Begins with a given state and plan; see :meth:`ClosedLoop.reset_to`."""
-        start.check(self.kinematics)
-        self._enter(context, start)
-        self._observers.reseed(context, rng)
-        if rng is None:
-            self._observers.silence(context)
-
-    def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with."""
-        state = self.GetOutputPort("plant_state").Eval(context)
-        q, v = np.split(state, [self.kinematics.num_positions])
-        plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
-        return EpisodeStart(q=q, v=v, plan=plan)
-
-    def standing_start(self) -> EpisodeStart:
-        """At rest in the standing posture, the hand where it is."""
-        q = self.kinematics.standing_positions()
-        hand = self._controller.model.reaching_position(q).copy()
-        # The plan is told from the feet.
-        hand[:2] += self.kinematics.nominal_base_offset
-        v = np.zeros(self.kinematics.num_velocities)
-        return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(hand[:, None]))
+    def _output_of(self, q: np.ndarray) -> np.ndarray:
+        return self._controller.model.reaching_position(q)
 
     def _set(
         self,
@@ -419,7 +306,7 @@ class Reaching(ClosedLoop):
         x, y, yaw = stance_pose
         X_SW = RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0]).inverse()
         plan = interpolate(
-            X_SW @ self._controller.model.reaching_position(q),
+            X_SW @ self._output_of(q),
             X_SW @ goal,
             self.scenario.parameters.plan_duration_s,
             detour=None if detour is None else X_SW.rotation() @ detour,
@@ -427,21 +314,10 @@ class Reaching(ClosedLoop):
         v = np.zeros(self.kinematics.num_velocities)
         self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
 
-    def _enter(self, context: Context, start: EpisodeStart) -> None:
-        # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
-        context.SetTime(0.0)
-        context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
+    def _set_state(self, context: Context, start: EpisodeStart) -> None:
+        super()._set_state(context, start)
         self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
-        with self._physics.edited(context) as plant_context:
-            self.plant.SetPositionsAndVelocities(
-                plant_context, self.robot_instance, np.concatenate([start.q, start.v])
-            )
         self._controller.set_reference(
             self._controller.GetMyMutableContextFromRoot(context),
             self._controller.model.reference(start.q),
-        )
-        self._planner.set_plan(
-            self._planner.GetMyMutableContextFromRoot(context),
-            start.plan,
-            start.stance_pose(self.kinematics),
         )

@@ -7,13 +7,13 @@ import numpy as np
 from drake_safety.control.reaching_safe_set import ReachingLimits
 from drake_safety.plants.obstacles import Obstacle
 from drake_safety.plants.pushes import Push, RandomPushes
+from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.reaching_sampling import (
     Detours,
     FairTargets,
     PostureSampling,
     TargetSampling,
 )
-from drake_safety.simulation.view import View
 
 
 @dataclass(kw_only=True)

@@ -90,12 +90,19 @@ class Gliding(ClosedLoop):
         self.output_names = ["x", "y", "z"]
         self.feature_names = ["distance"]
         self.constraint_names = ["right", "left"]
-        self.check_assessment()
         builder = DiagramBuilder()
         self.mass = builder.AddSystem(Mass(scenario.parameters, scenario.assessment.horizon))
         for i in range(self.mass.num_output_ports()):
             port = self.mass.get_output_port(i)
             builder.ExportOutput(port, port.get_name())
+        self.add_assessor(
+            builder,
+            period_s=0.04,
+            **{
+                name: self.mass.GetOutputPort(name)
+                for name in ("state", "desired_preview", "features")
+            },
+        )
         self.finish(builder)
 
     def reset(self, context, rng):

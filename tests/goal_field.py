@@ -1,6 +1,7 @@
 """Doubles for judging goals: a task whose input is its goal, and a Γ that is a given field."""
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ class GoalTask:
     """Offers what is asked of a loop whose plans have a goal; its state is the goal."""
 
     target_box = BOX
+    named_targets: ClassVar[dict] = {}
+    hand = None
     constraint_names = ("wall", "floor")
 
     def __init__(self):
@@ -20,6 +23,12 @@ class GoalTask:
 
     def CreateDefaultContext(self):
         return {}
+
+    def reset(self, context, rng, goal=None):
+        raise NotImplementedError
+
+    def goal_of(self, episode):
+        raise NotImplementedError
 
     def reset_standing(self, context, goal, rng=None):
         self.num_resets += 1

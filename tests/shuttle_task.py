@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
 from drake_safety.plants.pushes import Push
+from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario
 
@@ -77,6 +79,10 @@ class Shuttling(ClosedLoop):
     """The whole task."""
 
     Parameters = ShuttleParameters
+    hand = None
+    named_targets: ClassVar[dict] = {}
+    pushes: ClassVar[dict] = {}
+    plan_variety = "the task decides how fast it goes"
 
     def __init__(
         self, scenario, variation="nominal", *, assessment=None, meshcat=None, side="left"
@@ -89,12 +95,19 @@ class Shuttling(ClosedLoop):
         self.constraint_names = ["front", "flank"]
         self.fall_name = "flank"
         self.watched_features = {"front_margin": "to_the_front"}
-        self.check_assessment()
         builder = DiagramBuilder()
         self.shuttle = builder.AddSystem(Shuttle(scenario, SIDES[side]))
         for i in range(self.shuttle.num_output_ports()):
             port = self.shuttle.get_output_port(i)
             builder.ExportOutput(port, port.get_name())
+        self.add_assessor(
+            builder,
+            period_s=0.04,
+            **{
+                name: self.shuttle.GetOutputPort(name)
+                for name in ("state", "desired_preview", "features")
+            },
+        )
         self.finish(builder)
 
     def _of_this_side(self, box):
@@ -158,6 +171,9 @@ class Shuttling(ClosedLoop):
         position, velocity = np.split(episode.state[0], 2)
         goal = position + self.scenario.episode_duration_s * velocity
         return self.shuttle.reflect * goal
+
+    def is_fair(self, episode):
+        return is_in_box(self.goal_of(episode), self.fair_box)
 
     def num_controller_failures(self, context):
         _, velocity, _ = self.shuttle.read(self.shuttle.GetMyContextFromRoot(context))

@@ -94,4 +94,6 @@ def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, r
     _, folder = run
     arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
     assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
-    assert "have no goal to be pushed on the way to" in " ".join(capsys.readouterr().out.split())
+    assert "'Balancing' has no plans with a goal; it has a ball to throw" in " ".join(
+        capsys.readouterr().out.split()
+    )

@@ -91,7 +91,7 @@ def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simula
     file = tmp_path / "gliding.yaml"
     file.write_text(SCENARIO)
     assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path, "--throws", 5) == 2
-    assert "has no recovery to judge: pass --throws 0" in capsys.readouterr().out
+    assert "pass --throws 0: task 'Gliding' has no ball to throw" in capsys.readouterr().out
 
 
 def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
@@ -323,7 +323,9 @@ def test_options_of_targets_are_refused_where_plans_have_no_goal():
     loop = load_scenario("laikago_balancing").make_loop()
     check_options(loop, PlanOptions(), 100)
     for options in (PlanOptions(other_hand=5), PlanOptions(learning_curve=(64,))):
-        with pytest.raises(ValueError, match="Balancing have no goal: leave out --other-hand"):
+        with pytest.raises(
+            ValueError, match=r"leave out --other-hand.*'Balancing' has no plans with a"
+        ):
             check_options(loop, options, 100)
 
 

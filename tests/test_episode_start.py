@@ -102,7 +102,7 @@ def test_a_start_that_does_not_fit_the_robot_is_refused(balancing):
 
 def test_a_task_without_a_robot_cannot_begin_with_a_start_nor_a_start_with_a_goal(balancing):
     start = start_at(balancing, 0)
-    with pytest.raises(ValueError, match="'Gliding' cannot begin with a given start"):
+    with pytest.raises(ValueError, match="'Gliding' has no episodes from a given start"):
         run_episode(gliding().make_loop(), start=start)
     with pytest.raises(ValueError, match="leave out the goal"):
         run_episode(porter(), start=start, goal=EASY)

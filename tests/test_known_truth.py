@@ -15,7 +15,7 @@ from drake_safety.evaluation.known_truth import (
 )
 from drake_safety.evaluation.known_truth_figure import known_truth_figure
 from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.state_plane import StatePlane
+from drake_safety.simulation.episode_start import StatePlane
 from shuttle_task import shuttling
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
@@ -60,7 +60,9 @@ def test_grids_of_different_shapes_are_refused():
 
 
 def test_a_task_without_planes_says_so():
-    with pytest.raises(ValueError, match="'Shuttling' has no state plane 'hold'; it has"):
+    with pytest.raises(
+        ValueError, match="'Shuttling' has no state planes; it has plans with a goal"
+    ):
         simulate_truth(shuttling(), "hold", 3, num_workers=1)
 
 

@@ -20,7 +20,7 @@ from drake_safety.live.session import (
     LiveThrows,
     Pace,
 )
-from drake_safety.simulation.view import View
+from drake_safety.simulation.legged_loop import View
 from reaching_targets import NEAR, made_up_episodes
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")

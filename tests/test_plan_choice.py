@@ -99,7 +99,7 @@ def test_a_task_that_offers_no_plans_says_so():
         pass
 
     loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
-    with pytest.raises(ValueError, match="'Wandering' offers no plans to choose from"):
-        loop.candidate_plans(None, None, 2)
-    with pytest.raises(ValueError, match="'Wandering' offers no plans to choose from"):
-        loop.set_plan(None, None)
+    with pytest.raises(ValueError, match="'Wandering' has no plans to choose from"):
+        choose_plan(loop, SlowIsSafe(), None, threshold=0.5, rng=None)
+    with pytest.raises(ValueError, match="'Wandering' has no plans to choose from"):
+        plan_inputs(loop, None, [])

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.simulation.plan_shape import plan_shape, points_of_plan
-from drake_safety.systems.trajectory_planner import interpolate
+from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
 
 START, GOAL = np.array([0.1, 0.2, 0.9]), np.array([0.7, -0.2, 1.3])
 DETOUR = np.array([-0.1, 0.15, 0.05])

@@ -117,5 +117,5 @@ def test_without_starts_or_plans_there_is_nothing_to_study():
     with pytest.raises(ValueError, match="there is no start"):
         planning_study(Knowing(), [], threshold=0.5)
     gliding = parse_scenario(GLIDING, name="gliding", folder=Path())
-    with pytest.raises(ValueError, match="'Gliding' offers no plans"):
+    with pytest.raises(ValueError, match="'Gliding' has no plans to choose from"):
         run_trials(gliding, 1, num_plans=2, seed=0, num_workers=1)

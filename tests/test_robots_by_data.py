@@ -27,7 +27,7 @@ def heights_standing(name, duration_s):
     rng = np.random.default_rng(0)
     start = calm_start(loop.kinematics, rng, half_widths_m=[0, 0], plan_duration_s=[1.0, 1.0])
     loop.reset_calm(context, rng)
-    loop._set(context, rng, start)
+    loop.reset_to(context, rng, start)
     simulator.Initialize()
     violations = ViolationCounter(loop)
     heights = []

@@ -381,9 +381,9 @@ def test_goals_that_are_not_one_finite_row_an_episode_are_refused(goals, message
 
 
 def test_a_task_whose_plans_have_no_goal_says_so():
-    with pytest.raises(ValueError, match="task 'Gliding' has plans without a goal"):
+    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has nothing"):
         run_episode(gliding().make_loop(), goal=np.zeros(1))
-    with pytest.raises(ValueError, match="task 'Gliding' has plans without a goal"):
+    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has nothing"):
         run_episodes(gliding(), 1, goals=np.zeros((1, 1)), num_workers=1)
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES
 from drake_safety.simulation.sampling import (
@@ -21,8 +23,7 @@ def sampling_for(kinematics):
 
 
 def contact_velocities(kinematics, start):
-    q = kinematics.positions_at(start.X_WB, start.joints)
-    return kinematics.contact_jacobian(q) @ start.v
+    return kinematics.contact_jacobian(start.q) @ start.v
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -32,9 +33,9 @@ def test_the_base_moves_and_the_feet_stand_on_the_ground_at_rest(name):
     sampling.joint_std_rad = 0.0  # It would lift the feet, by design.
     sampling.foot_offset_m = 0.0  # Points of one foot move on their own: no flat foot fits them.
     start = sampling.sample(kinematics, np.random.default_rng(0))
-    q = kinematics.positions_at(start.X_WB, start.joints)
-    np.testing.assert_allclose(kinematics.contact_positions(q), start.p_WC, atol=2e-3)
-    np.testing.assert_array_equal(start.p_WC[:, 2], kinematics.foot_radii)
+    feet = start.foot_positions
+    np.testing.assert_allclose(kinematics.contact_positions(start.q), feet, atol=2e-3)
+    np.testing.assert_array_equal(feet[:, 2], kinematics.foot_radii)
     assert np.abs(start.v[:NUM_BASE_VELOCITIES]).max() > 0.05
     np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
 
@@ -46,9 +47,7 @@ def test_the_plan_begins_at_the_base_and_ends_in_the_ranges():
     for seed in range(5):
         start = sampling.sample(kinematics, np.random.default_rng(seed))
         # With the feet in their nominal places the stance frame is the world's.
-        np.testing.assert_allclose(
-            start.plan.value(0.0).ravel(), start.X_WB.translation(), atol=1e-9
-        )
+        np.testing.assert_allclose(start.plan.value(0.0).ravel(), start.q[4:7], atol=1e-9)
         low, high = sampling.plan_duration_s
         assert low <= start.plan.end_time() <= high
         goal = start.plan.value(start.plan.end_time()).ravel()
@@ -64,7 +63,7 @@ def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity():
         rng = np.random.default_rng(1)
         start = calm_start(kinematics, rng, elapsed_s=elapsed_s, **options)
         assert start.plan.start_time() == -elapsed_s
-        np.testing.assert_allclose(start.X_WB.translation(), start.plan.value(0.0).ravel())
+        np.testing.assert_allclose(start.q[4:7], start.plan.value(0.0).ravel())
         np.testing.assert_array_equal(start.v[:3], 0.0)
         np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
         is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
@@ -74,7 +73,8 @@ def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity():
 def test_feet_at_rest_need_no_joint_rates_when_the_base_is_at_rest():
     kinematics = robot_kinematics(ROBOT_NAMES[0])
     start = sampling_for(kinematics).sample(kinematics, np.random.default_rng(2))
-    v = resting_feet(kinematics, start.X_WB, start.joints, np.zeros(NUM_BASE_VELOCITIES))
+    X_WB = RigidTransform(Quaternion(start.q[:4]), start.q[4:7])
+    v = resting_feet(kinematics, X_WB, start.q[7:], np.zeros(NUM_BASE_VELOCITIES))
     np.testing.assert_array_equal(v, 0.0)
 
 
@@ -85,7 +85,7 @@ def test_the_same_generator_gives_the_same_start_and_another_one_another():
         sampling.sample(kinematics, np.random.default_rng(seed)) for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(one.v, same.v)
-    np.testing.assert_array_equal(one.joints, same.joints)
+    np.testing.assert_array_equal(one.q, same.q)
     assert not np.allclose(one.v, other.v)
 
 

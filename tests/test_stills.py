@@ -10,8 +10,8 @@ from drake_safety.evaluation.stills import (
 )
 from drake_safety.robots import robot_description
 from drake_safety.robots.model_files import is_installed
+from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.view import View
 
 SIZE = {"width": 96, "height": 72}
 

@@ -1,6 +1,6 @@
 import pytest
 
-from drake_safety.simulation.view import View
+from drake_safety.simulation.legged_loop import View
 
 
 def test_a_view_mirrored_twice_is_itself():

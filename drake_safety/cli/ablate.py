@@ -74,6 +74,7 @@ def ablate(
     from drake_safety.evaluation.ablation_figure import ablation_figure
     from drake_safety.evaluation.ablation_study import AblationFile, rows_to_csv, run_ablation
     from drake_safety.evaluation.figure_style import save
+    from drake_safety.simulation.capabilities import rate_names
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.scenario import load_scenario
 
@@ -92,7 +93,7 @@ def ablate(
         base,
         num_training,
         state_names=training.info.state_names,
-        rate_names=loop.rate_names,
+        rate_names=rate_names(loop),
         quick=quick,
     )
     name = "ablation_quick" if quick else "ablation"
@@ -162,9 +163,10 @@ def _sets(
 ) -> AblationSets:
     """The training episodes, and fresh ones: what is not there yet is simulated and kept."""
     from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
+    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
 
-    judging = dict(scenario.task_class().judging_options)
+    judging = judging_options(scenario.task_class())
 
     def fresh(what: str, count: int, own_seed: int) -> EpisodeSet:
         path = fresh_episodes_folder(folder, scenario.simulation_hash(), own_seed, judging)

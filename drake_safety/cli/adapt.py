@@ -219,6 +219,7 @@ class _Judge:
         self._folder, self._workers, self._stages = folder, workers, stages
 
     def _run(self, what: str, num_episodes: int, purpose: str) -> Episodes:
+        from drake_safety.simulation.capabilities import pairing_options
         from drake_safety.simulation.rollouts import run_episodes
 
         seed = self._seeds[purpose]
@@ -232,7 +233,7 @@ class _Judge:
             path=feedback_folder(self._folder, scenario_hash, seed) / self._variation,
             progress=partial(self._stages, what),
             extra={"command": command_line()},
-            **self._scenario.task_class().pairing_options(self._scenario, self._variation),
+            **pairing_options(self._scenario, self._variation),
         )
         return episodes
 

@@ -65,6 +65,7 @@ def calibrate(
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
     from drake_safety.learning.segments import split
+    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
@@ -80,7 +81,7 @@ def calibrate(
     for gamma in learned.values():
         check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
-    judging = dict(loaded.task_class().judging_options)
+    judging = judging_options(loaded.task_class())
     with open_stages() as stages:
         fresh = run_episodes(
             loaded,

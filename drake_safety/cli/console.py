@@ -71,13 +71,14 @@ def cause_words(
         margins: Predicted margins, (n_c,) [m, rad].
     """
     from drake_safety.learning.causes import NO_CAUSE, likely_causes
+    from drake_safety.simulation.capabilities import angular_constraints
 
     (cause,) = likely_causes(masses[None], margins[None], assessment.parameters.margin_unit)
     if cause == NO_CAUSE:
         return "unknown"
     if not math.isfinite(margins[cause]):
         return loop.constraint_names[cause]
-    return margin_words(loop.constraint_names[cause], margins[cause], loop.angular_constraints)
+    return margin_words(loop.constraint_names[cause], margins[cause], angular_constraints(loop))
 
 
 def print_path(what: str, path: Path) -> None:

@@ -115,26 +115,28 @@ def evaluate(
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.learning.assessment_file import file_hash
+    from drake_safety.simulation.capabilities import (
+        CanBePushed,
+        HasBall,
+        HasGoals,
+        HasStatePlanes,
+        judging_options,
+        require,
+    )
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
-    has_goals = loop.target_box is not None
-    has_recovery = hasattr(loaded.parameters, "recovery")
+    has_goals, has_recovery = isinstance(loop, HasGoals), isinstance(loop, HasBall)
     if throws is None:
         throws = _DEFAULT_THROWS if has_recovery and not has_goals else 0
-    if throws and not has_recovery:
-        raise ValueError(f"evaluate: {loaded.task} has no recovery to judge: pass --throws 0")
+    if throws:
+        require(loop, HasBall, "evaluate: pass --throws 0")
     if pushes:
-        if not has_goals:
-            raise ValueError(
-                f"evaluate: plans of {loaded.task} have no goal to be pushed on the way to: leave "
-                "out --pushes; balls that are thrown are watched, too"
-            )
-        # Either says so if there is none.
-        loop.sample_push(np.random.default_rng(0))
+        require(loop, HasGoals, "evaluate: leave out --pushes; thrown balls are watched, too")
+        require(loop, CanBePushed, "evaluate: leave out --pushes")
         loaded.variation("actual")
     options = PlanOptions(
         other_hand=other_hand,
@@ -153,7 +155,7 @@ def evaluate(
 
         def run_set(what: str, num_episodes: int, purpose: str, **loop_options: Any) -> Episodes:
             path = None
-            loop_options = {**loop.judging_options, **loop_options}
+            loop_options = {**judging_options(type(loop)), **loop_options}
             if has_goals:
                 path = fresh_episodes_folder(
                     assessment, loaded.simulation_hash(), seeds[purpose], loop_options
@@ -208,7 +210,7 @@ def evaluate(
                     calibration_seed=seeds["disturbance thresholds"],
                 )
             )
-        if loop.state_planes and truth_resolution:
+        if isinstance(loop, HasStatePlanes) and truth_resolution:
             findings.add(evaluate_truth(judged, list(loop.state_planes), truth_resolution))
     report = {
         "command": command_line(),

@@ -43,10 +43,11 @@ def evaluate_pushes(
     from drake_safety.evaluation.metrics import proportion
     from drake_safety.evaluation.monitoring_study import begun
     from drake_safety.evaluation.scorers import assessment_scorer
+    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.pushed_motions import run_pushed_motions
 
     scenario = judged.scenario
-    options = {**scenario.task_class().judging_options, "pushed": _PLANT}
+    options = {**judging_options(scenario.task_class()), "pushed": _PLANT}
 
     def run(what: str, count: int, own_seed: int) -> list[WatchedMotion]:
         return run_pushed_motions(
@@ -86,16 +87,18 @@ def evaluate_monitoring(
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.monitoring_figure import monitoring_figure
     from drake_safety.evaluation.monitoring_study import evaluate_alarms
+    from drake_safety.simulation.capabilities import HasWatchedFeatures
 
     if all(motion.has_left for motion in calibration):
         # Nobody could be allowed the same share of false alarms.
         return Findings()
     loop = judged.scenario.make_loop()
+    watched = loop.watched_features if isinstance(loop, HasWatchedFeatures) else {}
     alarms = [
         *assessment_alarms("sharpened", judged.sharpened),
         *assessment_alarms("paper", judged.paper),
         *(scorer_alarm(scorer) for scorer in judged.classifiers),
-        *threshold_alarms(loop.state_names, loop.feature_names, loop.watched_features),
+        *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]
     study = evaluate_alarms(alarms, calibration, test)
     return Findings(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
@@ -80,19 +80,27 @@ def check_options(loop: ClosedLoop, options: PlanOptions, num_training: int) -> 
     """
     from drake_safety.evaluation.learning_curve import check_sizes
     from drake_safety.evaluation.reachable_region import plane_of
+    from drake_safety.simulation.capabilities import HasGoals, require
 
-    if loop.target_box is None:
+    if not isinstance(loop, HasGoals):
         if options != PlanOptions():
-            raise ValueError(
-                f"evaluate: plans of {loop.scenario.task} have no goal: leave out --other-hand, "
-                "--learning-curve, --plane-x and --plane-step"
+            require(
+                loop,
+                HasGoals,
+                "evaluate: leave out --other-hand, --learning-curve, --plane-x and --plane-step",
             )
         return
-    if options.other_hand and not loop.mirror_options:
+    if options.other_hand and not _mirror_options(loop):
         raise ValueError(f"evaluate: {loop.scenario.task} has no other hand: pass --other-hand 0")
     check_sizes(num_training, options.learning_curve)
     if options.plane_step:
         plane_of(loop, options.plane_x, options.plane_step)
+
+
+def _mirror_options(loop: ClosedLoop) -> dict[str, Any]:
+    from drake_safety.simulation.capabilities import HasMirrorImage
+
+    return loop.mirror_options if isinstance(loop, HasMirrorImage) else {}
 
 
 def evaluate_plans(
@@ -109,10 +117,11 @@ def evaluate_plans(
     from drake_safety.evaluation.learning_curve import learning_curve
     from drake_safety.evaluation.plan_study import evaluate_plans, plans_of
     from drake_safety.evaluation.reachable_region import reachable_region
+    from drake_safety.simulation.capabilities import judging_options
 
     scenario, sharpened = judged.scenario, judged.sharpened
     loop = scenario.make_loop()
-    mirror = loop.mirror_options
+    mirror = _mirror_options(loop)
     test = plans_of(loop, judged.test_set)
     calibration = plans_of(loop, judged.calibration_set)
     sets = {"plans": test}
@@ -123,7 +132,7 @@ def evaluate_plans(
         # The same draws: what this hand is asked for is the mirror image of what that one was.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
         sets["plans.other_hand"] = plans_of(
-            scenario.make_loop(**loop.judging_options, **mirror), episodes
+            scenario.make_loop(**judging_options(type(loop)), **mirror), episodes
         )
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     twins = [key for key in sets if key != "plans"]

@@ -37,6 +37,7 @@ def play(
     from pydrake.geometry import Meshcat, MeshcatParams
 
     from drake_safety.live.session import LiveGoals, LiveThrows
+    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -45,8 +46,10 @@ def play(
     given = {"hand": hand, "recovery": recovery}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     # What a task offers is asked of its diagram, before a browser is opened for it.
-    has_goals = loaded.make_loop(variation, assessment=gamma, **options).target_box is not None
+    asked = loaded.make_loop(variation, assessment=gamma, **options)
+    has_goals = isinstance(asked, HasGoals)
     if not has_goals:
+        require(asked, HasBall, "play")
         options["ball"] = True
     print_shipped(folder)
     meshcat = Meshcat(MeshcatParams() if port is None else MeshcatParams(port=port))

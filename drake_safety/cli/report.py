@@ -103,6 +103,7 @@ def _angular_constraints(run: Run) -> tuple[str, ...]:
     """Constraints whose margins are angles; none where the task cannot be asked any more."""
     import yaml
 
+    from drake_safety.simulation.capabilities import angular_constraints
     from drake_safety.simulation.scenario import parse_scenario
 
     if not run.scenario:
@@ -111,6 +112,6 @@ def _angular_constraints(run: Run) -> tuple[str, ...]:
         scenario = parse_scenario(
             yaml.safe_dump(run.scenario), name=run.scenario_name, folder=run.folder
         )
-        return tuple(scenario.make_loop().angular_constraints)
+        return angular_constraints(scenario.make_loop())
     except (ValueError, OSError, RuntimeError):
         return ()

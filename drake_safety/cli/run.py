@@ -95,6 +95,7 @@ def run(
 
     A target that Γ refuses is not gone to, and the exit code is 1; --force goes there.
     """
+    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
 
     given = {"hand": hand, "recovery": recovery}
@@ -122,11 +123,12 @@ def run(
         raise ValueError(f"run: --force goes to a target that Γ refuses: pass {TARGET} too")
     # What a task offers is asked of its diagram, before a browser is opened for it.
     loop = settings.make_loop()
-    if loop.target_box is not None:
+    if isinstance(loop, HasGoals):
         raise ValueError(
             f"run: task '{type(loop).__name__}' goes to a target: pass {TARGET} X Y Z, or one of "
             f"the names {list(loop.named_targets)}"
         )
+    require(loop, HasBall, "run")
     _run_with_balls(settings)
 
 

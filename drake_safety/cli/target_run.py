@@ -109,17 +109,20 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
     Raises:
         ValueError: No such push, or more than one.
     """
+    from drake_safety.simulation.capabilities import CanBePushed, require
+
     if not names:
         return None
     if len(names) > 1:
         raise ValueError(f"--push: a motion to a target takes one push; got {names}")
     (name,) = names
-    if name not in loop.pushes:
+    pushes = require(loop, CanBePushed, "--push").pushes
+    if name not in pushes:
         raise ValueError(
             f"--push '{name}': scenario '{loop.scenario.name}' has no such push for a motion to a "
-            f"target; it has {list(loop.pushes)}"
+            f"target; it has {list(pushes)}"
         )
-    return loop.pushes[name]
+    return pushes[name]
 
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
@@ -138,6 +141,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     """
     from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
     from drake_safety.evaluation.timeline_figure import timeline_figure
+    from drake_safety.simulation.capabilities import angular_constraints
 
     positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
     events = [motion.leave_time_s] if motion.has_left else []
@@ -160,7 +164,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
         belief=motion.extra["belief"],
         margins=motion.margins,
         constraint_names=loop.constraint_names,
-        angular_constraints=loop.angular_constraints,
+        angular_constraints=angular_constraints(loop),
     )
 
 

@@ -72,17 +72,17 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     Raises:
         ValueError: The task's plans have no goal, no such name, or not three numbers.
     """
-    from drake_safety.planning.goal_verdict import target_box
+    from drake_safety.simulation.capabilities import HasGoals, require
 
-    target_box(loop)
-    if text in loop.named_targets:
-        return np.array(loop.named_targets[text], dtype=float)
+    named_targets = require(loop, HasGoals, TARGET).named_targets
+    if text in named_targets:
+        return np.array(named_targets[text], dtype=float)
     words = text.split()
     if len(words) == 3 and all(map(_is_number, words)):
         return np.array([float(word) for word in words])
     raise ValueError(
         f"{TARGET} '{text}': give X Y Z, three numbers [m], or one of the names that scenario "
-        f"'{loop.scenario.name}' gives: {list(loop.named_targets)}"
+        f"'{loop.scenario.name}' gives: {list(named_targets)}"
     )
 
 
@@ -133,10 +133,12 @@ def print_verdict(
 
 
 def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None) -> dict[str, str]:
+    from drake_safety.simulation.capabilities import angular_constraints
+
     lines = {}
     if np.isfinite(verdict.cause_margin):
         lines["likely cause"] = margin_words(
-            verdict.cause, verdict.cause_margin, loop.angular_constraints
+            verdict.cause, verdict.cause_margin, angular_constraints(loop)
         )
     elif verdict.cause:
         share = verdict.cause_probability.max() / verdict.cause_probability.sum()

@@ -21,7 +21,7 @@ from drake_safety.evaluation.stills import StillCamera
 if TYPE_CHECKING:
     from PIL import Image
 
-    from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.legged_loop import LeggedLoop
 
 _WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 5.6, 3.5, 1.1  # [inches]
 _DOTS_PER_INCH = 100
@@ -30,7 +30,7 @@ _COLOURS, _PALETTE_FRAMES = 255, 8
 
 
 def save_animation(
-    loop: ClosedLoop,
+    loop: LeggedLoop,
     time_s: np.ndarray,
     positions: np.ndarray,
     gamma: np.ndarray,

@@ -18,6 +18,7 @@ from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
+from drake_safety.simulation.capabilities import HasBall, judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
@@ -74,7 +75,8 @@ def compare_scenario(
     Raises:
         ValueError: The folder holds another scenario's episodes.
     """
-    recovery = getattr(scenario.parameters, "recovery", None)
+    has_ball = isinstance(scenario.make_loop(), HasBall)
+    recovery = scenario.parameters.recovery if has_ball else None
     made_by = {
         "scenario": scenario.to_yaml(),
         "simulation_hash": scenario.simulation_hash(),
@@ -89,7 +91,7 @@ def compare_scenario(
     run = partial(run_episodes, scenario, num_workers=num_workers)
     seed, robot = effort.seed, scenario.robot
     seeds = EVALUATION.seeds(EVALUATION.first + seed)
-    judging = dict(scenario.task_class().judging_options)
+    judging = judging_options(scenario.task_class())
     training = run(
         effort.num_episodes,
         seed=seed,

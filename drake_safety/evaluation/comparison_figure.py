@@ -11,6 +11,7 @@ import numpy as np
 from drake_safety.evaluation.comparison import row_figure
 from drake_safety.evaluation.figure_style import drawing_style, new_figure
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.legged_loop import LeggedLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
@@ -27,7 +28,7 @@ def standing_still(loop: ClosedLoop) -> np.ndarray | None:
     """
     from drake_safety.evaluation.stills import StillCamera
 
-    if not hasattr(loop, "plant") or type(loop).standing_start is ClosedLoop.standing_start:
+    if not isinstance(loop, LeggedLoop):
         return None
     context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())

@@ -9,7 +9,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Figure, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, split
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.rollouts import (
     Progress,
     batches,
@@ -97,12 +97,12 @@ def simulate_truth(
         ValueError: The task has no such plane.
     """
     loop = scenario.make_loop()
-    if plane not in loop.state_planes:
+    planes = require(loop, HasStatePlanes).state_planes
+    if plane not in planes:
         raise ValueError(
-            f"task '{type(loop).__name__}' has no state plane '{plane}'; it has "
-            f"{list(loop.state_planes)}"
+            f"task '{type(loop).__name__}' has no state plane '{plane}'; it has {list(planes)}"
         )
-    points = loop.state_planes[plane].points(resolution)
+    points = planes[plane].points(resolution)
     flat = points.reshape(-1, 2)
     parts = batches(list(range(len(flat))))
     rows: dict[int, tuple] = {}
@@ -117,7 +117,7 @@ def simulate_truth(
     is_safe, state, preview, features = (np.array(column).reshape(*shape, -1) for column in columns)
     return KnownTruth(
         plane=plane,
-        axes=loop.state_planes[plane].axes,
+        axes=planes[plane].axes,
         points=points,
         is_safe=is_safe[..., 0],
         state=state,
@@ -129,8 +129,8 @@ def simulate_truth(
 def _outcomes(
     scenario: Scenario, plane: str, indices: list[int], points: np.ndarray
 ) -> dict[int, tuple]:
-    loop: ClosedLoop = worker_loop(scenario, "nominal", {})
-    start = loop.state_planes[plane].start
+    loop = worker_loop(scenario, "nominal", {})
+    start = require(loop, HasStatePlanes).state_planes[plane].start
     found = {}
     for index, point in zip(indices, points, strict=True):
         episode = run_episode(loop, index, start=start(point))

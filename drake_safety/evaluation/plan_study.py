@@ -21,6 +21,7 @@ from drake_safety.learning.calibration import (
 )
 from drake_safety.learning.causes import likely_causes
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
+from drake_safety.simulation.capabilities import HasGoals, is_fair, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 SAFE_RECALL = 0.952
@@ -95,14 +96,15 @@ def plans_of(loop: ClosedLoop, episodes: Episodes) -> Plans:
     # A segment that starts where the episode does, however early the episode ends.
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     first = segments.take(segments.is_first)
-    is_fair = np.array([loop.is_fair(episode) for episode in episodes])
+    with_goals = require(loop, HasGoals)
+    fair = np.array([is_fair(with_goals, episode) for episode in episodes])
     return Plans(
         first=first,
-        goals=np.array([loop.goal_of(episodes[i]) for i in first.episode]),
-        is_fair=is_fair[first.episode],
-        hand=loop.hand,
+        goals=np.array([with_goals.goal_of(episodes[i]) for i in first.episode]),
+        is_fair=fair[first.episode],
+        hand=with_goals.hand,
         outcomes=np.array([SAFE if e.is_safe else e.cause for e in episodes]),
-        is_outcome_fair=is_fair,
+        is_outcome_fair=fair,
         num_failures=np.array([episode.num_controller_failures for episode in episodes]),
         constraint_names=list(episodes.info.constraint_names),
     )

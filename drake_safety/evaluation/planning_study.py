@@ -15,6 +15,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
+from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import (
@@ -107,7 +108,7 @@ def run_trials(
         ValueError: The task's plans cannot be chosen, there is but one, hardly any start is
             undisturbed, or the folder holds other motions.
     """
-    options = _judging_options(scenario)
+    options = judging_options(scenario.task_class())
     loop = scenario.make_loop(**options)
     context = loop.CreateDefaultContext()
     indices: list[int] = []
@@ -124,7 +125,7 @@ def run_trials(
     if len(_candidates(loop, context, seed, indices[-1], num_plans)) < 2:
         raise ValueError(
             f"planning: scenario '{scenario.name}' has one plan from a start, and none to choose; "
-            f"{loop.plan_variety}"
+            f"{require(loop, OffersPlans).plan_variety}"
         )
     # What Γ sees of each start and candidate, and what came of it.
     found: dict[tuple[int, int], _Motion] = {}
@@ -206,7 +207,9 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
     """The plans of a start; its Context is reset to it."""
     loop.reset(context, episode_rng(seed, index))
     sequence = np.random.SeedSequence(seed, spawn_key=(index, _CANDIDATES))
-    return loop.candidate_plans(context, np.random.default_rng(sequence), num_plans)
+    return require(loop, OffersPlans).candidate_plans(
+        context, np.random.default_rng(sequence), num_plans
+    )
 
 
 def _motion_batch(

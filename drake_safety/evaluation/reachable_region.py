@@ -14,7 +14,9 @@ from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.planning.goal_verdict import goal_inputs
+from drake_safety.simulation.capabilities import HasGoals, fair_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
@@ -120,7 +122,9 @@ def reachable_region(
     outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
 
     targets = _targets(x_m, *fine)
-    reachability = None if loop.hand is None else Reachability(loop.robot, loop.hand)
+    reachability = None
+    if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
+        reachability = Reachability(loop.robot, loop.hand)
     scorer = assessment_scorer("sharpened", assessment, "calibrated")
     probability, reachable = [], []
     for start in range(0, len(targets), _REPORT_EVERY):
@@ -165,9 +169,8 @@ def plane_of(loop: ClosedLoop, x_m: float | None, step_m: float) -> tuple[float,
     Raises:
         ValueError: As :func:`reachable_region`.
     """
-    box, fair = loop.target_box, loop.fair_box
-    if box is None or fair is None:
-        raise ValueError(f"reachable region: plans of {loop.scenario.task} have no goal")
+    with_goals = require(loop, HasGoals, "reachable region")
+    box, fair = with_goals.target_box, fair_box(with_goals)
     x_m = float(fair[:, 0].mean()) if x_m is None else x_m
     if not box[0, 0] <= x_m <= box[1, 0]:
         raise ValueError(
@@ -191,10 +194,9 @@ def _targets(x_m: float, y_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
 
 def _obstacle_distance(loop: ClosedLoop, context: Context, points: np.ndarray) -> np.ndarray | None:
     """Signed distance of points (N, 3) to what is not the robot, at most `_SEEN_M`, (N,) [m]."""
-    scene_graph = getattr(loop, "scene_graph", None)
-    if scene_graph is None:
+    if not isinstance(loop, LeggedLoop):
         return None
-    plant, robot = loop.plant, loop.robot_instance
+    plant, robot, scene_graph = loop.plant, loop.robot_instance, loop.scene_graph
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
     inspector = query.inspector()
     distance = np.full(len(points), _SEEN_M)

@@ -30,8 +30,7 @@ from pydrake.systems.sensors import CameraInfo
 from drake_safety.models import load_robot
 
 if TYPE_CHECKING:
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.view import View
+    from drake_safety.simulation.legged_loop import LeggedLoop, View
 
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
@@ -60,7 +59,7 @@ class StillCamera:
 
     def __init__(
         self,
-        loop: ClosedLoop,
+        loop: LeggedLoop,
         positions: np.ndarray,
         *,
         width: int = 720,
@@ -174,7 +173,7 @@ class StillCamera:
         return centre, float(np.linalg.norm(points - centre[:, None], axis=0).max())
 
 
-def stack_positions(loop: ClosedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
+def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
     """All of a plant's positions from the logged states of its model instances.
 
     Args:
@@ -249,7 +248,7 @@ def spread_times(time_s: np.ndarray, events_s: Iterable[float], *, num_stills: i
 
 
 def render_stills(
-    loop: ClosedLoop,
+    loop: LeggedLoop,
     time_s: np.ndarray,
     positions: np.ndarray,
     still_times_s: Sequence[float],
@@ -289,7 +288,7 @@ def render_stills(
     return [(float(time_s[row]), camera.render(positions[row])) for row in rows]
 
 
-def _scene_graph(loop: ClosedLoop) -> SceneGraph:
+def _scene_graph(loop: LeggedLoop) -> SceneGraph:
     for system in loop.GetSystems():
         if isinstance(system, SceneGraph):
             return system

@@ -19,7 +19,7 @@ from pydrake.common import MemoryFile
 from pydrake.geometry import InMemoryMesh, Mesh, Meshcat, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_safety.simulation.view import View
+from drake_safety.simulation.legged_loop import View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

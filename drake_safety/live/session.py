@@ -23,11 +23,11 @@ from drake_safety.live.panel import (
 from drake_safety.planning.goal_verdict import (
     GoalVerdict,
     assess_goal,
-    target_box,
 )
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
 TICK_S = 0.04
@@ -86,7 +86,7 @@ class LiveSession(ABC):
 
     probability_port = "normalized_safety_probability"
 
-    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         if loop.assessment is None:
             raise ValueError("live session: the loop was built without an assessment")
         self.loop = loop
@@ -222,9 +222,10 @@ class LiveThrows(LiveSession):
     THROW, STAND = "Throw", "Stand up again"
     MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
 
-    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
-        self.probability_port = loop.trigger_port
+        self._thrown = require(loop, HasBall)
+        self.probability_port = self._thrown.trigger_port
         self._has_recovery = loop.HasOutputPort("recovery_active")
         self._unit = self.assessment.parameters.margin_unit
         self._note, self._note_until_s = "", 0.0
@@ -250,7 +251,7 @@ class LiveThrows(LiveSession):
 
     def _stand(self) -> None:
         self._lies_until_s, self._note_until_s = math.inf, 0.0
-        self.loop.reset_calm(self.context, self._next_rng())
+        self._thrown.reset_calm(self.context, self._next_rng())
         self._begin()
 
     def _throw(self) -> None:
@@ -259,7 +260,7 @@ class LiveThrows(LiveSession):
         )
         throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
         try:
-            self.loop.throw_ball(self.context, throw, _FLIGHT_S)
+            self._thrown.throw_ball(self.context, throw, _FLIGHT_S)
             self._note = f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°"
         except ValueError:  # The robot lies, or stands so that the line leads past it.
             self._note = "this ball would miss the robot"
@@ -300,7 +301,7 @@ class LiveGoals(LiveSession):
 
     def __init__(
         self,
-        loop: ClosedLoop,
+        loop: LeggedLoop,
         meshcat: Meshcat,
         *,
         threshold: float,
@@ -312,8 +313,9 @@ class LiveGoals(LiveSession):
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
         self._end_s = -math.inf
-        box = target_box(loop)
-        start = next(iter(loop.named_targets.values()), box.mean(axis=0))
+        self._goals = require(loop, HasGoals)
+        box = self._goals.target_box
+        start = next(iter(self._goals.named_targets.values()), box.mean(axis=0))
         for name, key in (
             (self.ASK, "KeyA"),
             (self.GO, "Space"),
@@ -372,13 +374,13 @@ class LiveGoals(LiveSession):
         return verdict
 
     def _go(self, goal: np.ndarray) -> None:
-        self.loop.reset_standing(self.context, goal, self._next_rng())
+        self._goals.reset_standing(self.context, goal, self._next_rng())
         self._begin()
         self._end_s = self.loop.scenario.episode_duration_s + 1.0
 
     def _stand(self) -> None:
         # The posture alone is shown; no motion begins.
-        self.loop.reset_standing(self.context, target_box(self.loop).mean(axis=0))
+        self._goals.reset_standing(self.context, self._goals.target_box.mean(axis=0))
         self._begin()
         self._end_s = -math.inf
         self._goal = np.full(3, np.nan)
@@ -392,7 +394,7 @@ class LiveGoals(LiveSession):
         first = f"refused: Γ {verdict.safety_probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
-        is_angle = verdict.cause in self.loop.angular_constraints
+        is_angle = verdict.cause in angular_constraints(self.loop)
         cause = verdict.cause + _margin_words(verdict.cause_margin, is_angle)
         second = f"expected: {cause}" if cause else verdict.reason
         if is_thorough:
@@ -419,7 +421,7 @@ class LiveGoals(LiveSession):
             if self.context.get_time() >= self._end_s - 1e-9:
                 self.panel.say("there", f"{100 * miss_m:.1f} cm off", rgb=RECOVERY_RGB)
             else:
-                self.panel.say("on the way", f"the {self.loop.hand} hand reaches", rgb=SAFE_RGB)
+                self.panel.say("on the way", f"the {self._goals.hand} hand reaches", rgb=SAFE_RGB)
 
 
 def _margin_words(margin: float, is_angle: bool) -> str:

@@ -15,9 +15,11 @@ from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
-from drake_safety.simulation.closed_loop import RECORDED_PORTS, ClosedLoop
+from drake_safety.simulation.capabilities import monitor_period_s
+from drake_safety.simulation.closed_loop import RECORDED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import Scenario
 
@@ -26,7 +28,7 @@ _ROUNDING_S = 1e-9
 
 def episodes_from_log(
     log: RobotLog | Sequence[RobotLog],
-    loop: ClosedLoop | Scenario,
+    loop: LeggedLoop | Scenario,
     *,
     desired_output: np.ndarray | None = None,
 ) -> Episodes:
@@ -36,7 +38,7 @@ def episodes_from_log(
 
 def cut_log(
     log: RobotLog | Sequence[RobotLog],
-    loop: ClosedLoop | Scenario,
+    loop: LeggedLoop | Scenario,
     *,
     desired_output: np.ndarray | None = None,
 ) -> tuple[Episodes, list[EpisodeStart]]:
@@ -76,7 +78,7 @@ def cut_log(
 
 
 def _cut(
-    log: RobotLog, loop: ClosedLoop, desired: np.ndarray
+    log: RobotLog, loop: LeggedLoop, desired: np.ndarray
 ) -> list[tuple[Episode, EpisodeStart]]:
     """The episodes of one log and their beginnings; z* in the world is ``desired``, (N, n_z)."""
     scenario = loop.scenario
@@ -107,7 +109,7 @@ def _cut(
 
 
 def _desired_output(
-    log: RobotLog, loop: ClosedLoop, desired_output: np.ndarray | None
+    log: RobotLog, loop: LeggedLoop, desired_output: np.ndarray | None
 ) -> np.ndarray:
     who = f"log '{log.path}'"
     if log.robot != loop.robot.name:
@@ -131,7 +133,7 @@ def _desired_output(
     return np.tile(value, (len(log.time_s), 1))
 
 
-def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
+def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
     """The logged state at a time, and the logged z* from then on as a plan."""
     kinematics = loop.kinematics
     begin = np.array([begin_s])
@@ -158,10 +160,10 @@ def _start(log: RobotLog, loop: ClosedLoop, desired: np.ndarray, begin_s: float)
     return start
 
 
-def _episode(log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float) -> Episode:
+def _episode(log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float) -> Episode:
     scenario = loop.scenario
     length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
-    period_s = loop.monitor_period_s
+    period_s = monitor_period_s(loop)
     ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
     margins = _margins(log, loop, context, begin_s, ticks)
     is_out = (margins < 0).any(axis=1)
@@ -181,7 +183,7 @@ def _episode(log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float) 
 
 
 def _margins(
-    log: RobotLog, loop: ClosedLoop, context: Context, begin_s: float, ticks: np.ndarray
+    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, ticks: np.ndarray
 ) -> np.ndarray:
     """Margins at the monitor's ticks up to the first violation, (n, n_c) [m or rad]."""
     port = loop.GetOutputPort("margins")
@@ -194,7 +196,7 @@ def _margins(
     return np.array(rows)
 
 
-def _set_state(loop: ClosedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
+def _set_state(loop: LeggedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
     context.SetTime(float(time_s))
     plant_context = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)

@@ -13,6 +13,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import NO_CAUSE, likely_causes
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -196,8 +197,9 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
     context = loop.CreateDefaultContext()
     ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
     rows = []
+    with_goals = require(loop, HasGoals)
     for goal in goals:
-        loop.reset_standing(context, goal)
+        with_goals.reset_standing(context, goal)
         rows.append([port.Eval(context).copy() for port in ports])
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
@@ -208,10 +210,7 @@ def target_box(loop: ClosedLoop) -> np.ndarray:
     Raises:
         ValueError: The task's plans have no goal.
     """
-    box = loop.target_box
-    if box is None:
-        raise ValueError(f"task '{type(loop).__name__}' has plans without a goal: no target to ask")
-    return box
+    return require(loop, HasGoals).target_box
 
 
 def checked_goal(goal: np.ndarray) -> np.ndarray:

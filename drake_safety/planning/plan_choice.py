@@ -10,6 +10,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.capabilities import OffersPlans, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 _INPUTS = ("state", "desired_preview", "features")
@@ -48,14 +49,15 @@ def plan_inputs(
     Returns:
         State (M, n_s), desired preview (M, H n_z) and features (M, n_f).
     """
+    offering = require(loop, OffersPlans)
     ports = [loop.GetOutputPort(name) for name in _INPUTS]
     rows = []
     try:
         for plan in plans:
-            loop.set_plan(context, plan)
+            offering.set_plan(context, plan)
             rows.append([port.Eval(context).copy() for port in ports])
     finally:
-        loop.set_plan(context, plans[0])
+        offering.set_plan(context, plans[0])
     state, preview, features = (np.array(column) for column in zip(*rows, strict=True))
     return state, preview, features
 
@@ -83,9 +85,10 @@ def choose_plan(
     Raises:
         ValueError: The task's plans cannot be chosen.
     """
-    plans = loop.candidate_plans(context, rng, num_plans)
+    offering = require(loop, OffersPlans)
+    plans = offering.candidate_plans(context, rng, num_plans)
     state, preview, features = plan_inputs(loop, context, plans)
     said = assessment.predict(state, preview, features if assessment.uses_features else None)
     best = int(np.argmax(said.calibrated))  # Of equally good ones the first: no needless change.
-    loop.set_plan(context, plans[best])
+    offering.set_plan(context, plans[best])
     return PlanChoice(index=best, safety_probability=said.calibrated, threshold=threshold)

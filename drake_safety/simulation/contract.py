@@ -3,33 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.systems.framework import Context
 
-from drake_safety.learning.segments import RECORDED
-
-if TYPE_CHECKING:
-    from pydrake.systems.framework import Context
-
-    from drake_safety.simulation.closed_loop import ClosedLoop
-
-RECORDED_PORTS = RECORDED
-"""Output ports that an episode records, row by row."""
-REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
-"""Output ports that every task exports."""
-ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-"""Output ports that a task exports besides when it has an assessment."""
+from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop, check_ports
 
 _NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
-_SIZED_BY = {
-    "state": "state_names",
-    "true_state": "state_names",
-    "output": "output_names",
-    "desired_output": "output_names",
-    "features": "feature_names",
-    "margins": "constraint_names",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,64 +42,28 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     Returns:
         A finding for each part; later parts are left out while an earlier one fails.
     """
-    findings = [_names(diagram), *check_ports(diagram)]
+    findings = [_names(diagram), _ports(diagram)]
     if not all(finding.is_ok for finding in findings):
         return findings
     return [*findings, *_values(diagram, seed)]
 
 
-def check_ports(diagram: ClosedLoop) -> list[Finding]:
-    """The part of :func:`check_contract` that needs no start: ports and their sizes.
-
-    Args:
-        diagram: The closed loop, built.
-    """
-    who = f"task '{type(diagram).__name__}'"
-    ports = {
-        port.get_name(): port.size()
-        for port in (diagram.get_output_port(i) for i in range(diagram.num_output_ports()))
-    }
-    required = REQUIRED_PORTS + (ASSESSMENT_PORTS if diagram.assessment else ())
-    missing = [name for name in required if name not in ports]
-    if missing:
-        return [
-            Finding(
-                item="ports",
-                is_ok=False,
-                message=f"{who} exports no port {missing}; it exports {list(ports)}",
-                remedy="call builder.ExportOutput(port, NAME) for each before finish(builder)",
-            )
-        ]
-    wrong = []
-    for name, size in _promised_sizes(diagram).items():
-        if ports[name] != size:
-            wrong.append(f"'{name}' has {ports[name]} and not {size}")
-    return [
-        Finding(item="ports", is_ok=True, message=f"all {len(required)} are there"),
-        Finding(
-            item="sizes of ports",
-            is_ok=not wrong,
-            message=f"{who} promises other sizes by its names: {'; '.join(wrong)}"
-            if wrong
-            else "as the names promise",
-            remedy="one name an entry; the preview is H·n_z, row-major in time" if wrong else "",
-        ),
-    ]
-
-
-def _promised_sizes(diagram: ClosedLoop) -> dict[str, int]:
-    sizes = {"safe": 1}
-    for port, attribute in _SIZED_BY.items():
-        names = getattr(diagram, attribute, None)
-        if names is not None:
-            sizes[port] = len(names)
-    if "output" in sizes:
-        sizes["desired_preview"] = sizes["output"] * diagram.scenario.assessment.horizon
-    return sizes
+def _ports(diagram: ClosedLoop) -> Finding:
+    try:
+        check_ports(diagram)
+    except ValueError as error:
+        return Finding(
+            item="ports",
+            is_ok=False,
+            message=str(error),
+            remedy="call builder.ExportOutput(port, NAME) for each before finish(builder); one "
+            "name an entry; the preview is H·n_z, row-major in time",
+        )
+    return Finding(item="ports", is_ok=True, message="all are there, as large as the names promise")
 
 
 def _names(diagram: ClosedLoop) -> Finding:
-    missing = [name for name in _NAMES if getattr(diagram, name, None) is None]
+    missing = [name for name in _NAMES if name not in vars(diagram)]
     return Finding(
         item="names",
         is_ok=not missing,

@@ -1,7 +1,8 @@
-"""EpisodeStart: where and how an episode begins, for one that is to begin as another one did."""
+"""Where and how an episode begins: as another one did, or somewhere on a plane of starts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +50,24 @@ class EpisodeStart:
         """
         return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
 
-    def check(self, kinematics: RobotKinematics) -> None:
+    def check(self, who: str, num_positions: int, num_velocities: int) -> None:
         """Refuses what no plant can begin with.
+
+        Args:
+            who: Whose start it is, for messages.
+            num_positions: n_q.
+            num_velocities: n_v.
+
+        Raises:
+            ValueError: The state has another size, or is not finite.
+        """
+        for name, size in {"q": num_positions, "v": num_velocities}.items():
+            value = getattr(self, name)
+            if np.shape(value) != (size,) or not np.isfinite(value).all():
+                raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
+
+    def check_robot(self, kinematics: RobotKinematics) -> None:
+        """Refuses what no robot can begin with.
 
         Args:
             kinematics: The robot.
@@ -60,11 +77,7 @@ class EpisodeStart:
                 is none.
         """
         who = f"start of robot '{kinematics.robot.name}'"
-        sizes = {"q": kinematics.num_positions, "v": kinematics.num_velocities}
-        for name, size in sizes.items():
-            value = getattr(self, name)
-            if np.shape(value) != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
+        self.check(who, kinematics.num_positions, kinematics.num_velocities)
         norm = float(np.linalg.norm(self.q[:4]))
         if not abs(norm - 1.0) < 1e-3:
             raise ValueError(f"{who}: the quaternion must have a norm of 1; got {norm}")
@@ -75,3 +88,37 @@ class EpisodeStart:
             raise ValueError(
                 f"{who}: foot_positions must be {kinematics.num_contacts} finite points; got {feet}"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatePlane:
+    """Two state variables, all else fixed, on whose plane the truth can be simulated.
+
+    Attributes:
+        axes: What the two variables are, with their units.
+        lowest: Of both.
+        highest: Of both.
+        start: From a point (2,) of the plane to a start.
+    """
+
+    axes: tuple[str, str]
+    lowest: tuple[float, float]
+    highest: tuple[float, float]
+    start: Callable[[np.ndarray], EpisodeStart]
+
+    def points(self, resolution: int) -> np.ndarray:
+        """A grid with its border, (resolution, resolution, 2); the first variable varies first.
+
+        Args:
+            resolution: Points along either variable.
+
+        Raises:
+            ValueError: There are fewer than two of them.
+        """
+        if resolution < 2:
+            raise ValueError(f"state plane: resolution must be at least 2; got {resolution}")
+        x, y = (
+            np.linspace(low, high, resolution)
+            for low, high in zip(self.lowest, self.highest, strict=True)
+        )
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)

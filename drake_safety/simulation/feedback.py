@@ -14,8 +14,10 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.simulation.capabilities import pairing_options
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
     batches,
@@ -82,7 +84,7 @@ def run_pairs(
             those that it already holds are not simulated again.
         progress: Called with the number of episodes done and the number wanted, two a pair.
         extra: Stored beside the episodes' info.
-        **loop_options: For the task, over what its ``pairing_options`` say of the variation.
+        **loop_options: For the task, over those with which the variation and its twin begin alike.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
@@ -93,7 +95,7 @@ def run_pairs(
             return None
         return lambda done, total: progress(offset + done, 2 * num_pairs)
 
-    loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
+    loop_options = pairing_options(scenario, variation) | loop_options
     sets = {}
     for offset, name in enumerate((variation, _TWINS)):
         sets[name] = run_episodes(
@@ -131,7 +133,7 @@ def make_recorder(
     )
 
 
-def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
+def window_start(loop: LeggedLoop, window: RecordedWindow) -> EpisodeStart:
     """What the nominal twin of a recorded window begins with.
 
     Its plan goes through the desired outputs that the actual robot was given, and holds still after
@@ -146,7 +148,7 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     # The first sample of every preview is of its own row; the last preview looks further ahead.
     plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
     times = loop.scenario.step_s * np.arange(len(plan))
-    q, v = np.split(window.plant_state, [loop.plant.num_positions(loop.robot_instance)])
+    q, v = np.split(window.plant_state, [loop.kinematics.num_positions])
     return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
 
 

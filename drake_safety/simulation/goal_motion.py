@@ -9,12 +9,35 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.plants.pushes import Push
+from drake_safety.simulation.capabilities import CanBePushed, CanFall, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
-from drake_safety.simulation.mishap import Mishap
 from drake_safety.simulation.rollouts import episode_rng
 
 _PORTS = ("output", "margins", "plant_state")
+
+
+@dataclass(kw_only=True, eq=False)
+class Mishap:
+    """What every log of one motion tells of its end.
+
+    Attributes:
+        leave_time_s: When the robot left its safe set [s]; infinite if it did not.
+        fall_time_s: When it fell [s]; infinite if it did not.
+    """
+
+    leave_time_s: float
+    fall_time_s: float
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the robot left its safe set."""
+        return math.isfinite(self.leave_time_s)
+
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot fell."""
+        return math.isfinite(self.fall_time_s)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -73,18 +96,19 @@ def run_to_goal(
         until_unsafe: Whether it ends where it leaves the safe set, not only at a fall.
 
     Raises:
-        ValueError: The task's plans have no goal, or the robot has no such body to push.
+        ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
     """
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
-    loop.reset_standing(context, goal, episode_rng(seed, 0))
+    with_goals = require(loop, HasGoals)
+    with_goals.reset_standing(context, goal, episode_rng(seed, 0))
     if push is not None:
-        loop.set_push(context, push)
+        require(loop, CanBePushed).set_push(context, push)
     simulator.Initialize()
     recorder = Recorder(loop, (*_PORTS, *ports))
     margins_port = loop.GetOutputPort("margins")
-    fall_column = loop.constraint_names.index(loop.fall_name)
+    fall_column = loop.constraint_names.index(require(loop, CanFall).fall_name)
     leave_s = fall_s = math.inf
     cause = ""
     for row in range(round(duration_s / log_period_s) + 1):

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import Any
 
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    HasGoals,
+    judging_options,
+    require,
+)
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.motion_files import MotionFolder, Pair
@@ -40,10 +45,8 @@ def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> Pair:
         ValueError: The task has no goals or pushes, or hardly any goal is safe.
     """
     rng = episode_rng(seed, index)
-    push = loop.sample_push(rng)
-    box = loop.target_box
-    if box is None:
-        raise ValueError(f"task '{type(loop).__name__}' has plans without a goal")
+    push = require(loop, CanBePushed).sample_push(rng)
+    box = require(loop, HasGoals).target_box
     noise_seed = int(rng.integers(2**31))
     duration_s = loop.scenario.episode_duration_s
     for _ in range(_MAX_TRIES):
@@ -94,7 +97,7 @@ def run_pushed_motions(
     pairs: dict[int, Pair] = {}
     folder = None
     if path is not None:
-        options = _judging_options(scenario)
+        options = judging_options(scenario.task_class())
         loop = scenario.make_loop(variation, **options)
         folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
         pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
@@ -119,10 +122,6 @@ def run_pushed_motions(
     return [motion for index in sorted(pairs) for motion in pairs[index]]
 
 
-def _judging_options(scenario: Scenario) -> dict[str, Any]:
-    return dict(scenario.task_class().judging_options)
-
-
 def _motion_batch(scenario: Scenario, variation: str, seed: int, indices: list[int]) -> list[Pair]:
-    loop = worker_loop(scenario, variation, _judging_options(scenario))
+    loop = worker_loop(scenario, variation, judging_options(scenario.task_class()))
     return [run_pushed_motion(loop, index, seed=seed) for index in indices]

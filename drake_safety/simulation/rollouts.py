@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import inspect
 import logging
 import warnings
 from collections.abc import Callable, Generator
@@ -16,6 +15,14 @@ from pydrake.systems.analysis import Simulator
 
 import drake_safety
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
+from drake_safety.simulation.capabilities import (
+    CanStartAnywhere,
+    CountsFailures,
+    HasGoals,
+    OffersPlans,
+    monitor_period_s,
+    require,
+)
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
@@ -112,9 +119,7 @@ def run_episode(
     """
     if start is not None and (goal is not None or is_standing):
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
-    if goal is not None:
-        _check_takes_goal(loop)
-    elif is_standing:
+    if is_standing and goal is None:
         raise ValueError("run_episode: an episode from the standing posture takes a goal")
     scenario = loop.scenario
     simulator = Simulator(loop)
@@ -122,29 +127,30 @@ def run_episode(
     rng = episode_rng(seed, index)
     first_step = 0
     if start is not None:
-        loop.reset_to(context, rng, start)
+        require(loop, CanStartAnywhere).reset_to(context, rng, start)
     elif goal is None:
         first_step = loop.reset(context, rng)
     elif is_standing:
-        loop.reset_standing(context, goal, rng)
+        require(loop, HasGoals).reset_standing(context, goal, rng)
     else:
-        first_step = loop.reset(context, rng, goal)
+        first_step = require(loop, HasGoals).reset(context, rng, goal)
     if plan is not None:
-        loop.set_plan(context, plan)
+        require(loop, OffersPlans).set_plan(context, plan)
     episode = record_episode(
         simulator,
         {name: name for name in REQUIRED_PORTS},
         EpisodeTiming(
             step_s=scenario.step_s,
             num_steps=scenario.num_steps,
-            monitor_period_s=loop.monitor_period_s,
+            monitor_period_s=monitor_period_s(loop),
         ),
         constraint_names=loop.constraint_names,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",
         index=index,
         first_step=first_step,
     )
-    episode.num_controller_failures = loop.num_controller_failures(context)
+    if isinstance(loop, CountsFailures):
+        episode.num_controller_failures = loop.num_controller_failures(context)
     return episode
 
 
@@ -280,13 +286,8 @@ def _call(function: Callable[..., list[Episode]], *arguments: Any) -> list[Episo
     return function(*arguments)
 
 
-def _check_takes_goal(loop: ClosedLoop) -> None:
-    if "goal" not in inspect.signature(loop.reset).parameters:
-        raise ValueError(f"task '{type(loop).__name__}' has plans without a goal; leave it out")
-
-
 def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np.ndarray:
-    _check_takes_goal(loop)
+    require(loop, HasGoals)
     goals = np.asarray(goals, dtype=float)
     if goals.ndim != 2 or len(goals) != num_episodes:
         raise ValueError(

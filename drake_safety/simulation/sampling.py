@@ -15,26 +15,8 @@ from drake_safety.control.kinematics import (
     planar_pose,
 )
 from drake_safety.plants.balls import Throw
+from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
-
-
-@dataclass(kw_only=True, eq=False)
-class Start:
-    """How an episode begins.
-
-    Attributes:
-        X_WB: Pose of the base.
-        joints: Joint positions, (n_j,) [rad].
-        v: Velocities, (n_v,) [rad/s, m/s].
-        p_WC: Contact points, where the feet stand, (n_c, 3) [m].
-        plan: Position of the base over time, in the stance frame of the feet, (3,) [m].
-    """
-
-    X_WB: RigidTransform
-    joints: np.ndarray
-    v: np.ndarray
-    p_WC: np.ndarray
-    plan: PiecewisePolynomial
 
 
 @dataclass(kw_only=True)
@@ -66,7 +48,7 @@ class StartSampling:
         for name, size in (("base_offset_m", 2), ("velocity_std_m_s", 3), ("target_offset_m", 2)):
             _check_size("start", name, getattr(self, name), size)
 
-    def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> Start:
+    def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
         """A start with the base anywhere in the ranges and moving, and the feet at rest."""
         xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * self.foot_offset_m
         p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
@@ -87,7 +69,7 @@ class StartSampling:
             _between(rng, self.target_height_m),
         )
         plan = interpolate(start, goal, _between(rng, self.plan_duration_s))
-        return Start(X_WB=X_WB, joints=joints, v=v, p_WC=p_WC, plan=plan)
+        return _start(kinematics, X_WB, joints, v, p_WC, plan)
 
 
 @dataclass(kw_only=True)
@@ -138,7 +120,7 @@ def calm_start(
     half_widths_m: list[float],
     plan_duration_s: list[float],
     elapsed_s: float = 0.0,
-) -> Start:
+) -> EpisodeStart:
     """A start in a motion near the standing posture, as if it had been tracked well.
 
     Args:
@@ -161,7 +143,7 @@ def calm_start(
     if elapsed_s < duration_s:
         V_WB[3:] = plan.MakeDerivative().value(0.0).ravel()
     v = resting_feet(kinematics, X_WB, joints, V_WB)
-    return Start(X_WB=X_WB, joints=joints, v=v, p_WC=p_WC, plan=plan)
+    return _start(kinematics, X_WB, joints, v, p_WC, plan)
 
 
 def resting_feet(
@@ -182,6 +164,19 @@ def resting_feet(
     J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
     rates, *_ = np.linalg.lstsq(J_joints, -J_base @ V_WB, rcond=1e-6)
     return np.concatenate([V_WB, rates])
+
+
+def _start(
+    kinematics: RobotKinematics,
+    X_WB: RigidTransform,
+    joints: np.ndarray,
+    v: np.ndarray,
+    p_WC: np.ndarray,
+    plan: PiecewisePolynomial,
+) -> EpisodeStart:
+    joints = np.clip(joints, *kinematics.position_limits.T)
+    q = kinematics.positions_at(X_WB, joints)
+    return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)
 
 
 def _check_range(who: str, name: str, bounds: list[float]) -> None:

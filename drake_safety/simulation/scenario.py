@@ -19,6 +19,7 @@ import drake_safety
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
+from drake_safety.simulation.capabilities import CompletesParameters
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 if TYPE_CHECKING:
@@ -305,7 +306,7 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
     task = scenario.task_class()
-    if isinstance(parameters, dict):
+    if isinstance(parameters, dict) and isinstance(task, CompletesParameters):
         parameters = task.complete_parameters(scenario.robot, parameters)
     scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
     return scenario

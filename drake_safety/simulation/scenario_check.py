@@ -15,6 +15,7 @@ from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.contract import Finding, check_contract
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -249,7 +250,7 @@ def _motors(state: _State) -> Iterator[Finding]:
 def _target(state: _State) -> Iterator[Finding]:
     """Whether a ball can hit the base, of a task that throws some."""
     loop, robot = _of(state.loop), _of(state.robot)
-    if not hasattr(loop, "ball"):
+    if not isinstance(state.loop, HasBall):
         return
     plant = loop.plant
     base = plant.GetBodyByName(robot.base, loop.robot_instance)

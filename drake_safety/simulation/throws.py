@@ -18,9 +18,11 @@ from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.plants.balls import Throw
+from drake_safety.simulation.capabilities import CanFall, HasBall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
-from drake_safety.simulation.mishap import Mishap
+from drake_safety.simulation.goal_motion import Mishap
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
     batches,
@@ -95,7 +97,7 @@ class ViolationCounter:
     _POSITION_SLACK_RAD = 0.02
     _PENETRATION_M = 5e-3
 
-    def __init__(self, loop: ClosedLoop):
+    def __init__(self, loop: LeggedLoop):
         if loop.variation.engine != "drake":
             raise ValueError(
                 "throws: contacts and efforts are read from Drake's plant; variation "
@@ -167,6 +169,7 @@ def play_throws(
     Yields:
         The time of each row, from 0 on [s].
     """
+    thrown = require(loop, HasBall)
     waiting = sorted(throws, key=lambda throw: throw.time_s)
     for row in range(round(duration_s / log_period_s) + 1):
         time = row * log_period_s
@@ -174,7 +177,7 @@ def play_throws(
             throw = waiting.pop(0)
             release_s = max(throw.time_s - _FLIGHT_S, 0.0)
             advance_to(simulator, release_s)
-            loop.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
+            thrown.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
         advance_to(simulator, time)
         yield time
 
@@ -212,8 +215,9 @@ def run_throw(
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
-    loop.reset_calm(context, rng)
-    sampled = loop.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
+    thrown = require(loop, HasBall)
+    thrown.reset_calm(context, rng)
+    sampled = thrown.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
     throws = [sampled] if throws is None else throws
     first = throws[0] if throws else sampled
     if duration_s is None:
@@ -227,7 +231,7 @@ def run_throw(
     recorder = Recorder(loop, (*_PORTS, *ports, *(("recovery_active",) if has_recovery else ())))
     violations = ViolationCounter(loop)
     margins_port = loop.GetOutputPort("margins")
-    fall_column = loop.constraint_names.index(loop.fall_name)
+    fall_column = loop.constraint_names.index(require(loop, CanFall).fall_name)
     fall_s = leave_s = math.inf
     triggered_s = math.nan
     for time in play_throws(

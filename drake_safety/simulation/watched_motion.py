@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.simulation.goal_motion import GoalMotion
-from drake_safety.simulation.mishap import Mishap
+from drake_safety.simulation.goal_motion import GoalMotion, Mishap
 from drake_safety.simulation.throws import ThrowLog
 
 SEEN = ("state", "desired_preview", "features")

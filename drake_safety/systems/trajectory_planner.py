@@ -49,6 +49,44 @@ def interpolate(
     return PiecewisePolynomial([segment], [start_time_s, start_time_s + duration_s])
 
 
+def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
+    """Start, goal and detour of a plan, from its first samples.
+
+    The plan is one of :func:`interpolate`.
+
+    Args:
+        preview: Samples from the plan's begin on; they may end before it does, (M, n_z) [m].
+        step_s: Time between them [s].
+        duration_s: Duration of the whole plan [s].
+
+    Returns:
+        One a row, (3, n_z) [m].
+    """
+    seen_s = step_s * np.arange(len(preview))
+    motion = interpolate(np.zeros(1), np.ones(1), duration_s)
+    progress = motion.vector_values(seen_s.tolist()).ravel()
+    shape, *_ = np.linalg.lstsq(_shares(progress), preview, rcond=None)
+    return shape
+
+
+def points_of_plan(shape: np.ndarray, num_points: int) -> np.ndarray:
+    """Points of a plan from its start to its goal, evenly spread over its progress.
+
+    Args:
+        shape: Start, goal and detour, (3, n_z) [m].
+        num_points: M.
+
+    Returns:
+        The points, (M, n_z) [m].
+    """
+    return _shares(np.linspace(0, 1, num_points)) @ shape
+
+
+def _shares(progress: np.ndarray) -> np.ndarray:
+    """Shares of start, goal and detour in a plan's points, (M, 3); see ``interpolate``."""
+    return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
+
+
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) [m] of the stance frame ``[x, y, yaw]``, in the world."""
     x, y, yaw = stance_pose.tolist()

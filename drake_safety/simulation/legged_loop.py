@@ -1,0 +1,243 @@
+"""LeggedLoop: what the tasks of legged robots share, and where their pictures are taken from."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.observation import is_rate
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.models import load_robot, robot_files
+from drake_safety.plants.physics import Physics, Scene, add_physics
+from drake_safety.robots.robot import ObservationNoise
+from drake_safety.simulation.closed_loop import LoopScenario
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.planned_loop import PlannedLoop, WatchedSet
+from drake_safety.systems.safety_assessor import SafetyAssessor
+
+
+@dataclass(kw_only=True)
+class View:
+    """A camera that follows a robot's base over the ground."""
+
+    azimuth_rad: float = math.radians(-42.0)
+    """Where it stands, as an angle from the world's x axis [rad]."""
+    elevation_rad: float = math.radians(15.0)
+    """How far above the robot it stands [rad]."""
+    room: float = 0.95
+    """How much more than the robot's own extent fits into a picture."""
+
+    def __post_init__(self) -> None:
+        if not abs(self.elevation_rad) < 0.5 * math.pi:
+            raise ValueError(
+                f"view: elevation_rad must be within a right angle; got {self.elevation_rad}"
+            )
+        if not self.room > 0:
+            raise ValueError(f"view: room must be positive; got {self.room}")
+
+    def mirrored(self) -> "View":
+        """The view from the other side of the x-z plane."""
+        return View(azimuth_rad=-self.azimuth_rad, elevation_rad=self.elevation_rad, room=self.room)
+
+
+class LeggedSafeSet(WatchedSet, Protocol):
+    """A safe set of a robot that can fall."""
+
+    fall_name: str
+    watched_features: Mapping[str, str]
+    rate_features: list[str]
+
+
+class LeggedLoop(PlannedLoop):
+    """A legged robot that follows a plan and is observed with noise.
+
+    A subclass wires in this order: :meth:`_add_robot`, :meth:`_add_observers`,
+    :meth:`_add_planner`, its controller, :meth:`_watch`, :meth:`_export_robot`, :meth:`finish`. It
+    extends :meth:`_set_state` by what its controller begins with, and says in :meth:`_output_of`
+    what its plans are for.
+
+    Args:
+        scenario: The scenario.
+        variation: Name of the plant variation.
+        assessment: Γ, or None.
+
+    Attributes:
+        robot: The robot.
+        kinematics: The nominal robot's.
+        plant: A MultibodyPlant with the robot in it, to be read, whatever engine simulates it.
+        robot_instance: The robot in the plant.
+        scene_graph: What its geometry is in.
+        fall_name: The constraint whose violation is a fall.
+        watched_features: Features that one would set an alarm on by hand, by what they measure;
+            larger is safer.
+        view: Where pictures are taken from.
+    """
+
+    view: View = View()
+
+    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+        super().__init__(scenario, variation, assessment)
+        self.robot = load_robot(scenario.robot)
+        self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
+
+    @classmethod
+    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+        """The robot's YAML and model file."""
+        return robot_files(scenario.robot)
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States that are velocities, and the features that velocities enter."""
+        return [*filter(is_rate, self.state_names), *self._rate_features]
+
+    def _add_robot(self, builder: DiagramBuilder, scene: Scene, *, servos: bool) -> Physics:
+        """Adds the robot in its scene.
+
+        Args:
+            builder: Of the task's diagram.
+            scene: What else is there.
+            servos: Whether the joints have robot.yaml's position servos; they take torques
+                otherwise.
+        """
+        physics = self._physics = add_physics(
+            builder,
+            self.robot,
+            self.variation,
+            scene,
+            time_step_s=self.scenario.time_step_s,
+            servos=servos,
+        )
+        self.plant, self.robot_instance = physics.plant, physics.instance
+        self.scene_graph = physics.scene_graph
+        return physics
+
+    def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
+        """Adds what the controller, the assessor and a witness without noise see.
+
+        Args:
+            builder: Of the task's diagram.
+            **options: Of every `StateObserver`.
+
+        Returns:
+            The plant's state as the controller measures it.
+        """
+        noise = self.variation.observation_noise
+        self._observers = Observers(
+            builder,
+            self.kinematics,
+            self._physics.state,
+            self.scenario.control_period_s,
+            **options,
+        )
+        self._observer = self._observers.add("observer", noise)
+        self._assessor_observer = self._observers.add(
+            "assessor_observer", combined(noise, self.variation.input_noise)
+        )
+        self._true_observer = self._observers.add("true_observer", ObservationNoise())
+        self.state_names = self._assessor_observer.state_names
+        self.output_names = self._assessor_observer.output_names
+        return self._observer.GetOutputPort("measured_plant_state")
+
+    def _watch(
+        self,
+        builder: DiagramBuilder,
+        safe_set: LeggedSafeSet,
+        *,
+        outlook: OutputPort | None = None,
+    ) -> None:
+        """Adds monitor and features.
+
+        Args:
+            builder: Of the task's diagram.
+            safe_set: The robot's.
+            outlook: The plan that the features look at; the planner's by default.
+        """
+        self.fall_name = safe_set.fall_name
+        self.watched_features = safe_set.watched_features
+        self._rate_features = safe_set.rate_features
+        self._add_safe_set(
+            builder,
+            safe_set,
+            (self.kinematics.num_positions, self.kinematics.num_velocities),
+            plant_state=self._physics.state,
+            seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
+            outlook=outlook,
+        )
+
+    def _export_robot(
+        self,
+        builder: DiagramBuilder,
+        *,
+        assessment_period_s: float,
+        desired_output: OutputPort | None = None,
+        desired_preview: OutputPort | None = None,
+        meshcat: Meshcat | None,
+    ) -> SafetyAssessor | None:
+        """Adds the assessor and the visualiser, if there are any, and exports all ports.
+
+        Args:
+            builder: Of the task's diagram.
+            assessment_period_s: Time between two evaluations of Γ [s].
+            desired_output: As the controller follows it; the planner's by default.
+            desired_preview: What is to come of it as the assessor sees it; by default as planned.
+            meshcat: Where the robot is shown.
+
+        Returns:
+            The assessor; None without Γ.
+        """
+        assessor = self._export(
+            builder,
+            assessment_period_s=assessment_period_s,
+            state=self._assessor_observer.GetOutputPort("state"),
+            true_state=self._true_observer.GetOutputPort("state"),
+            output=self._observer.GetOutputPort("output"),
+            desired_output=desired_output,
+            desired_preview=desired_preview,
+        )
+        if self._physics.ball_state is not None:
+            builder.ExportOutput(self._physics.ball_state, "ball_state")
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, self.scene_graph, meshcat)
+        return assessor
+
+    def reset_to(
+        self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
+    ) -> None:
+        """Begins with a given state of the robot and plan; see :meth:`PlannedLoop.reset_to`."""
+        start.check_robot(self.kinematics)
+        self._enter(context, start)
+        self._observers.reseed(context, rng)
+        if rng is None:
+            self._observers.silence(context)
+
+    def standing_start(self) -> EpisodeStart:
+        """At rest in the robot's posture, which the plan keeps."""
+        q = self.kinematics.standing_positions()
+        output = self._output_of(q).copy()
+        # The plan is told from the feet.
+        output[:2] += self.kinematics.nominal_base_offset
+        v = np.zeros(self.kinematics.num_velocities)
+        return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(output[:, None]))
+
+    def _output_of(self, q: np.ndarray) -> np.ndarray:
+        """What plans are for, of the robot at positions (n_q,), in the world, (n_z,) [m]."""
+        raise NotImplementedError
+
+    def _stance_of(self, start: EpisodeStart) -> np.ndarray:
+        return start.stance_pose(self.kinematics)
+
+    def _set_state(self, context: Context, start: EpisodeStart) -> None:
+        with self._physics.edited(context) as plant_context:
+            self.plant.SetPositionsAndVelocities(
+                plant_context, self.robot_instance, np.concatenate([start.q, start.v])
+            )
+            if self._physics.ball is not None:
+                self._physics.ball.park(plant_context)

@@ -1,0 +1,108 @@
+"""What a task can do is told by its members; what it cannot, by one message with what it can."""
+
+import numpy as np
+import pytest
+
+from drake_safety import load_scenario
+from drake_safety.simulation import capabilities
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    CanStartAnywhere,
+    HasBall,
+    HasGoals,
+    HasMirrorImage,
+    HasStatePlanes,
+    OffersPlans,
+    angular_constraints,
+    judging_options,
+    pairing_options,
+    rate_names,
+    require,
+)
+from drake_safety.simulation.rollouts import run_episode
+from gliding_task import Gliding, gliding
+from shuttle_task import Shuttling, shuttling
+
+ASKED = (
+    HasGoals,
+    HasBall,
+    CanFall,
+    CanBePushed,
+    OffersPlans,
+    CanStartAnywhere,
+    HasStatePlanes,
+    HasMirrorImage,
+)
+HAS = {
+    "laikago_balancing": {HasBall, CanFall, OffersPlans, CanStartAnywhere},
+    "atlas_reaching": {
+        HasGoals,
+        CanFall,
+        CanBePushed,
+        OffersPlans,
+        CanStartAnywhere,
+        HasMirrorImage,
+    },
+    "pendulum": {CanStartAnywhere, HasStatePlanes},
+}
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_a_task_of_the_package_has_what_it_says_and_no_more(name):
+    loop = load_scenario(name).make_loop()
+    assert {one for one in ASKED if isinstance(loop, one)} == HAS[name]
+
+
+def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
+    loop = Shuttling(shuttling())
+    for capability in (HasGoals, CanBePushed, OffersPlans, CanFall, HasMirrorImage):
+        assert require(loop, capability) is loop
+
+
+@pytest.mark.parametrize(
+    ("capability", "lacked"),
+    [
+        (HasBall, "ball to throw"),
+        (CanStartAnywhere, "episodes from a given start"),
+        (HasStatePlanes, "state planes"),
+    ],
+)
+def test_what_a_task_lacks_is_told_with_what_was_asked_and_what_it_has(capability, lacked):
+    with pytest.raises(ValueError, match=f"^run: task 'Shuttling' has no {lacked}; it has plans "):
+        require(Shuttling(shuttling()), capability, "run")
+    with pytest.raises(ValueError, match=f"^task 'Gliding' has no {lacked}; it has nothing"):
+        require(Gliding(gliding()), capability)
+
+
+def test_every_capability_that_a_user_asks_for_has_its_words():
+    assert set(ASKED) == set(capabilities._WORDS)
+
+
+def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
+    loop = Gliding(gliding())
+    assert angular_constraints(loop) == ()
+    assert rate_names(loop) == []
+    assert judging_options(Gliding) == {}
+    assert pairing_options(gliding(), "actual") == {}
+    assert run_episode(loop).num_controller_failures == 0
+
+
+def test_without_a_word_of_its_own_all_of_a_tasks_targets_are_fair():
+    class Plain(Shuttling):
+        fair_box = is_fair = None
+
+    loop = Plain(shuttling())
+    assert not isinstance(loop, capabilities.HasFairGoals)
+    np.testing.assert_array_equal(capabilities.fair_box(loop), loop.target_box)
+    assert all(capabilities.is_fair(loop, run_episode(loop, index)) for index in range(3))
+
+
+def test_a_goal_outside_the_fair_box_is_not_fair():
+    loop = Shuttling(shuttling())
+    for index in range(12):
+        episode = run_episode(loop, index)
+        low, high = loop.fair_box
+        goal = loop.goal_of(episode)
+        is_inside = bool(np.all((low <= goal) & (goal <= high)))
+        assert capabilities.is_fair(loop, episode) == is_inside

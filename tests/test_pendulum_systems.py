@@ -1,0 +1,136 @@
+"""The pendulum's systems on their own: ports, values worked by hand, the motor's limit."""
+
+import math
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.diagrams.pendulum import (
+    PendulumController,
+    PendulumObserver,
+    PendulumParameters,
+    PendulumSafeSet,
+    bob_position,
+)
+
+LENGTH_M = 0.5
+PERIOD_S = 0.01
+
+
+def port_sizes(system):
+    inputs = [system.get_input_port(i) for i in range(system.num_input_ports())]
+    outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
+    return {port.get_name(): port.size() for port in (*inputs, *outputs)}
+
+
+def observed(angle_from_hanging, rate):
+    observer = PendulumObserver(LENGTH_M)
+    context = observer.CreateDefaultContext()
+    observer.get_input_port().FixValue(context, [angle_from_hanging, rate])
+    return [observer.GetOutputPort(name).Eval(context) for name in ("plant_state", "output")]
+
+
+def test_the_observer_passes_its_input_on_at_once():
+    observer = PendulumObserver(LENGTH_M)
+    assert port_sizes(observer) == {"pendulum_state": 2, "plant_state": 2, "output": 3}
+    assert observer.HasDirectFeedthrough(0, 0)
+    assert observer.HasDirectFeedthrough(0, 1)
+
+
+def test_the_observer_counts_from_upright_and_places_the_bob():
+    state, bob = observed(math.pi, 0.7)
+    np.testing.assert_allclose(state, [0.0, 0.7], atol=1e-15)
+    np.testing.assert_allclose(bob, [0.0, 0.0, LENGTH_M], atol=1e-15)
+    state, bob = observed(math.pi + math.pi / 6, -1.0)
+    np.testing.assert_allclose(state, [math.pi / 6, -1.0])
+    np.testing.assert_allclose(bob, [0.25, 0.0, 0.5 * math.sqrt(0.75)])
+    np.testing.assert_allclose(observed(0.0, 0.0)[1], [0.0, 0.0, -LENGTH_M], atol=1e-15)
+
+
+def torque_of(parameters, state, angle=0.0, rate=0.0):
+    """The torque that a controller holds after its update at time 0."""
+    controller = PendulumController(parameters, PERIOD_S)
+    simulator = Simulator(controller)
+    context = simulator.get_mutable_context()
+    point = bob_position(angle, parameters.length_m)
+    velocity = rate * parameters.length_m * np.array([math.cos(angle), 0.0, -math.sin(angle)])
+    ports = {"plant_state": state, "desired_output": point, "desired_output_rate": velocity}
+    for name, value in ports.items():
+        controller.GetInputPort(name).FixValue(context, value)
+    simulator.AdvanceTo(0.1 * PERIOD_S)
+    return simulator, controller
+
+
+def held_torque(*arguments, **options):
+    simulator, controller = torque_of(*arguments, **options)
+    return controller.get_output_port().Eval(simulator.get_context())[0]
+
+
+def test_the_controllers_torque_is_held_and_so_nothing_feeds_through():
+    controller = PendulumController(PendulumParameters(), PERIOD_S)
+    sizes = {"plant_state": 2, "desired_output": 3, "desired_output_rate": 3, "torque": 1}
+    assert port_sizes(controller) == sizes
+    assert not controller.HasAnyDirectFeedthrough()
+
+
+def test_the_torque_is_that_of_both_errors_less_the_weights():
+    parameters = PendulumParameters(effort_share=0.999)
+    # 20 (0.1 - 0.05) + 3 (0.4 - 0.2) - 1 * 9.81 * 0.5 sin(0.05) [N·m].
+    expected = 20.0 * 0.05 + 3.0 * 0.2 - 4.905 * math.sin(0.05)
+    assert held_torque(parameters, [0.05, 0.2], 0.1, 0.4) == pytest.approx(expected, abs=1e-12)
+    assert held_torque(parameters, [0.0, 0.0]) == 0.0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_torque_stays_within_the_motors_limit(side):
+    parameters = PendulumParameters(effort_share=0.35)
+    limit = 0.35 * 9.81 * 0.5
+    assert held_torque(parameters, [0.0, 0.0], side * 0.3) == pytest.approx(side * limit)
+
+
+def test_the_torque_changes_at_its_period_and_not_between():
+    parameters = PendulumParameters()
+    simulator, controller = torque_of(parameters, [0.0, 0.0], 0.05)
+    context, port = simulator.get_mutable_context(), controller.get_output_port()
+    first = port.Eval(context)[0]
+    controller.GetInputPort("plant_state").FixValue(context, [0.02, 0.0])
+    simulator.AdvanceTo(0.9 * PERIOD_S)
+    assert port.Eval(context)[0] == first == pytest.approx(1.0)
+    simulator.AdvanceTo(1.1 * PERIOD_S)
+    assert port.Eval(context)[0] == pytest.approx(20 * 0.03 - 4.905 * math.sin(0.02))
+
+
+def test_margins_are_the_angles_left_to_either_side():
+    safe_set = PendulumSafeSet(PendulumParameters(largest_angle_rad=0.6), 0.05)
+    assert safe_set.names == ("front", "back")
+    np.testing.assert_allclose(safe_set.margins(np.array([0.2]), np.array([9.0])), [0.4, 0.8])
+    assert safe_set.margins(np.array([0.7]), np.zeros(1))[0] < 0
+
+
+def test_features_of_a_plan_that_holds_still_are_worked_by_hand():
+    parameters = PendulumParameters()
+    safe_set = PendulumSafeSet(parameters, 0.05)
+    preview = np.tile(bob_position(0.1, LENGTH_M), (5, 1))
+    values = safe_set.features(np.array([0.02]), np.array([0.3]), preview)
+    found = dict(zip(safe_set.feature_names, values, strict=True))
+    hold, capture = math.asin(0.35), 0.02 + 0.3 * math.sqrt(0.5 / 9.81)
+    assert found == pytest.approx(
+        {
+            "now_margin_front": 0.58,
+            "now_margin_back": 0.62,
+            "capture_reserve_front": hold - capture,
+            "capture_reserve_back": hold + capture,
+            "goal_reserve_front": hold - 0.1,
+            "goal_reserve_back": hold + 0.1,
+            "plan_reserve_front": hold - 0.1,
+            "plan_reserve_back": hold + 0.1,
+            "plan_capture_reserve_front": hold - 0.1,
+            "plan_capture_reserve_back": hold + 0.1,
+            "plan_effort_reserve_front": 0.35 - math.sin(0.1),
+            "plan_effort_reserve_back": 0.35 + math.sin(0.1),
+            "tracking_error": 0.08,
+            "goal_from_capture": 0.1 - capture,
+        },
+        abs=1e-12,
+    )
