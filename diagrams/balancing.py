@@ -112,6 +112,8 @@ class Balancing(ClosedLoop):
         self._planner = planner
         desired_output = planner.GetOutputPort("desired_output")
         desired_preview = planner.GetOutputPort("desired_preview")
+        # The features see the whole plan: where it ends decides, and H steps do not reach it.
+        desired_outlook = planner.GetOutputPort("desired_outlook")
 
         self._recovery_switch = None
         if recovery:
@@ -124,17 +126,20 @@ class Balancing(ClosedLoop):
                     period_s=scenario.control_period_s,
                     offset_s=tick_offset_s,
                     horizon=horizon,
+                    num_outlook=_NUM_OUTLOOK,
                 ),
             )
             self._recovery_switch = switch
             builder.Connect(measured, switch.GetInputPort("plant_state"))
             builder.Connect(desired_output, switch.GetInputPort("nominal_desired_output"))
             builder.Connect(desired_preview, switch.GetInputPort("nominal_desired_preview"))
+            builder.Connect(desired_outlook, switch.GetInputPort("nominal_desired_outlook"))
             builder.Connect(
                 switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
             )
             desired_output = switch.GetOutputPort("desired_output")
             desired_preview = switch.GetOutputPort("desired_preview")
+            desired_outlook = switch.GetOutputPort("desired_outlook")
             builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
 
         stiffness = [
@@ -154,10 +159,8 @@ class Balancing(ClosedLoop):
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(desired_output, controller.GetInputPort("desired_output"))
         if recovery:
-            builder.Connect(
-                switch.GetOutputPort("desired_foot_positions"),
-                controller.GetInputPort("desired_foot_positions"),
-            )
+            for name in ("desired_foot_positions", "desired_yaw"):
+                builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
         physics.connect_servos(
             builder, kinematics.joint_names, controller.GetOutputPort("desired_joint_state")
         )
@@ -175,10 +178,7 @@ class Balancing(ClosedLoop):
             assessor_observer.GetOutputPort("measured_plant_state"),
             features.GetInputPort("plant_state"),
         )
-        # The features see the whole plan: where it ends decides, and H steps do not reach it.
-        builder.Connect(
-            planner.GetOutputPort("desired_outlook"), features.GetInputPort("desired_preview")
-        )
+        builder.Connect(desired_outlook, features.GetInputPort("desired_preview"))
 
         self.state_names = assessor_observer.state_names
         self.output_names = assessor_observer.output_names
