@@ -17,6 +17,7 @@ from drake_safety.simulation.contract import (
     check_ports,
 )
 from drake_safety.simulation.view import View
+from drake_safety.systems.float_system import FloatSystem
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["ASSESSMENT_PORTS", "RECORDED_PORTS", "REQUIRED_PORTS", "ClosedLoop"]
 
 
-class ClosedLoop(Diagram):
+class ClosedLoop(FloatSystem, Diagram):
     """A task's diagram: plant, controller, planner, monitor, and the assessor when there is Γ.
 
     Whoever runs, records or judges episodes uses only what this class promises: the output ports

@@ -9,12 +9,13 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.systems.float_system import FloatSystem
 
 _RATE_SHARE = 0.7  # Of a joint's speed limit; the servo overshoots a ramp by the rest.
 _LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
 
 
-class InverseKinematicsController(LeafSystem):
+class InverseKinematicsController(FloatSystem, LeafSystem):
     """Joint positions that carry a level base over given feet, with a gravity offset.
 
     .. pydrake_system::

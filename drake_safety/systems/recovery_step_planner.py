@@ -21,11 +21,12 @@ from drake_safety.control.recovery_step import (
     swing_position,
 )
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.systems.float_system import FloatSystem
 
 _IDLE, _STEPPING, _RETURNING, _DONE = 0.0, 1.0, 2.0, 3.0
 
 
-class RecoveryStepPlanner(LeafSystem):
+class RecoveryStepPlanner(FloatSystem, LeafSystem):
     """Catches the robot by swinging groups of feet in turn, then returns the base over them.
 
     .. pydrake_system::

@@ -7,6 +7,8 @@ from typing import Protocol
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_safety.systems.float_system import FloatSystem
+
 
 class SafeSet(Protocol):
     """What a safe set offers: the names of its constraints and their signed margins."""
@@ -18,7 +20,7 @@ class SafeSet(Protocol):
         ...
 
 
-class SafetyMonitor(LeafSystem):
+class SafetyMonitor(FloatSystem, LeafSystem):
     """Watches the plant's true state against the safe set.
 
     .. pydrake_system::
@@ -51,12 +53,12 @@ class SafetyMonitor(LeafSystem):
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", num_positions + num_velocities
         )
-        state = self.DeclareDiscreteState(n_c)
+        margins = self.DeclareDiscreteState(n_c)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
-        ticket = {self.discrete_state_ticket(state)}
+        ticket = {self.discrete_state_ticket(margins)}
         self.DeclareVectorOutputPort("safe", BasicVector(1), self._calc_safe, ticket)
-        self.DeclareVectorOutputPort("margins", BasicVector(n_c), self._calc_margins, ticket)
+        self.DeclareStateOutputPort("margins", margins)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
@@ -69,6 +71,3 @@ class SafetyMonitor(LeafSystem):
     def _calc_safe(self, context: Context, output: BasicVector) -> None:
         margins = context.get_discrete_state_vector().get_value()
         output.SetAtIndex(0, float(margins.min() >= 0))
-
-    def _calc_margins(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().get_value())
