@@ -76,6 +76,8 @@ class Balancing(LeggedLoop):
         )
         desired_output = planner.GetOutputPort("desired_output")
         desired_preview = planner.GetOutputPort("desired_preview")
+        # The features see the whole plan: where it ends decides, and H steps do not reach it.
+        desired_outlook = planner.GetOutputPort("desired_outlook")
 
         self._recovery_switch = None
         if recovery:
@@ -88,17 +90,20 @@ class Balancing(LeggedLoop):
                     period_s=scenario.control_period_s,
                     offset_s=tick_offset_s,
                     horizon=scenario.assessment.horizon,
+                    num_outlook=_NUM_OUTLOOK,
                 ),
             )
             self._recovery_switch = switch
             builder.Connect(measured, switch.GetInputPort("plant_state"))
             builder.Connect(desired_output, switch.GetInputPort("nominal_desired_output"))
             builder.Connect(desired_preview, switch.GetInputPort("nominal_desired_preview"))
+            builder.Connect(desired_outlook, switch.GetInputPort("nominal_desired_outlook"))
             builder.Connect(
                 switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
             )
             desired_output = switch.GetOutputPort("desired_output")
             desired_preview = switch.GetOutputPort("desired_preview")
+            desired_outlook = switch.GetOutputPort("desired_outlook")
             builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
 
         robot = self.robot
@@ -119,16 +124,14 @@ class Balancing(LeggedLoop):
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(desired_output, controller.GetInputPort("desired_output"))
         if recovery:
-            builder.Connect(
-                switch.GetOutputPort("desired_foot_positions"),
-                controller.GetInputPort("desired_foot_positions"),
-            )
+            for name in ("desired_foot_positions", "desired_yaw"):
+                builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
         physics.connect_servos(
             builder, kinematics.joint_names, controller.GetOutputPort("desired_joint_state")
         )
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
-        self._watch(builder, safe_set)
+        self._watch(builder, safe_set, outlook=desired_outlook)
         assessor = self._export_robot(
             builder,
             assessment_period_s=parameters.recovery.assessment_period_s,

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ from pydrake.systems.analysis import Simulator
 from balancing_loops import PACKAGED, scenario_of, standing_loop
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
+from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.scenario import parse_scenario
+from drake_safety.simulation.throws import run_throw
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
 
 
@@ -374,6 +377,54 @@ def test_recovery_saves_a_robot_that_would_have_fallen():
         lowest[recovery] = min(margins)
     assert lowest[False] < 0
     assert lowest[True] > 0
+
+
+def test_during_recovery_features_and_preview_tell_of_the_same_plan():
+    loop = packaged_loop(recovery=True)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, np.random.default_rng(0))
+    loop.GetInputPort("safety_probability").FixValue(context, [0.0])
+    observer = loop.GetSubsystemByName("assessor_observer")
+    safe_set = BalanceSafeSet(loop.kinematics, loop.scenario.parameters.safe_set)
+    num_active = 0
+    for time in np.arange(0.05, 0.6, 0.05):
+        simulator.AdvanceTo(time)
+        num_active += loop.GetOutputPort("recovery_active").Eval(context)[0]
+        x = observer.GetOutputPort("measured_plant_state").Eval(
+            observer.GetMyContextFromRoot(context)
+        )
+        # The recovery's plan is a set point that is held.
+        preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
+        q, v = np.split(x, [loop.kinematics.num_positions])
+        np.testing.assert_allclose(
+            loop.GetOutputPort("features").Eval(context),
+            safe_set.features(q, v, preview),
+            atol=1e-12,
+        )
+    assert num_active == 11
+
+
+def test_recovery_from_the_demonstrations_strong_ball_is_short_and_holds_the_heading():
+    loop = packaged_loop("actual", ball=True, recovery=True)
+    throw = loop.scenario.parameters.demonstration[1]
+    log = run_throw(
+        loop,
+        0,
+        seed=0,
+        throws=[replace(throw, time_s=0.5)],
+        trigger_time_s=0.52,
+        duration_s=2.6,
+    )
+    assert not log.has_fallen
+    ((start_s, end_s),) = log.recovery_intervals_s
+    step = loop.scenario.parameters.recovery.step
+    assert end_s - start_s < 9 * step.step_duration_s + step.return_duration_s
+    w, x, y, z = log.plant_state[:, :4].T
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    turned = yaw - yaw[log.time_s < 0.5][-1]
+    assert np.abs(turned).max() < np.radians(30)
+    assert abs(turned[-1]) < np.radians(15)
 
 
 def test_plans_to_choose_from_end_over_the_same_point_as_high_and_as_late_as_training_draws():

@@ -102,6 +102,16 @@ def test_a_connected_foot_input_overrides_the_parameter():
     np.testing.assert_allclose(reached, feet, atol=1.1e-4)
 
 
+def test_a_connected_yaw_overrides_that_of_the_feet():
+    bench = Bench("laikago", stiffness=1e9)
+    bench.fix("desired_yaw", 0.1)
+    bench.simulator.Initialize()
+    position, _ = bench.command()
+    X_WB = RigidTransform(RotationMatrix.MakeZRotation(0.1), base_over(bench.kinematics))
+    reached = bench.kinematics.contact_positions(bench.kinematics.positions_at(X_WB, position))
+    np.testing.assert_allclose(reached, standing_feet(bench.kinematics), atol=1.1e-4)
+
+
 def test_a_lifted_foot_gets_no_share_of_the_weight():
     on_ground, lifted = Bench("hexapod"), Bench("hexapod")
     feet = standing_feet(lifted.kinematics)

@@ -203,8 +203,6 @@ def test_ticks_without_a_solution_are_counted():
     loop = porter()
     context = started(loop, 0, EASY)
     controller = loop.GetSubsystemByName("whole_body_controller")
-    state = controller.GetMyMutableContextFromRoot(context).get_mutable_discrete_state_vector()
-    values = state.get_value().copy()
-    values[-1] = 3
-    state.SetFromVector(values)
+    values = controller.GetMyMutableContextFromRoot(context).get_mutable_discrete_state()
+    values.set_value(values.num_groups() - 1, [3])
     assert loop.num_controller_failures(context) == 3

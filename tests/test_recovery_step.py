@@ -8,6 +8,7 @@ import pytest
 from drake_safety.control.recovery_step import (
     RecoveryStepParameters,
     capture_point,
+    come_to_rest,
     first_group,
     foothold,
     gait_groups,
@@ -54,6 +55,19 @@ def test_a_still_pendulum_is_captured_where_it_is_and_a_moving_one_ahead():
 
 def test_a_pendulum_on_the_ground_has_a_finite_capture_point():
     assert np.isfinite(capture_point(np.array([0, 0, -1.0]), np.ones(3))).all()
+
+
+def test_a_pendulum_over_its_capture_point_starts_as_it_was_and_comes_to_rest_there():
+    p, v = np.array([0.1, 0.2, 0.5]), np.array([0.4, -0.3, 0.0])
+    np.testing.assert_allclose(come_to_rest(p, v, 0.0), p)
+    step_s = 1e-6
+    np.testing.assert_allclose((come_to_rest(p, v, step_s) - p) / step_s, v, atol=1e-5)
+    np.testing.assert_allclose(come_to_rest(p, v, 20.0), [*capture_point(p, v), 0.5])
+    # On the way its acceleration is what a centre of pressure at the capture point gives.
+    at = [come_to_rest(p, v, 0.1 + i * 1e-3) for i in (-1, 0, 1)]
+    acceleration = (at[0] - 2 * at[1] + at[2])[:2] / 1e-6
+    expected = 9.81 / 0.5 * (at[1][:2] - capture_point(p, v))
+    np.testing.assert_allclose(acceleration, expected, rtol=1e-3)
 
 
 def test_the_pair_away_from_the_capture_point_swings_first():

@@ -6,14 +6,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import fit_stance
-from drake_safety.control.recovery_step import RecoveryStepParameters, gait_groups
+from drake_safety.control.recovery_step import RecoveryStepParameters, capture_point, gait_groups
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.trajectory_planner import to_world
 from legged_robots import ROBOT_NAMES, robot_kinematics
 
 PERIOD_S = 0.01
 HORIZON = 4
-OUTPUTS = ("desired_output", "desired_foot_positions", "desired_preview", "stance_pose")
+NUM_OUTLOOK = 3
 
 
 class Bench:
@@ -23,7 +23,11 @@ class Bench:
         self.kinematics = robot_kinematics(name)
         self.parameters = RecoveryStepParameters(**numbers)
         self.planner = RecoveryStepPlanner(
-            self.kinematics, self.parameters, period_s=PERIOD_S, horizon=HORIZON
+            self.kinematics,
+            self.parameters,
+            period_s=PERIOD_S,
+            horizon=HORIZON,
+            num_outlook=NUM_OUTLOOK,
         )
         self.simulator = Simulator(self.planner)
         self.context = self.simulator.get_mutable_context()
@@ -41,10 +45,10 @@ class Bench:
     def fix(self, name, value):
         self.planner.GetInputPort(name).FixValue(self.context, value)
 
-    def see(self, p_WB):
-        X_WB = RigidTransform(RotationMatrix.MakeZRotation(self.stance_pose[2]), p_WB)
+    def see(self, p_WB, turned=0.0, yaw_rate=0.0):
+        X_WB = RigidTransform(RotationMatrix.MakeZRotation(self.stance_pose[2] + turned), p_WB)
         v = np.zeros(self.kinematics.num_velocities)
-        v[3:6] = self.speed
+        v[2], v[3:6] = yaw_rate, self.speed
         q = self.kinematics.positions_at(X_WB, self.kinematics.posture)
         self.fix("plant_state", np.concatenate([q, v]))
 
@@ -73,7 +77,8 @@ def test_its_ports_have_the_sizes_of_the_robot(name):
     bench = Bench(name)
     contacts = bench.kinematics.num_contacts
     sizes = {"desired_output": 3, "desired_foot_positions": 3 * contacts, "stance_pose": 3}
-    sizes |= {"desired_preview": 3 * HORIZON, "recovery_done": 1}
+    sizes |= {"desired_preview": 3 * HORIZON, "recovery_done": 1, "desired_yaw": 1}
+    sizes |= {"desired_outlook": 3 * NUM_OUTLOOK}
     assert {n: bench.planner.GetOutputPort(n).size() for n in sizes} == sizes
     assert bench.planner.GetInputPort("recovery_active").size() == 1
     assert bench.planner.GetInputPort("nominal_desired_output").size() == 3
@@ -143,8 +148,93 @@ def test_the_preview_is_the_set_point_held_in_the_stance_frame():
     bench.advance(5 * PERIOD_S)
     preview = bench.get("desired_preview").reshape(HORIZON, 3)
     assert np.all(preview == preview[0])
+    outlook = bench.get("desired_outlook").reshape(NUM_OUTLOOK, 3)
+    np.testing.assert_array_equal(outlook, preview[:NUM_OUTLOOK])
     world = to_world(bench.get("stance_pose"), preview[0])
     np.testing.assert_allclose(world, bench.get("desired_output"), atol=1e-9)
+
+
+def test_at_rest_the_base_is_told_the_yaw_of_its_stance():
+    bench = Bench(stance_pose=(1.0, 2.0, 0.5))
+    bench.see(bench.base, turned=0.2)
+    bench.advance(0.1)
+    assert bench.get("desired_yaw")[0] == 0.5
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.5, 3.1, -3.1])
+@pytest.mark.parametrize("turned", [0.1, -0.2])
+def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(heading, turned):
+    bench = Bench(stance_pose=(0.0, 0.0, heading), speed=(1.0, 0.0), max_twist_rad=0.3)
+    bench.fix("recovery_active", [1.0])
+    for _ in range(3):  # Footholds turn with the base; the heading does not.
+        bench.see(bench.base, turned=turned)
+        bench.advance(bench.parameters.step_duration_s)
+        told = np.remainder(bench.get("desired_yaw")[0] - heading + np.pi, 2 * np.pi) - np.pi
+        assert told == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("yaw_rate", [1.0, -0.5])
+def test_a_base_that_is_turning_is_told_a_yaw_against_it(yaw_rate):
+    bench = Bench(speed=(1.0, 0.0), yaw_damping_s=0.1, max_twist_rad=0.3)
+    bench.fix("recovery_active", [1.0])
+    bench.see(bench.base, yaw_rate=yaw_rate)
+    bench.advance(2 * PERIOD_S)
+    assert bench.get("desired_yaw")[0] == pytest.approx(-0.1 * yaw_rate)
+
+
+def test_the_yaw_that_it_is_told_is_never_further_than_it_can_twist():
+    bench = Bench(speed=(1.0, 0.0), max_twist_rad=0.2)
+    bench.fix("recovery_active", [1.0])
+    bench.see(bench.base, turned=1.0, yaw_rate=2.0)
+    bench.advance(2 * PERIOD_S)
+    assert bench.get("desired_yaw")[0] == pytest.approx(0.8)
+
+
+def test_a_robot_far_from_its_heading_steps_on():
+    bench = Bench(settle_heading_rad=0.35, max_steps=20)
+    bench.fix("recovery_active", [1.0])
+    bench.see(bench.base, turned=0.5)
+    bench.advance(10.5 * bench.parameters.step_duration_s)
+    assert bench.lifted()
+    bench.see(bench.base, turned=0.2)
+    bench.advance(2 * bench.parameters.step_duration_s)
+    assert not bench.lifted()
+
+
+def standing_but_not_done(bench):
+    bench.fix("recovery_active", [1.0])
+    bench.advance(2 * bench.parameters.step_duration_s + 3 * PERIOD_S)
+    assert not bench.lifted()
+    assert bench.get("recovery_done")[0] == 0
+    return bench
+
+
+def test_a_robot_that_cannot_stand_after_all_steps_on():
+    bench = standing_but_not_done(Bench(min_steps=2))
+    bench.speed = np.array([2.0, 0.0, 0.0])
+    bench.see(bench.base)
+    bench.advance(0.5 * bench.parameters.step_duration_s)
+    assert bench.lifted()
+    bench.speed = np.zeros(3)
+    bench.see(bench.base)
+    settled(bench)
+    assert bench.get("recovery_done")[0] == 1
+
+
+def test_after_its_last_step_it_stands_in_any_case():
+    bench = standing_but_not_done(Bench(min_steps=2, max_steps=2))
+    bench.speed = np.array([2.0, 0.0, 0.0])
+    bench.see(bench.base)
+    bench.advance(0.5 * bench.parameters.step_duration_s)
+    assert not bench.lifted()
+
+
+def test_the_base_comes_to_rest_over_its_capture_point_before_it_returns():
+    bench = Bench(speed=(0.2, 0.1), min_steps=2, return_duration_s=50.0)
+    bench.fix("recovery_active", [1.0])
+    bench.advance(2 * bench.parameters.step_duration_s + 2.0)
+    point = capture_point(bench.base, bench.speed)
+    np.testing.assert_allclose(bench.get("desired_output")[:2], point, atol=2e-3)
 
 
 def test_a_fast_robot_goes_on_stepping_until_its_last_step():

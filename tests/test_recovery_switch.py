@@ -11,6 +11,7 @@ from legged_robots import ROBOT_NAMES, robot_kinematics
 
 PERIOD_S, OFFSET_S, HORIZON = 0.01, 0.0005, 3
 PREVIEW = np.arange(9.0)
+OUTLOOK = np.arange(6.0)
 
 
 class Bench:
@@ -26,6 +27,7 @@ class Bench:
             period_s=PERIOD_S,
             offset_s=OFFSET_S,
             horizon=HORIZON,
+            num_outlook=2,
         )
         self.simulator = Simulator(self.switch)
         self.context = self.simulator.get_mutable_context()
@@ -39,6 +41,7 @@ class Bench:
         self.fix("plant_state", np.concatenate([q, np.zeros(self.kinematics.num_velocities)]))
         self.fix("nominal_desired_output", self.nominal)
         self.fix("nominal_desired_preview", PREVIEW)
+        self.fix("nominal_desired_outlook", OUTLOOK)
         self.fix("safety_probability", [1.0])
 
     def fix(self, name, value):
@@ -64,11 +67,14 @@ def test_it_exports_the_promised_ports():
         "plant_state",
         "nominal_desired_output",
         "nominal_desired_preview",
+        "nominal_desired_outlook",
     }
     assert outputs == {
         "desired_output",
         "desired_preview",
+        "desired_outlook",
         "desired_foot_positions",
+        "desired_yaw",
         "stance_pose",
         "recovery_active",
     }
@@ -81,6 +87,7 @@ def test_while_safe_the_nominal_plan_passes_through_at_once(name):
     assert bench.get("recovery_active")[0] == 0
     np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
     np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
+    np.testing.assert_array_equal(bench.get("desired_outlook"), OUTLOOK)
     np.testing.assert_array_equal(bench.get("desired_foot_positions"), bench.feet.ravel())
     bench.fix("nominal_desired_output", bench.nominal + 1.0)
     np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal + 1.0)
@@ -121,6 +128,18 @@ def test_recovery_ends_with_the_nominal_plan_passing_through_again():
     assert bench.get("recovery_active")[0] == 0
     np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
     np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
+    np.testing.assert_array_equal(bench.get("desired_outlook"), OUTLOOK)
+
+
+def test_during_recovery_preview_and_outlook_tell_the_same_plan():
+    bench = Bench()
+    bench.fix("safety_probability", [0.3])
+    for _ in range(60):
+        bench.advance(PERIOD_S)
+        if bench.get("recovery_active")[0] and bench.context.get_time() > 3 * PERIOD_S:
+            np.testing.assert_array_equal(
+                bench.get("desired_outlook"), bench.get("desired_preview")[:6]
+            )
 
 
 def test_a_second_dip_is_answered_by_a_second_recovery():

@@ -16,18 +16,24 @@ class RecoveryStepParameters:
     """Duration of a swing; the other feet carry the robot meanwhile [s]."""
     lift_m: float = 0.06
     """Height of the swing curve's top [m]."""
-    velocity_gain_s: float = 0.07
+    velocity_gain_s: float = 0.12
     """Raibert's gain: how much further than the neutral point per speed [s]."""
     max_reach_m: float = 0.18
     """A foothold is at most this far from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
     """A foothold is at least this far from the base's midline, on its own side [m]."""
+    max_twist_rad: float = 0.3
+    """Stance legs are told a base yaw that is at most this far from the measured one [rad]."""
+    yaw_damping_s: float = 0.1
+    """How far it lies on the other side of the heading to be held, per yaw rate [s]."""
     min_steps: int = 2
     """Swings before the robot may stop."""
     max_steps: int = 20
     """Swings after which it stops in any case."""
-    settle_speed_m_s: float = 0.5
+    settle_speed_m_s: float = 0.7
     """Base speed under which it may stop [m/s]."""
+    settle_heading_rad: float = 0.35
+    """Angle between the base's yaw and the heading under which it may stop [rad]."""
     settle_margin_m: float = 0.05
     """Distance of the capture point inside the support polygon at which it may stop [m]."""
     return_duration_s: float = 0.5
@@ -64,6 +70,26 @@ def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
 def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
     """Where a linear inverted pendulum comes to rest: p + v √(z/g), (2,) [m]."""
     return p_WB[:2] + v_WB[:2] * math.sqrt(max(float(p_WB[2]), 0.05) / _GRAVITY)
+
+
+def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.ndarray:
+    """Where a linear inverted pendulum is whose centre of pressure stays at its capture point.
+
+    Args:
+        p_WB: Where it began, at the height that it keeps, (3,) [m].
+        v_WB: Its horizontal velocity then, (3,) [m/s].
+        elapsed_s: Time since then [s].
+
+    Returns:
+        Its position, (3,) [m].
+    """
+    time_constant_s = math.sqrt(p_WB[2] / _GRAVITY)
+    return p_WB - v_WB * time_constant_s * math.expm1(-elapsed_s / time_constant_s)
+
+
+def minimum_jerk(s: float) -> float:
+    """Progress of the minimum-jerk law, from 0 to 1 as ``s`` goes from 0 to 1."""
+    return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
@@ -104,8 +130,8 @@ def foothold(
     Args:
         p_WB: Base position (3,) [m].
         v_WB: Base velocity (3,) [m/s].
-        yaw: Base yaw [rad].
-        hip_offset: The foot's place in the standing posture, in the base's heading frame, (2,).
+        yaw: Of the heading frame [rad].
+        hip_offset: The foot's place in the standing posture, in the heading frame, (2,).
         remaining_s: Time to touchdown [s].
         parameters: Numbers of the step.
     """
@@ -138,7 +164,6 @@ def swing_position(
         lift_m: Height of the curve's top over the line from start to target [m].
     """
     s = min(max(phase, 0.0), 1.0)
-    blend = s**3 * (10 - 15 * s + 6 * s**2)
-    point = start + blend * (target - start)
+    point = start + minimum_jerk(s) * (target - start)
     point[2] += lift_m * math.sin(math.pi * s) ** 2
     return point

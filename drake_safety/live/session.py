@@ -26,7 +26,7 @@ from drake_safety.planning.goal_verdict import (
 )
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.capabilities import HasBall, HasGoals, angular_constraints, require
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 

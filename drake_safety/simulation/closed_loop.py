@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.segments import RECORDED
+from drake_safety.systems.float_system import FloatSystem
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -60,7 +61,7 @@ class LoopScenario(Protocol):
         """A digest of the code that does it."""
 
 
-class ClosedLoop(Diagram):
+class ClosedLoop(FloatSystem, Diagram):
     """A task's diagram: plant, controller, planner, monitor, and the assessor when there is Γ.
 
     Whoever runs, records or judges episodes needs only what this class promises: the output ports

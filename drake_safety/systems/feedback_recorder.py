@@ -10,6 +10,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
 from drake_safety.learning.segments import RECORDED, Episode, Episodes, EpisodesInfo
+from drake_safety.systems.float_system import FloatSystem
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,7 +52,7 @@ class Recording:
         return self
 
 
-class FeedbackRecorder(LeafSystem):
+class FeedbackRecorder(FloatSystem, LeafSystem):
     """Records windows of a running robot; each is labelled by how it ended.
 
     .. pydrake_system::

@@ -9,12 +9,13 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.systems.float_system import FloatSystem
 
 _RATE_SHARE = 0.7  # Of a joint's speed limit; the servo overshoots a ramp by the rest.
 _LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
 
 
-class InverseKinematicsController(LeafSystem):
+class InverseKinematicsController(FloatSystem, LeafSystem):
     """Joint positions that carry a level base over given feet, with a gravity offset.
 
     .. pydrake_system::
@@ -24,15 +25,16 @@ class InverseKinematicsController(LeafSystem):
         - plant_state
         - desired_output
         - desired_foot_positions (optional)
+        - desired_yaw (optional)
         output_ports:
         - desired_joint_state
 
-    The command is a discrete state, so the output has no direct feedthrough. Base yaw follows
-    the planar fit of the feet. The joint servos are the plant's own implicit ones (q̇ of the
-    command is the rate of the set point); to their set point the static offset τ/k_p is added,
-    with τ from the robot model's weight split over the feet that are down, which removes the
-    sag of a servo of finite stiffness. Commands respect the joint limits, and set points move no
-    faster than 0.7 of the joints' speed limits.
+    The command is a discrete state, so the output has no direct feedthrough. Base yaw is
+    ``desired_yaw``, or follows the planar fit of the feet where that is not connected. The joint
+    servos are the plant's own implicit ones (q̇ of the command is the rate of the set point); to
+    their set point the static offset τ/k_p is added, with τ from the robot model's weight split
+    over the feet that are down, which removes the sag of a servo of finite stiffness. Commands
+    respect the joint limits, and set points move no faster than 0.7 of the joints' speed limits.
 
     Args:
         kinematics: The robot as the controller believes it to be.
@@ -74,18 +76,14 @@ class InverseKinematicsController(LeafSystem):
         self._feet_port = self.DeclareVectorInputPort(
             "desired_foot_positions", 3 * kinematics.num_contacts
         )
+        self._yaw_port = self.DeclareVectorInputPort("desired_yaw", 1)
         standing = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
         self._feet_index = self.DeclareNumericParameter(BasicVector(standing.ravel()))
-        # State: joint set point without offset, then the published position and rate command.
-        state = self.DeclareDiscreteState(3 * n_j)
+        self._set_point = self.DeclareDiscreteState(n_j)  # Of the joints, without the offset.
+        self._command = self.DeclareDiscreteState(2 * n_j)  # Positions with it, and rates.
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
-        self.DeclareVectorOutputPort(
-            "desired_joint_state",
-            BasicVector(2 * n_j),
-            self._calc_command,
-            {self.discrete_state_ticket(state)},
-        )
+        self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
         """Sets where the feet stand while ``desired_foot_positions`` is not connected.
@@ -107,7 +105,10 @@ class InverseKinematicsController(LeafSystem):
     def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         kinematics = self._kinematics
         p_WC = self.foot_positions(context)
-        half_yaw = 0.5 * fit_stance(p_WC, kinematics.nominal_contacts)[2]
+        if self._yaw_port.HasValue(context):
+            half_yaw = 0.5 * self._yaw_port.Eval(context)[0]
+        else:
+            half_yaw = 0.5 * fit_stance(p_WC, kinematics.nominal_contacts)[2]
         n_b = NUM_BASE_POSITIONS
         q = np.zeros(kinematics.num_positions)
         q[0], q[3] = math.cos(half_yaw), math.sin(half_yaw)
@@ -127,20 +128,18 @@ class InverseKinematicsController(LeafSystem):
         plant_state = self._state_port.Eval(context)
         guess = plant_state[NUM_BASE_POSITIONS : self._kinematics.num_positions]
         joints, torques = self._solve(context, guess)
-        command = self._add_offset(joints, torques)
-        discrete_state.set_value(np.concatenate([joints, command, np.zeros_like(joints)]))
+        command = np.concatenate([self._add_offset(joints, torques), np.zeros_like(joints)])
+        discrete_state.set_value(self._set_point, joints)
+        discrete_state.set_value(self._command, command)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        n_j = self._kinematics.num_joints
-        state = context.get_discrete_state_vector().get_value()
-        previous, last_rate = state[:n_j].copy(), state[2 * n_j :]
+        previous = context.get_discrete_state(self._set_point).get_value()
+        last_rate = context.get_discrete_state(self._command).get_value()[len(previous) :]
         # Smooth set points go on as they went: most ticks then need no Newton step at all.
         wanted, torques = self._solve(context, previous + self._period_s * last_rate)
         rate = (wanted - previous) / self._period_s
         rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
         joints = previous + self._period_s * rate
-        discrete_state.set_value(np.concatenate([joints, self._add_offset(joints, torques), rate]))
-
-    def _calc_command(self, context: Context, output: BasicVector) -> None:
-        n_j = self._kinematics.num_joints
-        output.SetFromVector(context.get_discrete_state_vector().get_value()[n_j:])
+        command = np.concatenate([self._add_offset(joints, torques), rate])
+        discrete_state.set_value(self._set_point, joints)
+        discrete_state.set_value(self._command, command)

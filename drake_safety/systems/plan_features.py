@@ -7,6 +7,8 @@ from typing import Protocol
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_safety.systems.float_system import FloatSystem
+
 
 class FeatureMap(Protocol):
     """What a safe set with features offers beside its margins."""
@@ -18,7 +20,7 @@ class FeatureMap(Protocol):
         ...
 
 
-class PlanFeatures(LeafSystem):
+class PlanFeatures(FloatSystem, LeafSystem):
     """Evaluates the safe set's features on the measured state and the desired preview.
 
     .. pydrake_system::

@@ -9,12 +9,14 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_safety.systems.float_system import FloatSystem
+
 _BODY, _FORCE, _START, _DURATION = 0, slice(1, 4), 4, 5
 _SIZE = 6
 _TOLERANCE_S = 1e-9
 
 
-class PushSource(LeafSystem):
+class PushSource(FloatSystem, LeafSystem):
     """Pushes one body of a robot at its centre of mass; which one, how and when is a parameter.
 
     .. pydrake_system::

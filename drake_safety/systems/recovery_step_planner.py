@@ -13,17 +13,20 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.control.recovery_step import (
     RecoveryStepParameters,
     capture_point,
+    come_to_rest,
     first_group,
     foothold,
     gait_groups,
+    minimum_jerk,
     swing_position,
 )
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.systems.float_system import FloatSystem
 
 _IDLE, _STEPPING, _RETURNING, _DONE = 0.0, 1.0, 2.0, 3.0
 
 
-class RecoveryStepPlanner(LeafSystem):
+class RecoveryStepPlanner(FloatSystem, LeafSystem):
     """Catches the robot by swinging groups of feet in turn, then returns the base over them.
 
     .. pydrake_system::
@@ -36,7 +39,9 @@ class RecoveryStepPlanner(LeafSystem):
         output_ports:
         - desired_output
         - desired_foot_positions
+        - desired_yaw
         - desired_preview
+        - desired_outlook
         - stance_pose
         - recovery_done
 
@@ -44,20 +49,24 @@ class RecoveryStepPlanner(LeafSystem):
     ``recovery_active`` rises, the group of feet whose partners' line is nearest the capture
     point swings to Raibert footholds that follow the base at every tick; the base set point
     follows the measured base at the standing height, so the stance legs carry the weight without
-    pulling it back. Groups alternate until the base is slow and its capture point well inside the
-    support polygon. The stance pose then becomes that of the new footholds, and the base is led
-    to the nominal planner's set point, which stands in that stance pose. After that
-    ``recovery_done`` is 1 until ``recovery_active`` has fallen.
+    pulling it back. The heading of the stance that the recovery began in is held: the stance legs
+    twist the base towards it and against its yaw rate, and the footholds follow the base. Groups
+    alternate until the robot can stand: its capture point is well inside the support polygon, and
+    it is about at the heading. The base then comes to rest as an inverted pendulum does over its
+    capture point, and is led to the nominal planner's set point, which stands in the stance pose of
+    the new footholds; should the capture point leave the support polygon meanwhile, the robot
+    steps on. After that ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
-    Every output is a discrete state; the preview is the base set point, held, in the stance
-    frame.
+    Preview and outlook are the base set point, held, in the frame of the stance as it is to be
+    now. No output has direct feedthrough.
 
     Args:
         kinematics: The robot as the controller believes it to be.
         parameters: Numbers of the step.
         period_s: Planning period [s].
         offset_s: Time of the first tick [s].
-        horizon: H of the preview.
+        horizon: H, samples of the preview.
+        num_outlook: M, samples of the outlook.
     """
 
     def __init__(
@@ -68,39 +77,48 @@ class RecoveryStepPlanner(LeafSystem):
         period_s: float,
         offset_s: float = 0.0,
         horizon: int,
+        num_outlook: int,
     ):
         super().__init__()
         self._kinematics = kinematics
         self._parameters = parameters
-        self._horizon = horizon
         self._nominal_feet = np.array(
             [kinematics.nominal_contacts[rows].mean(axis=0) for rows in kinematics.foot_slices]
         )
         self._groups = gait_groups(self._nominal_feet)
         n_p = 3 * kinematics.num_contacts
-        self.DeclareVectorInputPort(
+        self._state_port = self.DeclareVectorInputPort(
             "plant_state", kinematics.num_positions + kinematics.num_velocities
         )
-        self.DeclareVectorInputPort("recovery_active", 1)
-        self.DeclareVectorInputPort("nominal_desired_output", 3)
-        # Discrete state groups, each read and written by name.
-        self._mode = self.DeclareDiscreteState(4)  # mode, group, steps done, time of its start
+        self._active_port = self.DeclareVectorInputPort("recovery_active", 1)
+        self._nominal_port = self.DeclareVectorInputPort("nominal_desired_output", 3)
+        # Discrete state groups, each of which is one thing.
+        self._mode = self.DeclareDiscreteState(1)
+        self._swinging_group = self.DeclareDiscreteState(1)
+        self._num_steps = self.DeclareDiscreteState(1)
+        self._start_s = self.DeclareDiscreteState(1)  # Of the swing, or of the return.
+        self._heading = self.DeclareDiscreteState(1)  # To be held.
+        self._return_start = self.DeclareDiscreteState(6)  # Position and velocity of the base.
+        self._planted = self.DeclareDiscreteState(n_p)  # Where feet stand, or left the ground.
+        self._set_point = self.DeclareDiscreteState(3)
+        self._feet = self.DeclareDiscreteState(n_p)  # As the controller is told them.
+        self._yaw = self.DeclareDiscreteState(1)
         self._stance = self.DeclareDiscreteState(3)  # x, y, yaw
-        self._base = self.DeclareDiscreteState(6)  # set point; where the return began
-        self._feet = self.DeclareDiscreteState(n_p)  # commanded to the controller
-        self._planted = self.DeclareDiscreteState(n_p)  # where feet stand, or left the ground
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        self.DeclareStateOutputPort("desired_output", self._set_point)
+        self.DeclareStateOutputPort("desired_foot_positions", self._feet)
+        self.DeclareStateOutputPort("desired_yaw", self._yaw)
         ticket = {self.all_state_ticket()}
-        self.DeclareVectorOutputPort(
-            "desired_output", BasicVector(3), self._calc_desired_output, ticket
-        )
-        self.DeclareVectorOutputPort(
-            "desired_foot_positions", BasicVector(n_p), self._calc_feet, ticket
-        )
-        self.DeclareVectorOutputPort(
-            "desired_preview", BasicVector(3 * horizon), self._calc_preview, ticket
-        )
-        self.DeclareVectorOutputPort("stance_pose", BasicVector(3), self._calc_stance, ticket)
+        for name, num_samples in (("desired_preview", horizon), ("desired_outlook", num_outlook)):
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(3 * num_samples),
+                lambda context, output, n=num_samples: output.SetFromVector(
+                    np.tile(self._set_point_in_stance(context), n)
+                ),
+                ticket,
+            )
+        self.DeclareStateOutputPort("stance_pose", self._stance)
         self.DeclareVectorOutputPort("recovery_done", BasicVector(1), self._calc_done, ticket)
 
     def set_stance(self, context: Context, p_WC: np.ndarray, stance_pose: np.ndarray) -> None:
@@ -111,146 +129,155 @@ class RecoveryStepPlanner(LeafSystem):
             p_WC: Centres of the contact spheres, (n_c, 3) [m].
             stance_pose: [x, y, yaw] of the stance frame (3,) [m, rad].
         """
-        context.SetDiscreteState(self._mode, np.zeros(4))
+        context.SetDiscreteState(self._mode, [_IDLE])
         context.SetDiscreteState(self._stance, stance_pose)
+        context.SetDiscreteState(self._yaw, stance_pose[2:])
         context.SetDiscreteState(self._feet, np.ravel(p_WC))
         context.SetDiscreteState(self._planted, np.ravel(p_WC))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        mode, group, steps, start = discrete_state.get_vector(self._mode).get_value().tolist()
-        is_active = self.GetInputPort("recovery_active").Eval(context)[0] > 0
-        if mode == _IDLE and not is_active:
-            self._set_base(
-                discrete_state, self.GetInputPort("nominal_desired_output").Eval(context)
-            )
-            return
-        if mode == _DONE:
-            if not is_active:
-                discrete_state.set_value(self._mode, np.zeros(4))
-            else:
-                nominal = self.GetInputPort("nominal_desired_output").Eval(context)
-                self._set_base(discrete_state, nominal)
+        mode = discrete_state.get_value(self._mode)[0]
+        is_active = self._active_port.Eval(context)[0] > 0
+        if mode in (_IDLE, _DONE) and (mode == _DONE or not is_active):
+            discrete_state.set_value(self._mode, [_DONE if is_active else _IDLE])
+            discrete_state.set_value(self._set_point, self._nominal_port.Eval(context))
             return
         time = context.get_time()
-        plant_state = self.GetInputPort("plant_state").Eval(context)
-        q = plant_state[: self._kinematics.num_positions]
-        v = plant_state[self._kinematics.num_positions :]
-        if mode == _IDLE:
-            feet = discrete_state.get_vector(self._planted).get_value().reshape(-1, 3)
-            centres = self._foot_centres(feet)
-            point = capture_point(q[4:7], v[3:6])
-            group = first_group(self._groups, centres, point)
-            mode, steps, start = _STEPPING, 0, time
-        if mode == _STEPPING:
-            group, steps, start, is_settled = self._step(
-                discrete_state, q, v, int(group), int(steps), start, time
-            )
-            if is_settled:
-                mode, start = _RETURNING, time
-        elif mode == _RETURNING:
-            s = min((time - start) / self._parameters.return_duration_s, 1.0)
-            began = discrete_state.get_vector(self._base).get_value()[3:]
-            goal = self.GetInputPort("nominal_desired_output").Eval(context)
-            blend = s**3 * (10 - 15 * s + 6 * s**2)
-            self._set_base(discrete_state, began + blend * (goal - began))
-            if s >= 1.0:
-                mode = _DONE
-        discrete_state.set_value(self._mode, np.array([mode, group, steps, start]))
+        q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
+        if mode == _RETURNING:
+            num_steps = discrete_state.get_value(self._num_steps)[0]
+            if self._margin(discrete_state, q, v) >= 0 or num_steps >= self._parameters.max_steps:
+                self._return(discrete_state, self._nominal_port.Eval(context), time)
+                return
+            self._begin(discrete_state, q, v, time)
+        elif mode == _IDLE:
+            discrete_state.set_value(self._num_steps, [0])
+            discrete_state.set_value(self._heading, discrete_state.get_value(self._stance)[2:])
+            self._begin(discrete_state, q, v, time)
+        elif time - discrete_state.get_value(self._start_s)[0] >= self._swing_s:
+            self._plant(discrete_state, q, time)
+            if self._can_stand(discrete_state, q, v):
+                self._stand(discrete_state, q, v)
+                return
+        self._swing(discrete_state, q, v, time)
 
-    def _set_base(self, discrete_state: DiscreteValues, p_WB: np.ndarray) -> None:
-        base = discrete_state.get_vector(self._base).get_value().copy()
-        base[:3] = p_WB
-        discrete_state.set_value(self._base, base)
+    @property
+    def _swing_s(self) -> float:
+        return self._parameters.step_duration_s - 1e-9
 
-    def _foot_centres(self, contacts: np.ndarray) -> np.ndarray:
-        return np.array([contacts[rows, :2].mean(axis=0) for rows in self._kinematics.foot_slices])
+    def _contacts(self, discrete_state: DiscreteValues) -> np.ndarray:
+        return discrete_state.get_value(self._planted).reshape(-1, 3).copy()
 
-    def _step(
-        self,
-        discrete_state: DiscreteValues,
-        q: np.ndarray,
-        v: np.ndarray,
-        group: int,
-        steps: int,
-        start: float,
-        time: float,
-    ) -> tuple[int, int, float, bool]:
+    def _begin(
+        self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray, time: float
+    ) -> None:
+        contacts = self._contacts(discrete_state)
+        centres = np.array(
+            [contacts[rows, :2].mean(axis=0) for rows in self._kinematics.foot_slices]
+        )
+        group = first_group(self._groups, centres, capture_point(q[4:7], v[3:6]))
+        discrete_state.set_value(self._mode, [_STEPPING])
+        discrete_state.set_value(self._swinging_group, [group])
+        discrete_state.set_value(self._start_s, [time])
+
+    def _plant(self, discrete_state: DiscreteValues, q: np.ndarray, time: float) -> None:
+        """Ends a swing where the feet are, and lets the other group swing."""
+        kinematics = self._kinematics
+        group = int(discrete_state.get_value(self._swinging_group)[0])
+        contacts, measured = self._contacts(discrete_state), kinematics.contact_positions(q)
+        for foot in self._groups[group]:
+            rows = kinematics.foot_slices[foot]
+            contacts[rows, :2] = measured[rows, :2]
+            contacts[rows, 2] = kinematics.foot_radii[rows]
+        discrete_state.set_value(self._planted, contacts.ravel())
+        discrete_state.set_value(self._swinging_group, [1 - group])
+        discrete_state.set_value(self._num_steps, discrete_state.get_value(self._num_steps) + 1)
+        discrete_state.set_value(self._start_s, [time])
+
+    def _margin(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> float:
+        """Signed distance of the capture point inside the polygon of the planted feet [m]."""
+        corners = convex_hull(self._contacts(discrete_state)[:, :2])
+        return signed_distance_to_polygon(capture_point(q[4:7], v[3:6]), corners)
+
+    def _heading_error(self, discrete_state: DiscreteValues, yaw: float) -> float:
+        return math.remainder(discrete_state.get_value(self._heading)[0] - yaw, 2 * math.pi)
+
+    def _can_stand(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> bool:
+        parameters = self._parameters
+        num_steps = discrete_state.get_value(self._num_steps)[0]
+        if num_steps < parameters.min_steps or num_steps >= parameters.max_steps:
+            return num_steps >= parameters.max_steps
+        yaw = yaw_of(RotationMatrix(quaternion_of(q)))
+        return (
+            np.hypot(*v[3:5]) <= parameters.settle_speed_m_s
+            and abs(self._heading_error(discrete_state, yaw)) <= parameters.settle_heading_rad
+            and self._margin(discrete_state, q, v) >= parameters.settle_margin_m
+        )
+
+    def _stand(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> None:
+        contacts = self._contacts(discrete_state)
+        stance = fit_stance(contacts, self._kinematics.nominal_contacts)
+        base = np.array([q[4], q[5], self._kinematics.standing_height])
+        discrete_state.set_value(self._mode, [_RETURNING])
+        discrete_state.set_value(self._return_start, np.concatenate([base, v[3:5], [0.0]]))
+        discrete_state.set_value(self._set_point, base)
+        discrete_state.set_value(self._feet, contacts.ravel())
+        discrete_state.set_value(self._stance, stance)
+        discrete_state.set_value(self._yaw, stance[2:])
+
+    def _return(self, discrete_state: DiscreteValues, goal: np.ndarray, time: float) -> None:
+        elapsed_s = time - discrete_state.get_value(self._start_s)[0]
+        p_WB, v_WB = np.split(discrete_state.get_value(self._return_start), 2)
+        resting = come_to_rest(p_WB, v_WB, elapsed_s)
+        s = min(elapsed_s / self._parameters.return_duration_s, 1.0)
+        blend = minimum_jerk(s)
+        discrete_state.set_value(self._set_point, resting + blend * (goal - resting))
+        if s >= 1.0:
+            discrete_state.set_value(self._mode, [_DONE])
+
+    def _swing(
+        self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray, time: float
+    ) -> None:
         kinematics, parameters = self._kinematics, self._parameters
         R_WB = RotationMatrix(quaternion_of(q))
-        yaw = yaw_of(R_WB)
-        p_WB, v_WB = q[4:7], v[3:6]
-        planted = discrete_state.get_vector(self._planted).get_value().reshape(-1, 3).copy()
-        is_settled = False
-        if time - start >= parameters.step_duration_s - 1e-9:
-            measured = kinematics.contact_positions(q)
-            for foot in self._groups[group]:
-                rows = kinematics.foot_slices[foot]
-                planted[rows] = measured[rows]
-                planted[rows, 2] = kinematics.foot_radii[rows]
-            steps += 1
-            is_settled = self._is_settled(planted, p_WB, v_WB, steps)
-            group, start = 1 - group, time
-        feet = planted.copy()
-        X_WS = RigidTransform(
-            RotationMatrix.MakeZRotation(yaw),
-            [p_WB[0], p_WB[1], kinematics.standing_height],
-        )
+        yaw, p_WB, v_WB = yaw_of(R_WB), q[4:7], v[3:6]
+        error = self._heading_error(discrete_state, yaw)
+        twist = error - parameters.yaw_damping_s * v[2]
+        twist = min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         base = np.array([p_WB[0], p_WB[1], kinematics.standing_height])
-        if is_settled:
-            stance = fit_stance(planted, kinematics.nominal_contacts)
-            discrete_state.set_value(self._stance, stance)
-            discrete_state.set_value(self._base, np.concatenate([base, base]))
-        else:
-            phase = (time - start) / parameters.step_duration_s
-            remaining_s = parameters.step_duration_s - (time - start)
-            # The controller solves for a level base at the standing height; a swinging foot must
-            # reach its place from the base as it is.
-            X_adjust = X_WS @ RigidTransform(R_WB, p_WB).inverse()
-            for foot in self._groups[group]:
-                rows = kinematics.foot_slices[foot]
-                hip = self._nominal_feet[foot] - kinematics.nominal_base_offset
-                centre = foothold(p_WB, v_WB, yaw, hip, remaining_s, parameters)
-                c, s = math.cos(yaw), math.sin(yaw)
-                R = np.array([[c, -s], [s, c]])
-                shape = kinematics.nominal_contacts[rows] - self._nominal_feet[foot]
-                for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
-                    target = np.append(centre + R @ offset, kinematics.foot_radii[i])
-                    feet[i] = X_adjust @ swing_position(
-                        planted[i], target, phase, parameters.lift_m
-                    )
-            self._set_base(discrete_state, base)
-        discrete_state.set_value(self._feet, feet.ravel())
-        discrete_state.set_value(self._planted, planted.ravel())
-        return group, steps, start, is_settled
+        # The controller solves for a level base at the set point; a swinging foot must reach its
+        # place from the base as it is.
+        X_adjust = (
+            RigidTransform(RotationMatrix.MakeZRotation(yaw + twist), base)
+            @ RigidTransform(R_WB, p_WB).inverse()
+        )
+        elapsed_s = time - discrete_state.get_value(self._start_s)[0]
+        phase = elapsed_s / parameters.step_duration_s
+        remaining_s = parameters.step_duration_s - elapsed_s
+        R_WF = RotationMatrix.MakeZRotation(yaw).matrix()[:2, :2]
+        feet = self._contacts(discrete_state)
+        told = feet.copy()
+        group = int(discrete_state.get_value(self._swinging_group)[0])
+        for foot in self._groups[group]:
+            rows = kinematics.foot_slices[foot]
+            hip = self._nominal_feet[foot] - kinematics.nominal_base_offset
+            centre = foothold(p_WB, v_WB, yaw, hip, remaining_s, parameters)
+            shape = kinematics.nominal_contacts[rows] - self._nominal_feet[foot]
+            for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
+                target = np.append(centre + R_WF @ offset, kinematics.foot_radii[i])
+                feet[i] = swing_position(feet[i], target, phase, parameters.lift_m)
+                told[i] = X_adjust @ feet[i]
+        discrete_state.set_value(self._set_point, base)
+        discrete_state.set_value(self._feet, told.ravel())
+        discrete_state.set_value(self._yaw, [yaw + twist])
+        discrete_state.set_value(self._stance, fit_stance(feet, kinematics.nominal_contacts))
 
-    def _is_settled(
-        self, planted: np.ndarray, p_WB: np.ndarray, v_WB: np.ndarray, steps: int
-    ) -> bool:
-        parameters = self._parameters
-        if steps >= parameters.max_steps:
-            return True
-        if steps < parameters.min_steps or np.hypot(*v_WB[:2]) > parameters.settle_speed_m_s:
-            return False
-        corners = convex_hull(planted[:, :2])
-        margin = signed_distance_to_polygon(capture_point(p_WB, v_WB), corners)
-        return margin >= parameters.settle_margin_m
-
-    def _calc_desired_output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._base).get_value()[:3])
-
-    def _calc_feet(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._feet).get_value())
-
-    def _calc_preview(self, context: Context, output: BasicVector) -> None:
+    def _set_point_in_stance(self, context: Context) -> np.ndarray:
         x, y, yaw = context.get_discrete_state(self._stance).get_value()
-        p = context.get_discrete_state(self._base).get_value()[:3]
+        p = context.get_discrete_state(self._set_point).get_value()
         c, s = math.cos(yaw), math.sin(yaw)
         dx, dy = p[0] - x, p[1] - y
-        p_S = np.array([c * dx + s * dy, -s * dx + c * dy, p[2]])
-        output.SetFromVector(np.tile(p_S, self._horizon))
-
-    def _calc_stance(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._stance).get_value())
+        return np.array([c * dx + s * dy, -s * dx + c * dy, p[2]])
 
     def _calc_done(self, context: Context, output: BasicVector) -> None:
         mode = context.get_discrete_state(self._mode).GetAtIndex(0)

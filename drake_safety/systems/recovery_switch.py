@@ -7,11 +7,12 @@ from pydrake.systems.primitives import PortSwitch
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 
-class RecoverySwitch(Diagram):
+class RecoverySwitch(FloatSystem, Diagram):
     """Passes the nominal set point through until Γ falls, then plays recovery steps.
 
     .. pydrake_system::
@@ -22,15 +23,19 @@ class RecoverySwitch(Diagram):
         - plant_state
         - nominal_desired_output
         - nominal_desired_preview
+        - nominal_desired_outlook
         output_ports:
         - desired_output
         - desired_preview
+        - desired_outlook
         - desired_foot_positions
+        - desired_yaw
         - stance_pose
         - recovery_active
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan goes on over the new
-    footholds, and ``desired_foot_positions`` to the controller.
+    footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. What the robot
+    is about to do is told by preview and outlook alike: connect whatever judges it to these.
 
     Args:
         kinematics: The robot as the controller believes it to be.
@@ -39,7 +44,8 @@ class RecoverySwitch(Diagram):
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger behind Γ, and of the step planner behind the trigger [s].
             Simultaneous discrete updates would each add a whole period.
-        horizon: H of the preview.
+        horizon: H, samples of the preview.
+        num_outlook: M, samples of the outlook.
     """
 
     def __init__(
@@ -51,6 +57,7 @@ class RecoverySwitch(Diagram):
         period_s: float,
         offset_s: float,
         horizon: int,
+        num_outlook: int,
     ):
         super().__init__()
         builder = DiagramBuilder()
@@ -66,6 +73,7 @@ class RecoverySwitch(Diagram):
                 period_s=period_s,
                 offset_s=2 * offset_s,
                 horizon=horizon,
+                num_outlook=num_outlook,
             ),
         )
         planner = self.step_planner
@@ -80,7 +88,12 @@ class RecoverySwitch(Diagram):
         builder.Connect(
             planner.GetOutputPort("recovery_done"), trigger.GetInputPort("recovery_done")
         )
-        for name, size in (("desired_output", 3), ("desired_preview", 3 * horizon)):
+        sizes = {
+            "desired_output": 3,
+            "desired_preview": 3 * horizon,
+            "desired_outlook": 3 * num_outlook,
+        }
+        for name, size in sizes.items():
             switch = builder.AddNamedSystem(f"{name}_switch", PortSwitch(size))
             builder.Connect(
                 trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
@@ -90,10 +103,10 @@ class RecoverySwitch(Diagram):
             if name == "desired_output":
                 builder.ConnectInput("nominal_desired_output", nominal)
             else:
-                builder.ExportInput(nominal, "nominal_desired_preview")
+                builder.ExportInput(nominal, f"nominal_{name}")
             builder.Connect(planner.GetOutputPort(name), recovery)
             builder.ExportOutput(switch.GetOutputPort("value"), name)
-        for name in ("desired_foot_positions", "stance_pose"):
+        for name in ("desired_foot_positions", "desired_yaw", "stance_pose"):
             builder.ExportOutput(planner.GetOutputPort(name), name)
         builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
         builder.BuildInto(self)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    InputPortIndex,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
+
+from drake_safety.systems.float_system import FloatSystem
 
 
-class RecoveryTrigger(LeafSystem):
+class RecoveryTrigger(FloatSystem, LeafSystem):
     """Switches to recovery when Γ < Γ_thre, and back when the recovery reports that it is done.
 
     .. pydrake_system::
@@ -43,30 +39,28 @@ class RecoveryTrigger(LeafSystem):
         if not 0 <= threshold <= 1:
             raise ValueError(f"recovery trigger: threshold must be in [0, 1]; got {threshold}")
         self.threshold = threshold
-        self.DeclareVectorInputPort("safety_probability", 1)
-        self.DeclareVectorInputPort("recovery_done", 1)
-        state = self.DeclareDiscreteState(1)
+        self._probability_port = self.DeclareVectorInputPort("safety_probability", 1)
+        self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
+        self._active = self.DeclareDiscreteState(1)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
-        ticket = {self.discrete_state_ticket(state)}
         self.DeclareAbstractOutputPort(
-            "port_selector", lambda: Value(InputPortIndex(1)), self._calc_selector, ticket
+            "port_selector",
+            lambda: Value(InputPortIndex(1)),
+            self._calc_selector,
+            {self.discrete_state_ticket(self._active)},
         )
-        self.DeclareVectorOutputPort("recovery_active", BasicVector(1), self._calc_active, ticket)
+        self.DeclareStateOutputPort("recovery_active", self._active)
 
     def _is_active(self, context: Context) -> bool:
-        return bool(context.get_discrete_state_vector().GetAtIndex(0) > 0)
+        return bool(context.get_discrete_state(self._active).GetAtIndex(0) > 0)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._is_active(context):
-            done = self.GetInputPort("recovery_done")
+            done = self._done_port
             active = not (done.HasValue(context) and done.Eval(context)[0] > 0)
         else:
-            probability = self.GetInputPort("safety_probability").Eval(context)[0]
-            active = not probability >= self.threshold
-        discrete_state.set_value([float(active)])
+            active = not self._probability_port.Eval(context)[0] >= self.threshold
+        discrete_state.set_value(self._active, [float(active)])
 
     def _calc_selector(self, context: Context, output: Value) -> None:
         output.set_value(InputPortIndex(2 if self._is_active(context) else 1))
-
-    def _calc_active(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(self._is_active(context)))

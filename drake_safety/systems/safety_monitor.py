@@ -7,6 +7,8 @@ from typing import Protocol
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_safety.systems.float_system import FloatSystem
+
 
 class SafeSet(Protocol):
     """What a safe set offers: the names of its constraints and their signed margins."""
@@ -18,7 +20,7 @@ class SafeSet(Protocol):
         ...
 
 
-class SafetyMonitor(LeafSystem):
+class SafetyMonitor(FloatSystem, LeafSystem):
     """Watches the plant's true state against the safe set.
 
     .. pydrake_system::

@@ -9,9 +9,10 @@ from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import add_noise, stance_state, state_names
 from drake_safety.robots.robot import ObservationNoise
+from drake_safety.systems.float_system import FloatSystem
 
 
-class StateObserver(LeafSystem):
+class StateObserver(FloatSystem, LeafSystem):
     """Measures a robot: plant state plus noise, the stance-frame state s_k, the output z_k.
 
     .. pydrake_system::

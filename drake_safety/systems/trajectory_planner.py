@@ -11,6 +11,8 @@ from pydrake.polynomial import Polynomial
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.systems.float_system import FloatSystem
+
 
 def interpolate(
     start: np.ndarray,
@@ -94,7 +96,7 @@ def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
 
 
-class TrajectoryPlanner(LeafSystem):
+class TrajectoryPlanner(FloatSystem, LeafSystem):
     """Plays a plan z*(t) and previews its next H samples.
 
     .. pydrake_system::

@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.whole_body_model import (
@@ -15,12 +15,13 @@ from drake_safety.control.whole_body_model import (
     WholeBodyReference,
 )
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
+from drake_safety.systems.float_system import FloatSystem
 
 NOT_FINITE = 1
 """Solver status of a tick whose state or set point no controller could use."""
 
 
-class WholeBodyController(LeafSystem):
+class WholeBodyController(FloatSystem, LeafSystem):
     """Torques that follow weighted tasks while the feet stand still, by one QP a tick.
 
     .. pydrake_system::
@@ -84,14 +85,13 @@ class WholeBodyController(LeafSystem):
         self._rate_port = self.DeclareVectorInputPort("desired_output_rate", 3)
         standing = self.model.reference(kinematics.standing_positions())
         self._reference_index = self.DeclareAbstractParameter(Value(standing))
-        # State: torques of the actuators, solver status, failed ticks since the initialisation.
-        self._num_actuators = n_u = len(matrix)
-        state = self.DeclareDiscreteState(n_u + 2)
+        self._actuation = self.DeclareDiscreteState(len(matrix))  # Torques of the actuators.
+        self._status = self.DeclareDiscreteState(1)
+        self._num_failures = self.DeclareDiscreteState(1)  # Since the initialisation.
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
-        ticket = {self.discrete_state_ticket(state)}
-        self.DeclareVectorOutputPort("actuation", BasicVector(n_u), self._calc_actuation, ticket)
-        self.DeclareVectorOutputPort("solver_status", BasicVector(1), self._calc_status, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._tick)
+        self.DeclareStateOutputPort("actuation", self._actuation)
+        self.DeclareStateOutputPort("solver_status", self._status)
 
     def set_reference(self, context: Context, reference: WholeBodyReference) -> None:
         """Sets where the robot stands and how: stance, centre of mass, orientations, posture.
@@ -109,7 +109,7 @@ class WholeBodyController(LeafSystem):
 
     def num_failures(self, context: Context) -> int:
         """Ticks since the initialisation whose ``solver_status`` was not 0."""
-        return int(context.get_discrete_state_vector().get_value()[-1])
+        return int(context.get_discrete_state(self._num_failures).GetAtIndex(0))
 
     def _reference(self, context: Context) -> WholeBodyReference:
         reference = context.get_abstract_parameter(self._reference_index).get_value()
@@ -125,8 +125,7 @@ class WholeBodyController(LeafSystem):
             reference.reaching = point
         return reference
 
-    def _tick(self, context: Context, command: np.ndarray, num_failures: float) -> np.ndarray:
-        """The discrete state after a tick that starts from the command before it."""
+    def _tick(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
         try:
             qp = build_qp(
@@ -138,18 +137,13 @@ class WholeBodyController(LeafSystem):
             solution = solve_qp(qp)
             status = solution.status
             if status == SOLVED:
-                command = self._matrix @ solution.torques
-        return np.concatenate([command, [status, num_failures + (status != SOLVED)]])
+                discrete_state.set_value(self._actuation, self._matrix @ solution.torques)
+        discrete_state.set_value(self._status, [status])
+        if status != SOLVED:
+            num_failures = discrete_state.get_value(self._num_failures)
+            discrete_state.set_value(self._num_failures, num_failures + 1)
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._tick(context, np.zeros(self._num_actuators), 0.0))
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = context.get_discrete_state_vector().get_value()
-        discrete_state.set_value(self._tick(context, state[:-2], state[-1]))
-
-    def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().get_value()[:-2])
-
-    def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = context.get_discrete_state_vector().get_value()[-2]
+        discrete_state.set_value(self._actuation, np.zeros(len(self._matrix)))
+        discrete_state.set_value(self._num_failures, [0])
+        self._tick(context, discrete_state)
