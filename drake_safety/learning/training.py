@@ -107,6 +107,7 @@ def learned_maps(
         targeted.score,
         score_weight=parameters.score_weight,
         num_neighbours=int(3 * parameters.perplexity),
+        backend=parameters.distance_backend,
         progress=stage("distances"),
     )
     points = tsne(
