@@ -21,9 +21,10 @@ class AdaptationParameters:
         update_interval: k_u, feedback sets from one update to the next.
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
             its own cell, or literally the number of all feedback sets (paper).
-        offset_std: Standard deviation of the prior of what changes in L's offset (sharpened).
-        slope_std: The same of either slope of L (sharpened).
-        hidden_std: The same of what the maps' last hidden layer adds to L, where its activations
+        offset_std: Standard deviation of the prior of what changes in the base logit's
+            offset (sharpened).
+        slope_std: The same of either of its slopes (sharpened).
+        hidden_std: The same of what the maps' last hidden layer adds to it, where its activations
             are as far from their mean as they are in feedback (sharpened).
     """
 
@@ -80,8 +81,8 @@ class AssessmentParameters:
         batch_size: Segments a training step.
         epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of the episodes that no map learns from: what the maps say of those
-            together makes Gamma a probability (sharpened).
+        held_out: Share of the episodes that maps are tried on, before others of their kind learn
+            from all: what they say of these makes Gamma a probability (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Share of activations dropped in training (sharpened).
         target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
@@ -117,7 +118,7 @@ class AssessmentParameters:
     batch_size: int = 512
     epochs: int = 18
     ensemble_size: int = 3
-    held_out: float = 0.1
+    held_out: float = 0.2
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
     dropout: float = 0.2
     target_weight: float = 0.1
