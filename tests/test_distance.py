@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
+import tslearn.metrics
 
 from drake_safety.learning import distance
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import dtw_matrix, neighbour_graph
+from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
+from drake_safety.learning.training import learned_maps, segments_for
 from lip_episodes import make_episodes
 
 
@@ -47,6 +51,24 @@ def test_the_graph_holds_exactly_the_nearest_neighbours(segments, block, score_w
     omega = matrix / matrix.max() + score_weight * np.abs(score[:, None] - score)
     found = np.take_along_axis(omega, graph.indices, axis=1)
     np.testing.assert_allclose(found, graph.distances, atol=1e-12)
+
+
+def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
+    episodes, learned, asked = make_episodes(40), {}, []
+    cdist = tslearn.metrics.cdist_dtw
+    monkeypatch.setattr(tslearn.metrics, "cdist_dtw", lambda *of: asked.append(of) or cdist(*of))
+    for backend in distance.BACKENDS:
+        parameters = AssessmentParameters(
+            distance_backend=backend, mode="paper", perplexity=5.0, epochs=1
+        )
+        training = segments_for(episodes, parameters)
+        x = training.segments.state
+        grid = Grid(resolution=14, cell_length=10.0)
+        learned[backend], _ = learned_maps(training, x, grid, parameters, None)
+        assert bool(asked) == (backend == "tslearn")
+    assert learned["tslearn"].is_same(learned["dtaidistance"])
+    with pytest.raises(ValueError, match=r"distance_backend is fast, expected one of .*tslearn"):
+        AssessmentParameters(distance_backend="fast")
 
 
 def test_no_segment_is_its_own_neighbour_nor_twice_the_same(segments):

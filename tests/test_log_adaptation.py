@@ -69,7 +69,7 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         files.append(write(recorded(index), joints, kind, tmp_path / f"{index}"))
     (tmp_path / "columns.yaml").write_text(map_text(kind))
     logs = [option for file in files for option in ("--log", file)]
-    options = ("--assessment", folder, "--map", tmp_path / "columns.yaml", "--seed", 0)
+    options = ("--assessment", folder, "--map", tmp_path / "columns.yaml")
     assert not call(monkeypatch, "adapt", folder / "short.yaml", *logs, *options)
     for mode in MODES:
         adapted = load(adapted_folder(folder, files[0].stem), mode)

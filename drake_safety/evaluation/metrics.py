@@ -99,15 +99,12 @@ def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
     """
     if not 0 <= count <= n:
         raise ValueError(f"proportion: count is {count}, expected 0..{n}")
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    tail = 0.5 * (1.0 - confidence)
-    return Figure(
-        value=count / n if n else math.nan,
-        low=float(beta.ppf(tail, count, n - count + 1)) if count > 0 else 0.0,
-        high=float(beta.ppf(1.0 - tail, count + 1, n - count)) if count < n else 1.0,
-        n=int(n),
-    )
+    if n == 0:
+        return Figure(value=math.nan, low=0.0, high=1.0, n=0)
+    interval = binomtest(count, n).proportion_ci(confidence, method="exact")
+    return Figure(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
 
 
 def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Figure:

@@ -38,7 +38,8 @@ class TrainingScores:
         points: Psi(x), (K, N, 2).
         score: lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        heads: What L is made of, see `BaseLogit.heads`, (N, 2); none where the maps have no heads.
+        heads: What the base logit is made of, see `BaseLogit.heads`, (N, 2); none where the maps
+            have no heads.
         nearest: Column of the constraint that is predicted to be nearest its violation, (N,).
     """
 

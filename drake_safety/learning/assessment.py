@@ -31,7 +31,7 @@ from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit,
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episodes, EpisodesInfo
 from drake_safety.learning.trained_maps import INPUT_LIMIT
-from drake_safety.learning.training import fitted_base_logit, learned_maps, segments_for
+from drake_safety.learning.training import learned_maps, segments_for
 
 __all__ = [
     "MODES",
@@ -57,10 +57,11 @@ class SafetyAssessment:
       prediction takes other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
       segments in the cells, (K, N, 2), (N,), (N,), which adaptation starts from; where the maps
-      have heads also `training_heads_` and `training_nearest_`, what the `BaseLogit` L of the
+      have heads also `training_heads_` and `training_nearest_`, what the `BaseLogit` of the
       segments is made of and the constraint that is predicted to be nearest, (N, 2), (N,).
-    - `base_logit_`: L, which scales the maps' heads to one logit; None without heads.
-    - `correction_`: the `Correction`, what feedback adds to L; nothing before any.
+    - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
+    - `correction_`: the `Correction`, what feedback adds to the base logit;
+      nothing before any.
     - `adaptation_`: the `Adaptation` to feedback; None before any.
     - `used_`: every set of episodes that was learned from, calibrated or adapted with, as
       `UsedEpisodes`: what judges the assessment must be drawn with other seeds.
@@ -119,18 +120,17 @@ class SafetyAssessment:
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, is_held_out = learned_maps(training, x, self.grid_, parameters, progress)
+        self.embedding_, base_logit = learned_maps(training, x, self.grid_, parameters, progress)
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
         self.training_score_ = assessment_file.single(segments.score)
         self.training_cause_ = segments.cause
-        self.base_logit_: BaseLogit | None = None
+        self.base_logit_: BaseLogit | None = base_logit
         self.training_heads_ = self.training_nearest_ = None
-        if self.embedding_.has_heads:
+        if base_logit is not None:
             margins = output.margins.mean(axis=0)
-            self.base_logit_ = fitted_base_logit(output, is_held_out, segments, parameters)
-            self.training_heads_ = assessment_file.single(self.base_logit_.heads(output))
+            self.training_heads_ = assessment_file.single(base_logit.heads(output))
             self.training_nearest_ = (
                 margins.argmin(axis=1)
                 if margins.shape[1]
@@ -176,9 +176,9 @@ class SafetyAssessment:
 
         Args:
             feedback: Pairs of actual episodes and their nominal twins.
-            method: "recalibration" changes L, and scores with it; "paper" is the paper's update, by
-                a discrepancy function and feedback beliefs. By default "paper" in the paper's mode
-                and without heads, else "recalibration".
+            method: "recalibration" changes the base logit, and scores with it; "paper" is the
+                paper's update, by a discrepancy function and feedback beliefs. By default "paper"
+                in the paper's mode and without heads, else "recalibration".
 
         Returns:
             Another assessment with the same maps.
@@ -328,7 +328,7 @@ class SafetyAssessment:
             desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
             features: Features, (N, n_f); the paper's mode has no use for them.
             beliefs: Beliefs of the cells instead of `beliefs_`, (K, R*R, 3 + n_c).
-            correction: What is added to L instead of `correction_`.
+            correction: What is added to the base logit instead of `correction_`.
 
         Returns:
             The assessments. An input that is not finite is empty: Gamma is 0 there.

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from drake_safety.learning.distance import BACKENDS
+
 MODES = ("paper", "sharpened")
 
 
@@ -19,9 +21,10 @@ class AdaptationParameters:
         update_interval: k_u, feedback sets from one update to the next.
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
             its own cell, or literally the number of all feedback sets (paper).
-        offset_std: Standard deviation of the prior of what changes in L's offset (sharpened).
-        slope_std: The same of either slope of L (sharpened).
-        hidden_std: The same of what the maps' last hidden layer adds to L, where its activations
+        offset_std: Standard deviation of the prior of what changes in the base logit's
+            offset (sharpened).
+        slope_std: The same of either of its slopes (sharpened).
+        hidden_std: The same of what the maps' last hidden layer adds to it, where its activations
             are as far from their mean as they are in feedback (sharpened).
     """
 
@@ -70,14 +73,16 @@ class AssessmentParameters:
         min_count: k_min, beliefs below which a cell stays empty.
         resolution: Cells a side of the grid.
         cell_length: Side of a cell.
+        distance_backend: What computes dynamic time warping: "dtaidistance", or "tslearn", which
+            takes some twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
         seed: Seeds t-SNE and the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments a training step.
         epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of the episodes that no map learns from: what the maps say of those
-            together makes Gamma a probability (sharpened).
+        held_out: Share of the episodes that maps are tried on, before others of their kind learn
+            from all: what they say of these makes Gamma a probability (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Share of activations dropped in training (sharpened).
         target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
@@ -106,13 +111,14 @@ class AssessmentParameters:
     min_count: int = 5
     resolution: int = 14
     cell_length: float = 10.0
+    distance_backend: str = "dtaidistance"
     perplexity: float = 30.0
     seed: int = 0
     learning_rate: float = 2e-3
     batch_size: int = 512
     epochs: int = 18
     ensemble_size: int = 3
-    held_out: float = 0.1
+    held_out: float = 0.2
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
     dropout: float = 0.2
     target_weight: float = 0.1
@@ -131,6 +137,9 @@ class AssessmentParameters:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
             )
+        self._expect(
+            "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
+        )
         for name in ("discount", "initial_uncertainty"):
             self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in (

@@ -38,7 +38,8 @@ class DiscrepancyFunction:
         Raises:
             ValueError: No point is finite.
         """
-        from scipy.linalg import cho_solve, cholesky
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import RBF
 
         is_finite = np.isfinite(points).all(axis=1)
         points, difference = points[is_finite].astype(float), difference[is_finite].astype(float)
@@ -47,18 +48,11 @@ class DiscrepancyFunction:
         kernel = _fitted(self._kernel, points, difference)
         self.length_scale = float(kernel.k1.k2.length_scale)
         self.noise = float(kernel.k2.noise_level)
-        self._points = points
-        covariance = self._covariance(points, points)
-        covariance[np.diag_indices_from(covariance)] += self.noise
-        self._factor = cholesky(covariance, lower=True, overwrite_a=True)
-        self._weight = cho_solve((self._factor, True), difference)
+        # The noise is of what was seen, and no part of sigma.
+        self._process: Any = GaussianProcessRegressor(
+            RBF(self.length_scale), alpha=self.noise, optimizer=None
+        ).fit(points, difference)
         return self
-
-    def _covariance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        squared = (
-            (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2.0 * one @ other.T
-        ) / self.length_scale**2
-        return np.exp(-0.5 * np.maximum(squared, 0.0))
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean m, clipped to [0, 1], and standard deviation sigma without the noise.
@@ -69,19 +63,13 @@ class DiscrepancyFunction:
         Returns:
             m and sigma, (M,) each; 0 and 1, the prior's, where a point is not finite.
         """
-        from scipy.linalg import solve_triangular
-
         mean, deviation = np.zeros(len(points)), np.ones(len(points))
         rows = np.flatnonzero(np.isfinite(points).all(axis=1))
         for start in range(0, len(rows), _CHUNK):
             chunk = rows[start : start + _CHUNK]
-            cross = self._covariance(self._points, points[chunk].astype(float))
-            mean[chunk] = self._weight @ cross
-            explained = solve_triangular(
-                self._factor, cross, lower=True, overwrite_b=True, check_finite=False
+            mean[chunk], deviation[chunk] = self._process.predict(
+                points[chunk].astype(float), return_std=True
             )
-            variance = 1.0 - np.einsum("ij,ij->j", explained, explained)
-            deviation[chunk] = np.sqrt(np.maximum(variance, 0.0))
         return np.clip(mean, 0.0, 1.0), deviation
 
 

@@ -4,7 +4,7 @@ Only the nearest neighbours under Omega are ever kept. Two exact bounds make thi
 Euclidean distance of two error sequences, the shorter one held at its last value, is the cost of
 one admissible warping path and so bounds DTW from above; it gives each segment a radius within
 which its neighbours must lie. Sorted by that radius, a block of segments needs DTW only up to its
-own largest radius, and the C implementation abandons a pair as soon as it exceeds it.
+own largest radius, and dtaidistance's C implementation abandons a pair as soon as it exceeds it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def dtw_matrix(
     Args:
         error: Error sequences, (N, H, n_z).
         length: Samples of each that count, (N,).
-        backend: "dtaidistance", or "tslearn", the slower oracle with the same values.
+        backend: "dtaidistance", or "tslearn", which is slower and gives the same values.
 
     Returns:
         Symmetric matrix (N, N).
@@ -55,16 +55,12 @@ def dtw_matrix(
     if num_segments > _MAX_DENSE:
         raise ValueError(
             f"dtw_matrix: {num_segments} segments would need a dense matrix, expected at most "
-            f"{_MAX_DENSE}; neighbour_graph with backend 'dtaidistance' has no such limit"
+            f"{_MAX_DENSE}; neighbour_graph has no such limit"
         )
     _check_backend(backend)
     series = _series(error, length)
-    if backend == "tslearn":
-        from tslearn.metrics import cdist_dtw
-        from tslearn.utils import to_time_series_dataset
-
-        return np.asarray(cdist_dtw(to_time_series_dataset(series)))
-    return _dtw_block(series, slice(0, num_segments), slice(0, num_segments))
+    every = slice(0, num_segments)
+    return _dtw_block(series, every, every, backend)
 
 
 def neighbour_graph(
@@ -86,7 +82,7 @@ def neighbour_graph(
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
-        backend: "dtaidistance", or "tslearn" for up to 4000 segments.
+        backend: "dtaidistance", or "tslearn", which has no use for the bounds.
         progress: Called with the fraction done.
 
     Returns:
@@ -106,13 +102,9 @@ def neighbour_graph(
         )
     if not np.all(np.isfinite(error)):
         raise ValueError("neighbour_graph: the errors hold values that are not finite")
-    if backend == "tslearn":
-        return _dense_graph(
-            dtw_matrix(error, length, backend=backend), score, score_weight, num_neighbours
-        )
     series = _series(error, length)
     held = _hold_last(error, length)
-    max_dtw = _max_dtw(series, held)
+    max_dtw = _max_dtw(series, held, backend)
     scale = 1.0 / max_dtw if max_dtw > 0.0 else 0.0
     radius = np.empty(num_segments)
     for rows, bound in _euclidean_blocks(held):
@@ -130,7 +122,7 @@ def neighbour_graph(
     for start in range(0, num_segments, _BLOCK):
         stop = min(start + _BLOCK, num_segments)
         limit = radius[stop - 1] * max_dtw * (1.0 + _SLACK)
-        omega = _dtw_block(series, slice(0, stop), slice(start, stop), limit)
+        omega = _dtw_block(series, slice(0, stop), slice(start, stop), backend, limit)
         # Omega^ij = w^ij / w_max + delta |lambda^i - lambda^j|
         omega *= scale
         omega += score_weight * np.abs(sorted_score[:stop, None] - sorted_score[start:stop])
@@ -171,18 +163,22 @@ def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 
 def _dtw_block(
-    series: list[np.ndarray], rows: slice, columns: slice, limit: float = np.inf
+    series: list[np.ndarray], rows: slice, columns: slice, backend: str, limit: float = np.inf
 ) -> np.ndarray:
-    """DTW of `rows` against `columns`; infinite where it exceeds `limit`."""
+    """DTW of `rows` against `columns`; where it exceeds `limit` it may be infinite."""
+    if backend == "tslearn":
+        from tslearn.metrics import cdist_dtw
+        from tslearn.utils import to_time_series_dataset
+
+        sides = (to_time_series_dataset(series[part]) for part in (rows, columns))
+        return np.asarray(cdist_dtw(*sides))
     from dtaidistance import dtw_ndim
 
-    if limit <= 0.0:
-        limit = np.finfo(float).tiny
     distances = dtw_ndim.distance_matrix_fast(
         series,
         ndim=series[0].shape[1],
         block=((rows.start, rows.stop), (columns.start, columns.stop), False),
-        max_dist=limit if np.isfinite(limit) else None,
+        max_dist=max(limit, np.finfo(float).tiny) if np.isfinite(limit) else None,
         compact=True,
         parallel=True,
     )
@@ -203,12 +199,12 @@ def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
         yield rows, np.sqrt(block, out=block)
 
 
-def _max_dtw(series: list[np.ndarray], held: np.ndarray) -> float:
+def _max_dtw(series: list[np.ndarray], held: np.ndarray, backend: str) -> float:
     """w_max over all pairs, with DTW only where the Euclidean bound exceeds the largest yet."""
     by_size = np.argsort(-np.linalg.norm(held - held.mean(axis=0), axis=1), kind="stable")
     held = held[by_size] - held.mean(axis=0)
     first = [series[i] for i in by_size[:64]]
-    largest = float(_dtw_block(first, slice(0, len(first)), slice(0, len(first))).max())
+    largest = float(_dtw_block(first, slice(0, len(first)), slice(0, len(first)), backend).max())
     for rows, bound in _euclidean_blocks(held):
         is_open = bound > largest
         is_open[:, : rows.start] = False
@@ -218,7 +214,7 @@ def _max_dtw(series: list[np.ndarray], held: np.ndarray) -> float:
             chosen = open_columns[first_column : first_column + 8 * _BLOCK]
             pool = [series[by_size[i]] for i in (*open_rows, *chosen)]
             split = len(open_rows)
-            block = _dtw_block(pool, slice(0, split), slice(split, len(pool)))
+            block = _dtw_block(pool, slice(0, split), slice(split, len(pool)), backend)
             largest = max(largest, float(block.max()))
     return largest
 
@@ -239,16 +235,3 @@ def _keep_nearest(
     nearest = np.argpartition(pool, num_neighbours - 1, axis=1)[:, :num_neighbours]
     distances[rows] = np.take_along_axis(pool, nearest, axis=1)
     indices[rows] = np.take_along_axis(pool_indices, nearest, axis=1)
-
-
-def _dense_graph(
-    dtw: np.ndarray, score: np.ndarray, score_weight: float, num_neighbours: int
-) -> NeighbourGraph:
-    max_dtw = float(dtw.max())
-    omega = dtw / max_dtw if max_dtw > 0.0 else np.zeros_like(dtw)
-    omega += score_weight * np.abs(score[:, None] - score)
-    np.fill_diagonal(omega, np.inf)
-    indices = np.argsort(omega, axis=1, kind="stable")[:, :num_neighbours]
-    return NeighbourGraph(
-        indices=indices, distances=np.take_along_axis(omega, indices, axis=1), max_dtw=max_dtw
-    )

@@ -13,7 +13,7 @@ from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 LOGIT_LIMIT = 8.0
 """Largest logit that a head is believed."""
 SHIFT_LIMIT = 100.0
-"""Largest shift of L: beyond it sigma is 0 or 1 anyway, and exp must not overflow."""
+"""Largest shift of the base logit: beyond it sigma is 0 or 1 anyway, and exp must not overflow."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -71,7 +71,7 @@ class Assessment:
 
 @dataclass(frozen=True, kw_only=True)
 class BaseLogit:
-    """L, one logit of an unsafe end from what the maps' heads say.
+    """The base logit: one logit of an unsafe end from what the maps' heads say.
 
     ``offset + safety_slope z - margin_slope m / margin_unit``, where z is the mean logit of the
     safety heads and m the smallest predicted margin; a head that is missing has no part in it.
@@ -79,7 +79,7 @@ class BaseLogit:
     Attributes:
         margin_unit: Unit of margins [unit of the margins].
         margin_range: Margins are clipped to this range [unit of the margins].
-        offset: L where both heads are zero.
+        offset: The base logit where both heads are zero.
         safety_slope: What a logit of the safety heads counts for.
         margin_slope: Logits by which a margin of one unit is safer.
     """
@@ -101,22 +101,22 @@ class BaseLogit:
         return found
 
     def of_heads(self, heads: np.ndarray) -> np.ndarray:
-        """L, (N,), of what `heads` gave."""
+        """The base logit, (N,), of what `heads` gave."""
         logit = self.offset + heads @ (self.safety_slope, self.margin_slope)
         return np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
 @dataclass(eq=False, slots=True)
 class Correction:
-    """What feedback adds to L: a change of its three numbers, and of what else the maps know.
+    """What feedback adds to the base logit: to its three numbers, and by what else the maps know.
 
     Attributes:
-        change: What is added to L's offset, safety slope and margin slope, (3,).
+        change: What is added to the offset, safety slope and margin slope, (3,).
         hidden: What each activation of the maps' last hidden layer, and a last entry of 1, adds to
-            L, (K, num_activations + 1).
+            the base logit, (K, num_activations + 1).
         hidden_range: Least and most that they add together, (2,): what they added in feedback, for
             beyond it nobody knows.
-        guard: 1 in cells of each map where L must not fall, else 0, (K, R*R).
+        guard: 1 in cells of each map where the base logit must not fall, else 0, (K, R*R).
     """
 
     change: np.ndarray
@@ -140,14 +140,14 @@ class Correction:
         return bool(self.change.any() or self.hidden.any())
 
     def residual(self, embedding: Embedding, x: np.ndarray) -> np.ndarray:
-        """What the hidden layer adds to L at finite inputs (N, n_x), (N,)."""
+        """What the hidden layer adds at finite inputs (N, n_x), (N,)."""
         if not self.hidden.any():
             return np.zeros(len(x))
         added = hidden_sum(embedding.activations(x), self.hidden)
         return np.clip(added, *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
-        """What is added to L, (N,).
+        """What is added to the base logit, (N,).
 
         Args:
             heads: z and -m / margin_unit, (N, 2).
@@ -196,8 +196,8 @@ def predict(
         embedding: The maps.
         grid: The grid of their cells.
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        correction: What feedback adds to L.
-        base_logit: L; None without heads.
+        correction: What feedback adds to the base logit.
+        base_logit: The base logit; None without heads.
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)

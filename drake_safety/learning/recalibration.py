@@ -1,4 +1,4 @@
-"""How feedback changes L, and beliefs with it: the update of the sharpened mode."""
+"""How feedback changes the base logit, and beliefs with it: the update of the sharpened mode."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Outcomes:
     """What the maps say of rows of episodes, and how the episodes ended.
 
     Attributes:
-        heads: What L is made of, see `BaseLogit.heads`, (M, 2).
+        heads: What the base logit is made of, see `BaseLogit.heads`, (M, 2).
         activations: Of the maps' last hidden layer, (K, M, n).
         is_unsafe: Whether the row's episode ended unsafely, (M,).
         weight: What the row counts for, (M,).
@@ -59,7 +59,7 @@ def outcomes(
         feedback: The feedback sets.
         inputs: x from states, previews and features.
         embedding: The maps.
-        base_logit: L.
+        base_logit: The base logit.
     """
     num_rows = np.array([len(one) for one in feedback])
     sides = (
@@ -95,21 +95,21 @@ def outcomes(
 def fitted_change(
     actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is added to L, by its own three numbers and by the maps' last hidden layer.
+    """What is added to the base logit, by its own three numbers and by the maps' last hidden layer.
 
-    With phi = (1, z, -m / margin_unit, activations), w minimises the log loss of
-    sigma(L + w . phi) on the actual episodes, with a normal prior, and less what L itself is wrong
-    about at the start of the twins: w . sum phi (sigma(L) - label). What is hard to tell of a start
-    is so for both of a pair and cancels, and so does what L is wrong about on the nominal plant,
-    too. Later a twin is in another state, and its end says nothing of where the actual robot is:
-    those rows of the actual episodes count without one. Activations are taken from their mean in
-    units of their mean distance from it, so that all of them together add as much as `hidden_std`
-    says. What the slopes of L change by leaves them >= 0.
+    With phi = (1, z, -m / margin_unit, activations), w minimises the log loss of sigma(ell + w .
+    phi), ell being a row's base logit, on the actual episodes, with a normal prior, and less what
+    ell itself is wrong about at the start of the twins: w . sum phi (sigma(ell) - label). What is
+    hard to tell of a start is so for both of a pair and cancels, and so does what ell is wrong
+    about on the nominal plant, too. Later a twin is in another state, and its end says nothing of
+    where the actual robot is: those rows of the actual episodes count without one. Activations are
+    taken from their mean in units of their mean distance from it, so that all of them together add
+    as much as `hidden_std` says. What the slopes change by leaves them >= 0.
 
     Args:
         actual: Rows of the actual episodes.
         twins: The twins' first rows.
-        base_logit: L.
+        base_logit: The base logit.
         settings: Standard deviations of the prior.
 
     Returns:
@@ -198,15 +198,15 @@ def recalibrated_beliefs(
 
     Departure: the paper learns where the nominal scores are unreliable and trusts them less there.
     That hardly moves the safe share of a cell, as F keeps the ratio of its masses, and the
-    discrepancy has no sign. Adding sigma(L + shift) - sigma(L) to every score moves the boundary
-    between safe and unsafe itself. What the hidden layer adds is known where feedback was: its
-    mean in a cell holds for all that the cell was trained on.
+    discrepancy has no sign. Adding sigma(ell + shift) - sigma(ell) to every score moves the
+    boundary between safe and unsafe itself. What the hidden layer adds is known where feedback was:
+    its mean in a cell holds for all that the cell was trained on.
 
     Args:
         training: The training segments.
-        base_logit: L.
-        correction: What is added to L.
-        residual: What the hidden layer adds to L in every map's cells, (K, R*R).
+        base_logit: The base logit.
+        correction: What is added to the base logit.
+        residual: What the hidden layer adds to it in every map's cells, (K, R*R).
         grid: The grid.
         parameters: Of the assessment.
         num_causes: n_c.

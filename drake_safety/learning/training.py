@@ -82,7 +82,7 @@ def learned_maps(
     grid: Grid,
     parameters: AssessmentParameters,
     progress: StageProgress | None,
-) -> tuple[Embedding, np.ndarray]:
+) -> tuple[Embedding, BaseLogit | None]:
     """t-SNE of the segments, and the maps Psi that reproduce it.
 
     Args:
@@ -93,7 +93,7 @@ def learned_maps(
         progress: Called with "distances", "t-SNE", "training" and the fraction that is done.
 
     Returns:
-        The maps, and which segments they did not learn from, (N,).
+        The maps, and the base logit of their heads; None without heads.
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
@@ -107,6 +107,7 @@ def learned_maps(
         targeted.score,
         score_weight=parameters.score_weight,
         num_neighbours=int(3 * parameters.perplexity),
+        backend=parameters.distance_backend,
         progress=stage("distances"),
     )
     points = tsne(
@@ -125,14 +126,34 @@ def learned_maps(
         input_scale=_input_scale(x.shape[1], segments.features.shape[1], parameters),
     )
     is_held_out = held_out_segments(segments, parameters)
-    return _train(data, is_held_out, parameters, stage("training")), is_held_out
+    label = segments.is_unsafe[is_held_out]
+    report = stage("training")
+    if not parameters.is_sharpened or not 0 < label.sum() < len(label):
+        # There is nothing to try maps on.
+        embedding = _train(data, parameters, report)
+        tried, is_held_out = embedding, np.ones(len(segments), dtype=bool)
+    else:
+        # As scikit-learn's CalibratedClassifierCV(ensemble=False): others like them are tried on
+        # what they have not learned, and no episode is lost to the maps themselves.
+        tried = _train(data.take(~is_held_out), parameters, _part(report, 0))
+        embedding = _train(data, parameters, _part(report, 1))
+    if not embedding.has_heads:
+        return embedding, None
+    return embedding, fitted_base_logit(
+        tried.evaluate(x[is_held_out]), segments.take(is_held_out), parameters
+    )
+
+
+def _part(progress: Callable[[float], None] | None, half: int) -> Callable[[float], None] | None:
+    """Tells of the first or second half of a stage."""
+    return None if progress is None else lambda fraction: progress(0.5 * (half + fraction))
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Which segments no map learns from, (N,): those of some episodes, the same for all maps.
+    """Which segments are held out for the base logit, (N,): those of some episodes.
 
-    L is asked for the mean of the ensemble. What that is worth shows only where none of the maps
-    knows the end, and a mean over maps of which one does not is another quantity.
+    The base logit is asked for the mean of the ensemble. What that is worth shows only where none
+    of the maps knows the end, so all of them leave out the same episodes.
 
     Args:
         segments: The training segments.
@@ -165,7 +186,6 @@ def _input_scale(
 
 def _train(
     data: MapData,
-    is_held_out: np.ndarray,
     parameters: AssessmentParameters,
     progress: Callable[[float], None] | None,
 ) -> Embedding:
@@ -183,7 +203,6 @@ def _train(
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
     num_members = parameters.num_members
-    learned = data.take(~is_held_out)
     members = []
     for member in range(num_members):
 
@@ -194,7 +213,7 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        members.append(train_map(learned, settings, seed=seed, progress=report))
+        members.append(train_map(data, settings, seed=seed, progress=report))
     num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
     return _fill_grid(embedding, data) if is_sharpened else embedding
@@ -212,32 +231,22 @@ def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
 
 
 def fitted_base_logit(
-    output: EmbeddingOutput,
-    is_held_out: np.ndarray,
-    segments: Segments,
-    parameters: AssessmentParameters,
+    output: EmbeddingOutput, segments: Segments, parameters: AssessmentParameters
 ) -> BaseLogit:
     """Scales what the ensemble's heads say to one logit, by logistic regression.
 
-    It is asked about the episodes that no map has learned from: of its own it is too sure. Where
-    those are all safe or all unsafe, all segments are taken.
-
     Args:
-        output: What the maps say of the training segments.
-        is_held_out: Which of them no map has learned from, (N,).
-        segments: The training segments.
+        output: What maps say of segments that none of them has learned from: of those that they
+            have they are too sure.
+        segments: These segments.
         parameters: Of the assessment.
     """
-    if not 0 < segments.is_unsafe[is_held_out].sum() < is_held_out.sum():
-        is_held_out = np.ones_like(is_held_out)
     logit = BaseLogit(
         margin_unit=parameters.margin_unit,
         margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
     )
     offset, safety_slope, margin_slope = _logistic(
-        logit.heads(output)[is_held_out],
-        segments.is_unsafe[is_held_out],
-        _sample_weight(segments, parameters)[is_held_out],
+        logit.heads(output), segments.is_unsafe, _sample_weight(segments, parameters)
     )
     return replace(logit, offset=offset, safety_slope=safety_slope, margin_slope=margin_slope)
 
