@@ -12,6 +12,7 @@ from cart_episodes import ARRAYS
 from drake_safety import load_scenario
 from drake_safety.logs.robot_log import RobotLog
 from drake_safety.robots.robot import PlantVariation
+from drake_safety.simulation.episode_recorder import advance_to
 from drake_safety.simulation.rollouts import episode_rng
 
 ORIGIN_NS = 1_700_000_000_123_000_000
@@ -50,13 +51,9 @@ def record(loop, index=0, **goal):
     simulator.Initialize()
     step_s = scenario.time_step_s
     times = step_s * np.arange(round(scenario.episode_duration_s / step_s) + 1)
-    # An episode's rows are at these floats, which may be one rounding from the plant's own.
-    rows = scenario.step_s * np.arange(scenario.num_steps + 1)
-    times[np.abs(times[:, None] - rows).argmin(axis=0)] = rows
     states, desired = [], []
     for time_s in times:
-        if time_s > 0:  # At zero it would make the plant's first step.
-            simulator.AdvanceTo(time_s)
+        advance_to(simulator, time_s)
         states.append(loop.GetOutputPort("plant_state").Eval(context).copy())
         desired.append(loop.GetOutputPort("desired_output").Eval(context).copy())
     q, v = np.split(np.array(states), [loop.kinematics.num_positions], axis=1)

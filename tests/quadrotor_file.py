@@ -4,15 +4,10 @@ import numpy as np
 from pydrake.examples import QuadrotorPlant, StabilizingLQRController
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
-from drake_safety import (
-    AddSafetyAssessor,
-    AssessmentParameters,
-    SafetyAssessment,
-    record_episodes,
-)
+from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, record_episodes
 
 HORIZON, STEP_S, GOAL = 10, 0.1, np.array([0.0, 0.0, 1.0])
-START = np.array([0.5, 0.5, 0.5, 0.9, 0.9, 0.5, 2, 2, 2, 3, 3, 1])  # As far as it may begin.
+START = np.array([1, 1, 0.7, 1.1, 1.1, 1, 4, 4, 4, 8, 8, 1])  # As far as it may begin.
 
 
 class Flight(LeafSystem):  # Where it is, where it shall hover, how far from floor and tipping.
@@ -53,7 +48,8 @@ def reset(diagram, context, rng):
     quadrotor.GetMyMutableContextFromRoot(context).SetContinuousState(start)
 
 
-def learn(num_episodes=1000, **options):
+def learn(num_episodes=1000, *, num_workers=None, **parameters):
+    options = {"constraint_names": ["height", "tilt"], "num_workers": num_workers}
     times = {"duration_s": 2.0, "step_s": STEP_S}
     episodes = record_episodes(make_diagram, num_episodes, reset=reset, **times, **options)
-    return SafetyAssessment(AssessmentParameters(horizon=HORIZON)).fit(episodes)
+    return SafetyAssessment(AssessmentParameters(horizon=HORIZON, **parameters)).fit(episodes)

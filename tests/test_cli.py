@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,7 @@ import typer
 
 from command_line import call
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.cli import app
+from drake_safety.cli import app, main
 from drake_safety.cli.evaluate_plans import PlanOptions, check_options, parse_sizes
 from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import (
@@ -22,12 +23,28 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.evaluation import figure_style, planning_study
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO
 from shuttle_task import SCENARIO as SHUTTLE_SCENARIO
+
+
+def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "gliding.yaml"
+    file.write_text(SCENARIO + "parameters: {failure: bug}\n")
+    command = ("train", file, "--episodes", 8, "--workers", 1)
+    assert call(monkeypatch, *command, "--out", tmp_path / "a") == 2
+    told = capsys.readouterr().out
+    assert "of 'gliding' (seed 0): ValueError: operands could not be broadcast" in told
+    assert "--debug in the command line shows where" in told
+    arguments = ["drake-safety", *map(str, command), "--debug", "--out", str(tmp_path / "b")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(EpisodeError) as caught:
+        main()
+    assert isinstance(caught.value.__cause__, ValueError)
 
 
 def test_every_command_says_in_a_sentence_what_it_does():

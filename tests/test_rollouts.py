@@ -12,9 +12,9 @@ from pydrake.systems.primitives import ConstantVectorSource, LinearSystem
 
 from cart_episodes import ARRAYS
 from drake_safety import load_scenario, run_episode, run_episodes
-from drake_safety.learning.segments import DIVERGED
+from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.episode_recorder import EpisodeError, Recorder, advance_to
+from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng, parallel_map
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO, Gliding, gliding

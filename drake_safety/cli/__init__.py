@@ -49,8 +49,11 @@ _COMMANDS = (
     report.report,
 )
 
+_DEBUG = "--debug"
+
 app = typer.Typer(
-    help="Learn from simulations how safe a robot's motion is, and ask before and while it moves.",
+    help="Learn from simulations how safe a robot's motion is, and ask before and while it moves. "
+    f"With {_DEBUG}, anywhere in the line, errors show their traceback.",
     no_args_is_help=True,
     rich_markup_mode=None,
     add_completion=False,
@@ -61,18 +64,23 @@ for _command in _COMMANDS:
 
 
 def main() -> None:
-    """Runs the command; what a user did wrong is one line, not a traceback."""
+    """Runs the command; what a user did wrong is one line, and with --debug a traceback."""
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
+    arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
     try:
-        sys.exit(app(prog_name="drake-safety", standalone_mode=False))
-    except (ValueError, OSError) as error:
-        console.print("error", error, style="red", highlight=False, soft_wrap=True)
-        sys.exit(2)
+        sys.exit(app(arguments, prog_name="drake-safety", standalone_mode=False))
     except (typer.Abort, KeyboardInterrupt):
         console.print("stopped; finished episodes are kept", highlight=False)
         sys.exit(130)
     except Exception as error:
+        from drake_safety.learning.segments import EpisodeError
+
+        if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
+            console.print("error", error, style="red", highlight=False, soft_wrap=True)
+            if isinstance(error, EpisodeError):
+                console.print(f"{_DEBUG} in the command line shows where", highlight=False)
+            sys.exit(2)
         # Typer's own errors (unknown options, wrong types) know how to show themselves.
         if not hasattr(error, "exit_code") or not hasattr(error, "show"):
             raise

@@ -33,6 +33,13 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the episodes that are in OUT.")
     ] = False,
+    accept_code_change: Annotated[
+        bool,
+        typer.Option(
+            "--accept-code-change",
+            help="Resume although other source code simulated OUT.",
+        ),
+    ] = False,
     workers: WorkersOption = None,
 ) -> None:
     """Simulate the nominal closed loop and learn Γ from it.
@@ -62,6 +69,7 @@ def train(
             path=folder,
             progress=partial(stages, "nominal episodes"),
             extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
+            accept_code_change=accept_code_change,
         )
         # The modes are independent: the first is learned here, the others in processes beside.
         with _worker_processes(len(modes) - 1) as submit:

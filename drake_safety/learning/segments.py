@@ -22,6 +22,10 @@ DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; such an episode says nothing about safety."""
 
 
+class EpisodeError(RuntimeError):
+    """An error that a diagram raised during an episode, and that is no diverged simulation."""
+
+
 @dataclass(kw_only=True)
 class EpisodesInfo:
     """What all episodes of a set share.

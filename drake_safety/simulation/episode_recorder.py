@@ -13,14 +13,10 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from drake_safety.learning.segments import DIVERGED, RECORDED, Episode
+from drake_safety.learning.segments import DIVERGED, RECORDED, Episode, EpisodeError
 from drake_safety.plants.mujoco_dynamics import DivergenceError
 
 _LOGGER = logging.getLogger("drake_safety")
-
-
-class EpisodeError(RuntimeError):
-    """A system of the diagram raised an error in mid-episode; its cause is that error."""
 
 
 class Recorder:

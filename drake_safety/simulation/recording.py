@@ -14,9 +14,9 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+from drake_safety.learning.segments import Episode, EpisodeError, Episodes, EpisodesInfo
 from drake_safety.simulation.contract import REQUIRED_PORTS
-from drake_safety.simulation.episode_recorder import EpisodeError, EpisodeTiming, record_episode
+from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.rollouts import (
     Progress,
     collect_episodes,

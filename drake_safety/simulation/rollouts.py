@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
+import importlib
 import importlib.metadata
 import logging
+import sys
 import warnings
 from collections.abc import Callable, Generator
 from os import PathLike
+from types import BuiltinFunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
 
 import drake_safety
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
@@ -345,6 +350,22 @@ def parallel_map(
                 warnings.simplefilter("ignore")
                 results.close()
             raise
+
+
+def _reduce_builtin(function: Any) -> Any:
+    if type(function.__self__).__name__ == "PyCapsule":
+        return getattr, (importlib.import_module(function.__module__), function.__name__)
+    return function.__reduce__()
+
+
+# Functions of a notebook or a script are sent to the workers with all that they use. Of pydrake
+# two things lack a name that a worker could find them by: functions that it binds, such as
+# StabilizingLQRController, and the metaclass of its systems, whose module does not exist.
+copyreg.pickle(BuiltinFunctionType, _reduce_builtin)
+_METACLASS = type(LeafSystem)
+vars(sys.modules.setdefault(_METACLASS.__module__, ModuleType(_METACLASS.__module__))).setdefault(
+    _METACLASS.__name__, _METACLASS
+)
 
 
 _LOOPS: dict[tuple, ClosedLoop] = {}

@@ -59,7 +59,9 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         info = assessment.info_
         self._assessment = assessment
         self._shape = assessment.beliefs_.shape
-        self._uses_features = assessment.uses_features
+        # A diagram without features has nothing to connect.
+        self.reads_features = assessment.uses_features and bool(info.feature_names)
+        self._no_features = np.empty(0) if assessment.uses_features else None
         self.constraint_names = list(info.constraint_names)
         n_c = len(self.constraint_names)
         self._belief_index = self.DeclareNumericParameter(
@@ -164,7 +166,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         said = self._assessment.predict_one(
             self._state_port.Eval(context),
             self._preview_port.Eval(context),
-            self._features_port.Eval(context) if self._uses_features else None,
+            self._features_port.Eval(context) if self.reads_features else self._no_features,
             beliefs=self.get_beliefs(context),
             correction=self.get_correction(context) if self._has_heads else None,
         )
@@ -213,7 +215,7 @@ def AddSafetyAssessor(
     assessor = SafetyAssessor(assessment, period_s=info.step_s if period_s is None else period_s)
     given = {"state": state, "desired_preview": desired_preview, "features": features}
     ports = {name: port for name, port in given.items() if port is not None}
-    if assessment.uses_features and info.feature_names and features is None:
+    if assessor.reads_features and features is None:
         raise ValueError(
             f"AddSafetyAssessor: the assessment was fitted with features {info.feature_names}; "
             "give the port that carries them"

@@ -1,0 +1,255 @@
+"""Episodes of diagrams of one's own: the same guarantees as for the package's tasks."""
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+
+import quadrotor_file
+from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, record_episodes
+from drake_safety.learning.segments import DIVERGED, EpisodeError
+from drake_safety.plants.mujoco_dynamics import DivergenceError
+from drake_safety.simulation.dataset import completed, load_episodes
+
+STEP_S = 0.1
+
+
+class Glider(LeafSystem):
+    """A mass that glides between two walls; beyond x = 0.5 it fails as one likes."""
+
+    def __init__(self, failure):
+        super().__init__()
+        self.failure = failure
+        self.DeclareDiscreteState(2)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.01, 0.0, self._update)
+        for name, calc in {
+            "position_and_speed": lambda state: state,
+            "output": lambda state: state[:1],
+            "desired_preview": lambda state: np.zeros(5),
+            "margins": lambda state: 1.0 - state[0] * np.array([1.0, -1.0]),
+        }.items():
+            size = {"position_and_speed": 2, "output": 1, "desired_preview": 5, "margins": 2}[name]
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(size),
+                lambda context, output, calc=calc: output.SetFromVector(
+                    calc(context.get_discrete_state_vector().value())
+                ),
+            )
+
+    def _update(self, context, discrete_state):
+        x, v = context.get_discrete_state_vector().value()
+        if x > 0.5 and self.failure is not None:
+            raise self.failure
+        discrete_state.set_value([x + 0.01 * v, v])
+
+
+def make_glider(failure=None):
+    builder = DiagramBuilder()
+    glider = builder.AddNamedSystem("glider", Glider(failure))
+    for i in range(glider.num_output_ports()):
+        builder.ExportOutput(glider.get_output_port(i), glider.get_output_port(i).get_name())
+    return builder.Build()
+
+
+def reset_glider(diagram, context, rng):
+    context.SetDiscreteState([rng.uniform(-0.3, 0.3), rng.uniform(-2, 2)])
+    return 1
+
+
+def record(num_episodes=10, *, make=make_glider, reset=reset_glider, **options):
+    defaults = {"duration_s": 1.0, "step_s": STEP_S, "num_workers": 1}
+    ports = {"state": "position_and_speed"}
+    return record_episodes(make, num_episodes, reset=reset, ports=ports, **(defaults | options))
+
+
+def assert_identical(episodes, others):
+    for one, other in zip(episodes, others, strict=True):
+        assert (one.index, one.cause) == (other.index, other.cause)
+        for name in ("time_s", "state", "desired_preview", "margins"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_what_is_left_out_has_its_default():
+    episodes = record()
+    assert episodes.info.horizon == 5
+    assert episodes.info.num_steps == 10
+    assert episodes.info.scenario == "make_glider"
+    assert episodes.info.state_names == ["state_0", "state_1"]
+    assert 0 < episodes.num_unsafe < 10
+    for episode in episodes:
+        assert episode.first_step == min(1, episode.num_steps)
+        assert episode.features.shape == (len(episode.time_s), 0)
+        np.testing.assert_array_equal(episode.true_state, episode.state)
+        np.testing.assert_array_equal(episode.desired_output, episode.desired_preview[:, :1])
+        assert episode.is_safe == (episode.margins.min() >= 0)
+
+
+def test_an_unsafe_episode_ends_within_a_look_of_leaving():
+    for episode in record():
+        if not episode.is_safe:
+            assert -0.0201 < episode.margins[-1].min() < 0  # A look a hundredth of a second.
+
+
+def test_a_row_belongs_to_its_time():
+    for episode in record():
+        x, v = episode.state[0]
+        np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=1e-9)
+
+
+def test_the_bits_do_not_depend_on_the_number_of_workers():
+    assert_identical(record(num_workers=2), record())
+
+
+def test_a_folder_goes_on_with_its_own_set_and_refuses_others(tmp_path):
+    record(4, path=tmp_path)
+    assert completed(tmp_path) == {0, 1, 2, 3}
+    assert_identical(record(10, path=tmp_path), record(10))
+    assert_identical(load_episodes(tmp_path), record(10))
+    others = [
+        {"seed": 1},
+        {"duration_s": 2.0},
+        {"reset": lambda diagram, context, rng: context.SetDiscreteState([0.0, 1.0])},
+        {"parameters": {"failure": KeyError("bug")}},
+        {"make": lambda: make_glider()},
+        {"constraint_names": ["right", "left"]},
+    ]
+    for other in others:
+        with pytest.raises(ValueError, match="of another set"):
+            record(10, path=tmp_path, **other)
+
+
+def test_what_is_built_is_built_anew_for_every_call():
+    limits = {"failure": None}
+
+    def make():
+        return make_glider(**limits)
+
+    sound = record(make=make)
+    limits["failure"] = DivergenceError("now it fails")
+    assert sound.num_diverged == 0
+    assert record(make=make).num_diverged > 0
+
+
+def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
+    with caplog.at_level(logging.WARNING, logger="drake_safety"):
+        episodes = record(parameters={"failure": DivergenceError("the numbers ran away")})
+    assert episodes.num_diverged == sum(e.cause == DIVERGED for e in episodes) > 0
+    assert f"{episodes.num_diverged} of 10 simulations of 'make_glider'" in caplog.text
+    with pytest.raises(EpisodeError, match=r"episode \d of 'make_glider' \(seed 0\): KeyError"):
+        record(parameters={"failure": KeyError("bug")})
+
+
+def test_a_reset_that_fails_names_its_episode():
+    with pytest.raises(EpisodeError, match=r"episode 0 of 'make_glider' \(seed 0\), reset: Type"):
+        record(reset=lambda diagram, context, rng: context + 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ports": {}}, r"exports no port \['state'\] for \['state'\]; it exports .*'margins'"),
+        ({"ports": {"where": "output"}}, r"ports has \['where'\]; the contract's are"),
+        (
+            {"ports": {"state": "output", "safe": "nowhere"}},
+            r"no port \['nowhere'\] for \['safe'\]",
+        ),
+        (
+            {"ports": {"state": "output", "true_state": "margins"}},
+            "'margins' for true_state has size 2; expected 1",
+        ),
+        ({"ports": {"state": "output", "output": "margins"}}, "size 5; expected H times .* 2"),
+        ({"constraint_names": ["wall"]}, "constraint_names has 1 names, the port has 2"),
+        ({"duration_s": 0.01}, "an episode lasts a step at least"),
+        ({"monitor_period_s": 0.0}, "monitor_period_s must be positive"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_what_there_is(options, message):
+    given = {"ports": {"state": "position_and_speed"}, "duration_s": 1.0, "step_s": STEP_S}
+    with pytest.raises(ValueError, match=message):
+        record_episodes(make_glider, 1, reset=reset_glider, **(given | options))
+
+
+def test_a_drake_plant_that_diverges_is_no_mistake():
+    from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+    from pydrake.multibody.tree import SpatialInertia
+    from pydrake.systems.primitives import ConstantVectorSource
+
+    def make(force):
+        builder = DiagramBuilder()
+        plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
+        plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        plant.Finalize()
+        glider = builder.AddSystem(Glider(None))
+        forces = builder.AddSystem(ConstantVectorSource(np.full(6, force)))
+        builder.Connect(forces.get_output_port(), plant.get_applied_generalized_force_input_port())
+        for name in ("position_and_speed", "output", "desired_preview", "margins"):
+            builder.ExportOutput(glider.GetOutputPort(name), name)
+        return builder.Build()
+
+    def reset(diagram, context, rng):
+        return 0
+
+    assert record(1, make=make, reset=reset, parameters={"force": 1.0}).num_diverged == 0
+    assert record(1, make=make, reset=reset, parameters={"force": np.nan}).num_diverged == 1
+
+
+def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
+    assert len(Path(quadrotor_file.__file__).read_text().splitlines()) <= 60
+    assessment = quadrotor_file.learn(
+        200, num_workers=1, epochs=10, ensemble_size=1, hidden_sizes=[16], perplexity=10
+    )
+    diagram = quadrotor_file.make_diagram(assessment)
+    gamma = []
+    for share in (0.0, 1.0):
+        simulator = Simulator(diagram)
+        context = simulator.get_mutable_context()
+        quadrotor = diagram.GetSubsystemByName("quadrotor")
+        start = np.append(quadrotor_file.GOAL, np.zeros(9)) + share * quadrotor_file.START
+        quadrotor.GetMyMutableContextFromRoot(context).SetContinuousState(start)
+        simulator.Initialize()
+        gamma.append(diagram.GetOutputPort("gamma").Eval(context)[0])
+    assert gamma[0] > 0.6 > gamma[1]
+
+
+def test_an_assessor_refuses_ports_that_its_assessment_does_not_know():
+    assessment = SafetyAssessment(
+        AssessmentParameters(horizon=5, epochs=2, ensemble_size=1, hidden_sizes=[8], perplexity=5)
+    ).fit(record(30))
+    builder = DiagramBuilder()
+    glider = builder.AddSystem(Glider(None))
+    state, preview = (glider.GetOutputPort(n) for n in ("position_and_speed", "desired_preview"))
+    with pytest.raises(ValueError, match=r"'output' for state has size 1; .* fitted with 2"):
+        AddSafetyAssessor(
+            builder, assessment, state=glider.GetOutputPort("output"), desired_preview=preview
+        )
+    assessor = AddSafetyAssessor(builder, assessment, state=state, desired_preview=preview)
+    context = builder.Build().CreateDefaultContext()
+    assert (
+        0
+        <= assessor.GetOutputPort("safety_probability").Eval(assessor.GetMyContextFromRoot(context))
+        <= 1
+    )
+
+
+def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
+    """Its functions, the systems that they make, and what pydrake binds without a module."""
+    script = tmp_path / "mine.py"
+    script.write_text(
+        Path(quadrotor_file.__file__).read_text()
+        + "\n\ntimes = {'duration_s': 2.0, 'step_s': STEP_S}\n"
+        "sets = [record_episodes(make_diagram, 8, reset=reset, num_workers=n, **times)\n"
+        "        for n in (1, 2)]\n"
+        "for one, other in zip(*sets, strict=True):\n"
+        "    np.testing.assert_array_equal(one.state, other.state)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, str(script)]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
