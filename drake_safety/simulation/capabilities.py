@@ -204,7 +204,13 @@ class OffersPlans(Protocol):
 
 @runtime_checkable
 class CanStartAnywhere(Protocol):
-    """Episodes can begin with a given state and plan."""
+    """Episodes can begin with a given state and plan.
+
+    Attributes:
+        plant_state_sizes: n_q and n_v of the port ``plant_state``.
+    """
+
+    plant_state_sizes: tuple[int, int]
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart

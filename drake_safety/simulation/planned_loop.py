@@ -30,6 +30,9 @@ class PlannedLoop(ClosedLoop):
     A subclass wires in this order: :meth:`_add_planner`, its controller, :meth:`_add_safe_set`,
     the names of state and output, :meth:`_export`, :meth:`finish`. It says in :meth:`_set_state`
     how a start becomes the plant's state. Its episodes can then begin with a given start.
+
+    Attributes:
+        plant_state_sizes: n_q and n_v.
     """
 
     def _check_variation(self, *varied: str) -> None:
@@ -102,7 +105,7 @@ class PlannedLoop(ClosedLoop):
             period_s: Time between two looks of the monitor [s].
             outlook: The plan that the features look at; the planner's by default.
         """
-        self._sizes = sizes
+        self.plant_state_sizes = sizes
         self._plant_state = plant_state
         self._monitor = builder.AddNamedSystem(
             "safety_monitor", SafetyMonitor(safe_set, *sizes, period_s=period_s)
@@ -185,7 +188,7 @@ class PlannedLoop(ClosedLoop):
             ValueError: The start does not fit the plant.
         """
         del rng  # There is no noise.
-        start.check(f"start of task '{type(self).__name__}'", *self._sizes)
+        start.check(f"start of task '{type(self).__name__}'", *self.plant_state_sizes)
         self._enter(context, start)
 
     def start_of(self, context: Context) -> EpisodeStart:
@@ -194,7 +197,9 @@ class PlannedLoop(ClosedLoop):
         Args:
             context: The diagram's Context.
         """
-        q, v = np.split(self.GetOutputPort("plant_state").Eval(context), [self._sizes[0]])
+        q, v = np.split(
+            self.GetOutputPort("plant_state").Eval(context), [self.plant_state_sizes[0]]
+        )
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
         return EpisodeStart(q=q, v=v, plan=plan)
 
