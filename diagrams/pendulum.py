@@ -1,7 +1,7 @@
 """Pendulum: an inverted pendulum with a weak motor follows a point; its true safe set is known."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,27 +26,18 @@ class PendulumParameters:
 
     mass_kg: float = 1.0
     length_m: float = 0.5
-    damping: float = 0.05
-    """Of the hinge [N·m·s/rad]."""
-    effort_share: float = 0.35
-    """The motor's torque, as a share of what holds the pendulum when it is horizontal."""
-    stiffness: float = 20.0
-    """Gain of the angle's error [N·m/rad]."""
-    rate_gain: float = 3.0
-    """Gain of the rate's error [N·m·s/rad]."""
-    largest_angle_rad: float = 0.6
-    """Beyond this angle the pendulum has left the safe set."""
-    start_angle_rad: float = 0.6
-    """Half-width of the angles at which episodes begin."""
-    start_rate_rad_s: float = 2.0
-    """Half-width of the rates at which episodes begin."""
-    plan_angle_rad: float = 0.3
-    """Half-width of the angles at which plans begin and end."""
-    plan_duration_s: list[float] = field(default_factory=lambda: [0.5, 1.5])
-    """Shortest and longest duration of the planned motion."""
+    damping: float = 0.05  # Of the hinge [N·m·s/rad].
+    effort_share: float = 0.35  # The motor's torque; 1 holds the pendulum when it is horizontal.
+    stiffness: float = 20.0  # Gain of the angle's error [N·m/rad].
+    rate_gain: float = 3.0  # Gain of the rate's error [N·m·s/rad].
+    largest_angle_rad: float = 0.6  # Beyond this angle the pendulum has left the safe set.
+    start_angle_rad: float = 0.6  # Half-width of the angles at which episodes begin.
+    start_rate_rad_s: float = 2.0  # Half-width of the rates at which episodes begin.
+    plan_angle_rad: float = 0.3  # Half-width of the angles at which plans begin and end.
+    plan_duration_s: list[float] = field(default_factory=lambda: [0.5, 1.5])  # Of motions.
 
     def __post_init__(self) -> None:
-        for name, value in ((entry.name, getattr(self, entry.name)) for entry in fields(self)):
+        for name, value in vars(self).items():
             if not np.all(np.isfinite(value)) or np.min(value) <= 0:
                 raise ValueError(f"pendulum: {name} must be finite and positive; got {value}")
         if self.plan_duration_s != sorted(self.plan_duration_s)[:2]:

@@ -198,11 +198,6 @@ class Reaching(LeggedLoop):
     ) -> int:
         """Samples a standing posture and a target, and plans the hand's motion between them.
 
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            rng: Source of every draw.
-            goal: Target in the world, (3,) [m], in place of a random one.
-
         Returns:
             0, or the first step after the push that an episode begins with.
 
@@ -232,10 +227,6 @@ class Reaching(LeggedLoop):
 
     def set_push(self, context: Context, push: Push) -> None:
         """Plans a push on a body of the robot, in the run that was reset.
-
-        Args:
-            context: The diagram's Context.
-            push: Where, how hard, when.
 
         Raises:
             ValueError: The robot has no such body.
@@ -272,11 +263,6 @@ class Reaching(LeggedLoop):
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
         """Starts in the standing posture towards a target; its first instant is without noise.
-
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            goal: Target in the world, (3,) [m].
-            rng: Source of the noise that follows; always the same by default.
 
         Raises:
             ValueError: The goal is not three finite numbers.

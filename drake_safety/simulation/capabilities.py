@@ -1,4 +1,8 @@
-"""What only some tasks can do, a protocol each; users ask by ``isinstance``, or :func:`require`."""
+"""What only some tasks can do, a protocol each; users ask by ``isinstance``, or :func:`require`.
+
+Throughout, ``context`` is the diagram's root Context, of which a reset overwrites what an earlier
+episode left, ``rng`` the source of every draw, and ``episode`` one of the loop's own.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,6 @@ class HasGoals(Protocol):
     """Plans lead to a goal, a point in the world.
 
     Attributes:
-        target_box: Lowest and highest corner of the goals that are drawn, in the world, (2, 3) [m].
         named_targets: Goals that can be asked for by name, in the world, (3,) [m] each.
         hand: The robot's reaching frame that goes to the goal; None for another part of it.
     """
@@ -35,39 +38,23 @@ class HasGoals(Protocol):
 
     @property
     def target_box(self) -> np.ndarray:
-        """See the class."""
+        """Lowest and highest corner of the goals that are drawn, in the world, (2, 3) [m]."""
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
     ) -> int:
-        """Samples an initial state and plans the motion to a goal.
-
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            rng: Source of every draw.
-            goal: In the world, (3,) [m], in place of a random one.
-
-        Returns:
-            As the reset of every loop.
-        """
+        """As the reset of every loop; ``goal`` (3,) [m], in the world, replaces a random one."""
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts at rest in the robot's own posture; its first instant is without noise.
+        """Starts at rest in the robot's own posture towards a goal (3,) [m] in the world.
 
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            goal: In the world, (3,) [m].
-            rng: Source of the noise that follows; always the same by default.
+        The first instant is without noise; that which follows is always the same by default.
         """
 
     def goal_of(self, episode: Episode) -> np.ndarray:
-        """Where the plan of an episode of this loop led to, in the world, (3,) [m].
-
-        Args:
-            episode: The episode; one that ended early will do.
-        """
+        """Where the plan of an episode of this loop led to, in the world, (3,) [m]."""
 
 
 @runtime_checkable
@@ -79,62 +66,37 @@ class HasFairGoals(Protocol):
         """The part of the target box whose goals are neither, (2, 3) [m]."""
 
     def is_fair(self, episode: Episode) -> bool:
-        """Whether an episode of this loop belongs to the set in which verdicts are not trivial.
-
-        Args:
-            episode: The episode.
-        """
+        """Whether an episode of this loop belongs to the set in which verdicts are not trivial."""
 
 
 @runtime_checkable
 class CanFall(Protocol):
-    """A robot can fall, which ends a motion.
-
-    Attributes:
-        fall_name: The constraint whose violation is a fall.
-    """
+    """A robot can fall, which ends a motion and violates the constraint ``fall_name``."""
 
     fall_name: str
 
 
 @runtime_checkable
 class HasBall(Protocol):
-    """A ball can be thrown at the robot, and a recovery be triggered.
-
-    Attributes:
-        trigger_port: Name of the output port that recovery is triggered by.
-    """
+    """A ball can be thrown at the robot, and a recovery be triggered."""
 
     @property
     def trigger_port(self) -> str:
-        """See the class."""
+        """Name of the output port that recovery is triggered by."""
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
-        """Samples a calm motion, during which a ball is thrown.
-
-        Args:
-            context: The diagram's Context.
-            rng: Source of every draw.
-        """
+        """Samples a calm motion, during which a ball is thrown."""
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball that touches at a given time.
-
-        Args:
-            rng: Source of every draw.
-            time_s: When it touches [s].
-        """
+        """Samples a ball that touches at a given time [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
         """Sets a ball in flight towards the robot.
 
-        Args:
-            context: The diagram's Context.
-            throw: Mass, speed and direction.
-            lead_s: Time from now until the ball touches the robot, were it to stay still [s].
+        It touches, were the robot to stay still, ``lead_s`` [s] from now.
 
         Returns:
-            When the ball touches, simulation time [s].
+            When it touches, simulation time [s].
 
         Raises:
             ValueError: The loop was built without its ball.
@@ -152,19 +114,10 @@ class CanBePushed(Protocol):
     pushes: Mapping[str, Push]
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Plans a push on the robot in a run that was reset.
-
-        Args:
-            context: The diagram's Context.
-            push: Where, how hard, when.
-        """
+        """Plans a push on the robot in a run that was reset."""
 
     def sample_push(self, rng: np.random.Generator) -> Push:
-        """A random push on the robot.
-
-        Args:
-            rng: Source of every draw.
-        """
+        """A random push on the robot."""
 
 
 @runtime_checkable
@@ -184,48 +137,36 @@ class OffersPlans(Protocol):
 
         They stay inside what the scenario's training covers, or Γ could not judge them.
 
-        Args:
-            context: The diagram's Context, with a plan.
-            rng: Source of the others.
-            num_plans: How many at most.
-
         Returns:
-            What :meth:`set_plan` takes; the first is the plan that the Context has.
+            At most ``num_plans`` of what :meth:`set_plan` takes; the first is the plan that the
+            Context has.
         """
 
     def set_plan(self, context: Context, plan: Any) -> None:
-        """Sets a plan in place of the one that the Context has; the state stays as it is.
-
-        Args:
-            context: The diagram's Context.
-            plan: One of :meth:`candidate_plans`.
-        """
+        """Sets one of :meth:`candidate_plans`; the state stays as it is."""
 
 
 @runtime_checkable
 class CanStartAnywhere(Protocol):
-    """Episodes can begin with a given state and plan."""
+    """Episodes can begin with a given state and plan.
+
+    Attributes:
+        plant_state_sizes: n_q and n_v of the port ``plant_state``.
+    """
+
+    plant_state_sizes: tuple[int, int]
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Begins with a given plant state and plan.
-
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            rng: Source of the noise that follows; None takes the noise out of this instant.
-            start: Where and how it begins.
+        """Begins with a given plant state and plan; no ``rng``: no noise in this instant.
 
         Raises:
             ValueError: The start does not fit the plant.
         """
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with; see :meth:`reset_to`.
-
-        Args:
-            context: The diagram's Context.
-        """
+        """What an episode that goes on from here begins with; see :meth:`reset_to`."""
 
 
 @runtime_checkable
@@ -248,37 +189,25 @@ class HasMirrorImage(Protocol):
 
 @runtime_checkable
 class HasAngularMargins(Protocol):
-    """Some margins are angles [rad]; those of all other constraints are lengths [m].
-
-    Attributes:
-        angular_constraints: The constraints of which that is so.
-    """
+    """Margins of ``angular_constraints`` are angles [rad]; those of all others lengths [m]."""
 
     angular_constraints: tuple[str, ...]
 
 
 @runtime_checkable
 class HasWatchedFeatures(Protocol):
-    """There are features that one would set an alarm on by hand.
-
-    Attributes:
-        watched_features: Features by what they measure; larger is safer.
-    """
+    """One would set an alarm on features by hand: by what they measure; larger is safer."""
 
     watched_features: Mapping[str, str]
 
 
 @runtime_checkable
 class HasRates(Protocol):
-    """Some features are made of velocities.
-
-    Attributes:
-        rate_names: States and features that are.
-    """
+    """Some features are made of velocities."""
 
     @property
     def rate_names(self) -> list[str]:
-        """See the class."""
+        """States and features that are."""
 
 
 @runtime_checkable
@@ -297,20 +226,12 @@ class CountsFailures(Protocol):
     """A controller can be without a command of its own."""
 
     def num_controller_failures(self, context: Context) -> int:
-        """How often that was so since the episode began.
-
-        Args:
-            context: The diagram's Context.
-        """
+        """How often that was so since the episode began."""
 
 
 @runtime_checkable
 class HasJudgingOptions(Protocol):
-    """Verdicts are judged with another diagram than episodes are learned from.
-
-    Attributes:
-        judging_options: Options of that diagram, of the task's class.
-    """
+    """Verdicts are judged with other options of the diagram than training's; of the class."""
 
     judging_options: Mapping[str, Any]
 
@@ -320,12 +241,7 @@ class HasPairingOptions(Protocol):
     """A variation and its nominal twin take options to begin alike; of the task's class."""
 
     def pairing_options(self, scenario: Any, variation: str) -> dict[str, Any]:
-        """Options of the diagrams of both.
-
-        Args:
-            scenario: The scenario.
-            variation: Which plant is the actual one.
-        """
+        """Options of the diagrams of both; ``variation`` is the actual one's."""
 
 
 @runtime_checkable

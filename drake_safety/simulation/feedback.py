@@ -14,10 +14,9 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.simulation.capabilities import pairing_options
+from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
     batches,
@@ -133,7 +132,7 @@ def make_recorder(
     )
 
 
-def window_start(loop: LeggedLoop, window: RecordedWindow) -> EpisodeStart:
+def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     """What the nominal twin of a recorded window begins with.
 
     Its plan goes through the desired outputs that the actual robot was given, and holds still after
@@ -148,7 +147,7 @@ def window_start(loop: LeggedLoop, window: RecordedWindow) -> EpisodeStart:
     # The first sample of every preview is of its own row; the last preview looks further ahead.
     plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
     times = loop.scenario.step_s * np.arange(len(plan))
-    q, v = np.split(window.plant_state, [loop.kinematics.num_positions])
+    q, v = np.split(window.plant_state, [require(loop, CanStartAnywhere).plant_state_sizes[0]])
     return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
 
 

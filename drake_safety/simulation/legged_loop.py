@@ -99,14 +99,7 @@ class LeggedLoop(PlannedLoop):
         return [*filter(is_rate, self.state_names), *self._rate_features]
 
     def _add_robot(self, builder: DiagramBuilder, scene: Scene, *, servos: bool) -> Physics:
-        """Adds the robot in its scene.
-
-        Args:
-            builder: Of the task's diagram.
-            scene: What else is there.
-            servos: Whether the joints have robot.yaml's position servos; they take torques
-                otherwise.
-        """
+        """Adds the robot in its scene; its joints have position servos, or take torques."""
         physics = self._physics = add_physics(
             builder,
             self.robot,
@@ -122,12 +115,7 @@ class LeggedLoop(PlannedLoop):
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
         """Adds what the controller, the assessor and a witness without noise see.
 
-        Args:
-            builder: Of the task's diagram.
-            **options: Of every `StateObserver`.
-
-        Returns:
-            The plant's state as the controller measures it.
+        Takes options of every `StateObserver`; returns the state that the controller measures.
         """
         noise = self.variation.observation_noise
         self._observers = Observers(
@@ -153,13 +141,7 @@ class LeggedLoop(PlannedLoop):
         *,
         outlook: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features.
-
-        Args:
-            builder: Of the task's diagram.
-            safe_set: The robot's.
-            outlook: The plan that the features look at; the planner's by default.
-        """
+        """Adds monitor and features; see :meth:`_add_safe_set`."""
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self._rate_features = safe_set.rate_features
@@ -181,18 +163,7 @@ class LeggedLoop(PlannedLoop):
         desired_preview: OutputPort | None = None,
         meshcat: Meshcat | None,
     ) -> SafetyAssessor | None:
-        """Adds the assessor and the visualiser, if there are any, and exports all ports.
-
-        Args:
-            builder: Of the task's diagram.
-            assessment_period_s: Time between two evaluations of Γ [s].
-            desired_output: As the controller follows it; the planner's by default.
-            desired_preview: What is to come of it as the assessor sees it; by default as planned.
-            meshcat: Where the robot is shown.
-
-        Returns:
-            The assessor; None without Γ.
-        """
+        """Adds assessor and visualiser, if there are any, and exports; see :meth:`_export`."""
         assessor = self._export(
             builder,
             assessment_period_s=assessment_period_s,

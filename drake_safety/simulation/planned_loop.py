@@ -30,17 +30,13 @@ class PlannedLoop(ClosedLoop):
     A subclass wires in this order: :meth:`_add_planner`, its controller, :meth:`_add_safe_set`,
     the names of state and output, :meth:`_export`, :meth:`finish`. It says in :meth:`_set_state`
     how a start becomes the plant's state. Its episodes can then begin with a given start.
+
+    Attributes:
+        plant_state_sizes: n_q and n_v.
     """
 
     def _check_variation(self, *varied: str) -> None:
-        """Refuses a variation of a plant of the task's own that changes more than it can.
-
-        Args:
-            *varied: What it can change.
-
-        Raises:
-            ValueError: The variation changes something else.
-        """
+        """Refuses a variation that changes more of a plant of the task's own than ``varied``."""
         for entry in fields(PlantVariation):
             is_plain = getattr(self.variation, entry.name) == getattr(PlantVariation(), entry.name)
             if not is_plain and entry.name not in varied:
@@ -52,13 +48,7 @@ class PlannedLoop(ClosedLoop):
     def _add_planner(
         self, builder: DiagramBuilder, *, outlook_s: float, num_outlook: int
     ) -> TrajectoryPlanner:
-        """Adds the planner.
-
-        Args:
-            builder: Of the task's diagram.
-            outlook_s: How far the features look ahead along the plan [s].
-            num_outlook: At how many instants.
-        """
+        """Adds the planner; features look ``outlook_s`` [s] ahead, at ``num_outlook`` instants."""
         scenario = self.scenario
         self._num_outlook = num_outlook
         self._planner: TrajectoryPlanner = builder.AddNamedSystem(
@@ -100,7 +90,7 @@ class PlannedLoop(ClosedLoop):
             seen_state: What the features see of it, as the assessor does; all by default.
             outlook: The plan that the features look at; the planner's by default.
         """
-        self._sizes = sizes
+        self.plant_state_sizes = sizes
         self._plant_state = plant_state
         self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
         builder.Connect(plant_state, self._monitor.GetInputPort("plant_state"))
@@ -170,27 +160,16 @@ class PlannedLoop(ClosedLoop):
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Begins with a given plant state and plan.
-
-        Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            rng: Source of the noise that follows; None takes the noise out of this instant.
-            start: Where and how it begins.
-
-        Raises:
-            ValueError: The start does not fit the plant.
-        """
+        """Begins with a given plant state and plan; see `CanStartAnywhere`."""
         del rng  # There is no noise.
-        start.check(f"start of task '{type(self).__name__}'", *self._sizes)
+        start.check(f"start of task '{type(self).__name__}'", *self.plant_state_sizes)
         self._enter(context, start)
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with.
-
-        Args:
-            context: The diagram's Context.
-        """
-        q, v = np.split(self.GetOutputPort("plant_state").Eval(context), [self._sizes[0]])
+        """What an episode that goes on from here begins with."""
+        q, v = np.split(
+            self.GetOutputPort("plant_state").Eval(context), [self.plant_state_sizes[0]]
+        )
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
         return EpisodeStart(q=q, v=v, plan=plan)
 

@@ -17,6 +17,7 @@ from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.contract import Finding, check_contract
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
@@ -35,7 +36,7 @@ class _State:
     scenario: Scenario | None = None
     robot: RobotModel | None = None
     kinematics: RobotKinematics | None = None
-    loop: Any = None  # A ClosedLoop; one of a robot has more than the contract's ports.
+    loop: Any = None  # A ClosedLoop; one of a robot is a LeggedLoop.
 
 
 def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -> Iterator[Finding]:
@@ -68,7 +69,7 @@ def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -
     yield from _guarded("diagram", lambda: _diagram(state))
     if state.loop is None:
         return
-    if state.kinematics is not None:
+    if isinstance(state.loop, LeggedLoop):
         yield from _guarded("contact spheres", lambda: _contacts(state))
         yield from _guarded("shape of the base", lambda: _target(state))
         yield from _guarded("stands for 1 s", lambda: _stands(state))
