@@ -9,7 +9,7 @@ from lip_episodes import make_episodes
 
 @pytest.fixture(scope="module")
 def training():
-    return make_episodes(400, seed=0)
+    return make_episodes(240, seed=0)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from lip_episodes import make_episodes
 
 @pytest.fixture(scope="module")
 def segments():
-    return split(make_episodes(60), stride=4, discount=0.99)
+    return split(make_episodes(30), stride=4, discount=0.99)
 
 
 def graph_of(segments, **changes):

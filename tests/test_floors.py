@@ -1,6 +1,7 @@
 """The house's rules, read from the source: each rule is a function that returns its offences."""
 
 import ast
+import functools
 import re
 import sys
 import tomllib
@@ -81,6 +82,7 @@ def room_of(module):
     return parts[1] if len(parts) > 1 else None
 
 
+@functools.cache
 def imports_of(source, name):
     """Every import of a file: (dotted name, line, whether it runs when the file is imported)."""
     found = []

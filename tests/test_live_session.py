@@ -64,7 +64,7 @@ def meshcat():
 def balancing():
     scenario = quick(load_scenario("laikago_balancing"))
     return scenario, SafetyAssessment(scenario.assessment).fit(
-        run_episodes(scenario, 24, num_workers=1)
+        run_episodes(scenario, 8, num_workers=1)
     )
 
 

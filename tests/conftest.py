@@ -1,0 +1,12 @@
+"""Settings of every run of the tests: one thread and one process, unless a test asks for more.
+
+The tests' arrays are small, so threads of BLAS and OpenMP would mostly wait for each other, and
+workers would mostly start. Both cores are used by running two tests at a time (`make test`).
+"""
+
+import os
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+# What joblib counts where no number of workers is given; a number that is given stays as it is.
+os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
