@@ -19,7 +19,7 @@ from drake_safety.evaluation.comparison_figure import comparison_figure, standin
 from drake_safety.evaluation.metrics import Figure
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO, shuttling
-from test_ablate import call
+from test_cli import call
 
 NAME = "laikago_balancing"
 ROW = {

@@ -103,7 +103,7 @@ def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "LICENSE", "README.md", "constraints.txt", "Makefile"} <= names
-    for folder in ("tests", "assessments"):
+    for folder in ("tests", "studies", "assessments"):
         assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
     assert names >= SHIPPED
 

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    WorkersOption,
     console,
     interval,
     new_table,

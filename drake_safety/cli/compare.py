@@ -8,9 +8,16 @@ from typing import Annotated
 
 import typer
 
-from drake_safety.cli.arguments import WorkersOption
-from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
-from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.console import (
+    WorkersOption,
+    command_line,
+    console,
+    interval,
+    new_table,
+    open_stages,
+    print_path,
+    versions,
+)
 
 
 def compare(

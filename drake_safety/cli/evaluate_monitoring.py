@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from drake_safety.cli.console import new_table
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import fresh_episodes_folder
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
     from drake_safety.simulation.watched_motion import WatchedMotion
 
 _PLANT = "actual"  # Which is pushed.
@@ -101,25 +97,4 @@ def evaluate_monitoring(
     return Findings(
         figures=study.figures,
         pictures=save(monitoring_figure(study), judged.folder / "monitoring"),
-        tables=[_table(study.figures)],
     )
-
-
-def _table(figures: dict[str, Figure]) -> Table:
-    """The report's own table on the console, and below it where others are ahead."""
-    from drake_safety.evaluation.report.results import Results
-    from drake_safety.evaluation.report.verdicts import alarm_table
-
-    found = alarm_table(Results(figures=figures))
-    table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
-    for row in found.rows:
-        cells = [
-            f"{column.value_text(figure)} {column.interval_text(figure)}".strip()
-            for column, figure in zip(found.columns, row.figures, strict=True)
-        ]
-        table.add_row(row.label, *cells)
-    ahead = found.rivals_ahead()
-    table.caption = found.meaning
-    if ahead:
-        table.caption += "\nAhead of sharpened: " + "; ".join(ahead)
-    return table

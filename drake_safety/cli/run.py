@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import cause_words, new_table, print_shipped
+from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    cause_words,
+    new_table,
+    print_shipped,
+)
 from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, save_moving_picture
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption

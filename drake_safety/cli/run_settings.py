@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_safety.cli.console import console, print_path
-from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.console import command_line, console, print_path, versions
 
 if TYPE_CHECKING:
     import numpy as np

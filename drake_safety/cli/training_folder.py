@@ -70,18 +70,6 @@ def fresh_episodes_folder(
     return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
 
 
-def planning_folder(folder: Path, scenario_hash: str, seed: int, num_plans: int) -> Path:
-    """Where ``plan-study`` keeps the motions it executed, so that it can go on with them.
-
-    Args:
-        folder: The folder of the training.
-        scenario_hash: Of what was simulated: another simulation is another set.
-        seed: Of the starts.
-        num_plans: Candidates of each start.
-    """
-    return folder / "planning" / f"{scenario_hash[:12]}-{seed}-of-{num_plans}"
-
-
 def feedback_folder(folder: Path, scenario_hash: str, seed: int) -> Path:
     """Where ``adapt`` keeps pairs of actual episodes and their twins, a folder a plant.
 

@@ -72,3 +72,10 @@ def require_columns(path: Path, topic: str, wanted: Iterable[str], existing: Ite
     if missing:
         of = f" of topic '{topic}'" if topic else ""
         raise ValueError(f"log '{path}'{of} has no columns {missing}; it has {listed(existing)}")
+
+
+def missing_extra(path: Path, error: ImportError) -> ValueError:
+    """What to say when a package that reads a log is not installed."""
+    return ValueError(
+        f"log '{path}' needs the package '{error.name}': pip install 'drake_safety[logs]'"
+    )

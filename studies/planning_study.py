@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import PathLike
@@ -273,3 +273,34 @@ def planning_study(
         safety_probability=gamma,
         trials=trials,
     )
+
+
+def planning_verdict(figures: Mapping[str, Figure]) -> str:
+    """Who wins, in a sentence.
+
+    Args:
+        figures: Those of a `PlanningStudy`.
+    """
+    default, chosen, gain = (figures.get(key) for key in ("default", "chosen", "gain"))
+    if default is None or chosen is None or gain is None:
+        return "The study's figures are incomplete: make it again."
+    shares = (
+        f"{_percent(chosen)} of the starts stay safe with the plan that Γ chooses and "
+        f"{_percent(default)} with the default plan"
+    )
+    if not math.isfinite(gain.value):
+        return (
+            f"Nobody wins: {shares}, and no other candidate would have saved a start that the "
+            "default plan loses."
+        )
+    way = f"{_percent(gain, 0)} of the way to the best plan in hindsight"
+    if gain.low > 0.0:
+        return f"Γ wins: {shares}, which is {way}."
+    if gain.high < 0.0:
+        return f"The default plan wins: {shares}; choosing by Γ leads away from the best plan."
+    return f"Nobody wins beyond chance: {shares}, {way}, an interval that includes zero."
+
+
+def _percent(figure: Figure, digits: int = 1) -> str:
+    value, low, high = (100.0 * x for x in (figure.value, figure.low, figure.high))
+    return f"{value:.{digits}f} % ({low:.{digits}f}–{high:.{digits}f})"
