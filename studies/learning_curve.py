@@ -25,8 +25,8 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     check_fresh,
     episodes_folder,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Figure
@@ -45,7 +45,7 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import score_threshold
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.rollouts import parallel_map, run_episodes
+from drake_safety.simulation.rollouts import parallel_map
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.learning_curve_figure import learning_curve_figure
@@ -79,21 +79,12 @@ def train_fewer(
     info = load_episodes(episodes_folder(assessment)).info
     check_fresh(info, loaded, (seed, seed + 3))
     check_sizes(len(completed(episodes_folder(assessment))), wanted)
-    judging = dict(loop.judging_options)
     with open_stages() as stages:
         test, calibration = (
             plans_of(
                 loop,
-                run_episodes(
-                    loaded,
-                    count,
-                    seed=own_seed,
-                    num_workers=workers,
-                    path=fresh_episodes_folder(
-                        assessment, loaded.simulation_hash(), own_seed, judging
-                    ),
-                    progress=partial(stages, what),
-                    **judging,
+                run_fresh_episodes(
+                    loaded, assessment, count, own_seed, partial(stages, what), workers
                 ),
             )
             for what, count, own_seed in (

@@ -23,12 +23,11 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import (
     MODES,
     check_fresh,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Figure
-from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.known_truth import agreement, random_plan_figures, simulate_truth
@@ -59,17 +58,9 @@ def truth(
         raise ValueError(f"truth: task '{type(loop).__name__}' has no state planes")
     assessments = {mode: load_assessment(assessment, mode) for mode in MODES}
     check_fresh(assessments[MODES[0]].info_, loaded, (seed,))
-    judging = dict(loop.judging_options)
     with open_stages() as stages:
-        fresh = run_episodes(
-            loaded,
-            episodes,
-            seed=seed,
-            num_workers=workers,
-            path=fresh_episodes_folder(assessment, loaded.simulation_hash(), seed, judging),
-            progress=partial(stages, "fresh nominal episodes"),
-            **judging,
-        )
+        progress = partial(stages, "fresh nominal episodes")
+        fresh = run_fresh_episodes(loaded, assessment, episodes, seed, progress, workers)
         truths = [
             simulate_truth(
                 loaded,

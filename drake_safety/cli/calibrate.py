@@ -23,8 +23,8 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     assessment_folder,
     check_fresh,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def calibrate(
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
     from drake_safety.learning.segments import split
-    from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -83,17 +82,9 @@ def calibrate(
     scenario_hash = loaded.simulation_hash()
     for gamma in learned.values():
         check_fresh(gamma.info_, loaded, (seed,))
-    judging = dict(loaded.task_class().judging_options)
     with open_stages() as stages:
-        fresh = run_episodes(
-            loaded,
-            episodes,
-            seed=seed,
-            num_workers=workers,
-            path=fresh_episodes_folder(folder.out, scenario_hash, seed, judging),
-            progress=partial(stages, "calibration episodes"),
-            **judging,
-        )
+        progress = partial(stages, "calibration episodes")
+        fresh = run_fresh_episodes(loaded, folder.out, episodes, seed, progress, workers)
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}

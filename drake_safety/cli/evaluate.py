@@ -33,8 +33,8 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     check_fresh,
     episodes_folder,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 
 if TYPE_CHECKING:
@@ -86,6 +86,13 @@ def evaluate(
             min=0,
         ),
     ] = 0,
+    baselines: Annotated[
+        bool,
+        typer.Option(
+            "--baselines/--no-baselines",
+            help="Beside direct classifiers, trained on the same episodes; takes half of the time.",
+        ),
+    ] = True,
     seed: Annotated[int, typer.Option(help="Seed of everything that is fresh.")] = 1_000_000,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
@@ -95,7 +102,7 @@ def evaluate(
     """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers.
 
     Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
-    kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
+    kinematics too. Episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
     With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
     watch instead.
     """
@@ -106,7 +113,6 @@ def evaluate(
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.dataset import load_episodes
-    from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -147,20 +153,9 @@ def evaluate(
     with open_stages() as stages:
 
         def run_set(what: str, num_episodes: int, offset: int, **loop_options: Any) -> Episodes:
-            path = None
-            loop_options = {**loop.judging_options, **loop_options}
-            if has_goals:
-                path = fresh_episodes_folder(
-                    assessment, loaded.simulation_hash(), seed + offset, loop_options
-                )
-            return run_episodes(
-                loaded,
-                num_episodes,
-                seed=seed + offset,
-                num_workers=workers,
-                path=path,
-                progress=partial(stages, what),
-                **loop_options,
+            progress = partial(stages, what)
+            return run_fresh_episodes(
+                loaded, assessment, num_episodes, seed + offset, progress, workers, **loop_options
             )
 
         test_set = run_set("fresh nominal episodes", episodes, 0)
@@ -170,7 +165,9 @@ def evaluate(
             scenario=loaded,
             sharpened=sharpened,
             paper=paper,
-            classifiers=classifier_scorers(train_set, stages, shortest=shortest),
+            classifiers=classifier_scorers(train_set, stages, shortest=shortest)
+            if baselines
+            else [],
             run_folder=assessment,
             train_set=train_set,
             calibration_set=calibration_set,

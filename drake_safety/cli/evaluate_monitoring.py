@@ -84,7 +84,7 @@ def evaluate_monitoring(
     from drake_safety.evaluation.monitoring_study import evaluate_alarms
 
     if all(motion.has_left for motion in calibration):
-        # Nobody could be allowed the same share of false alarms.
+        # Nobody could be allowed the same share of false alarms: thresholds need calm motions.
         return Findings()
     loop = judged.scenario.make_loop()
     alarms = [

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import EpisodesInfo
+    from drake_safety.learning.segments import Episodes, EpisodesInfo
+    from drake_safety.simulation.rollouts import Progress
     from drake_safety.simulation.scenario import Scenario
 
 
@@ -68,6 +69,40 @@ def fresh_episodes_folder(
     """
     options = [f"{name}-{value}" for name, value in sorted(loop_options.items())]
     return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
+
+
+def run_fresh_episodes(
+    scenario: Scenario,
+    folder: Path,
+    num_episodes: int,
+    seed: int,
+    progress: Progress,
+    num_workers: int | None = None,
+    **loop_options: str,
+) -> Episodes:
+    """Simulates nominal episodes to judge by, and keeps them; goes on with those that are there.
+
+    Args:
+        scenario: The scenario.
+        folder: The folder of the training.
+        num_episodes: How many.
+        seed: Of the set.
+        progress: Called with the number done and the number wanted.
+        num_workers: Processes; as many as there are cores by default.
+        **loop_options: Of the task's diagram, besides those that it is judged with.
+    """
+    from drake_safety.simulation.rollouts import run_episodes
+
+    options = {**scenario.task_class().judging_options, **loop_options}
+    return run_episodes(
+        scenario,
+        num_episodes,
+        seed=seed,
+        num_workers=num_workers,
+        path=fresh_episodes_folder(folder, scenario.simulation_hash(), seed, options),
+        progress=progress,
+        **options,
+    )
 
 
 def feedback_folder(folder: Path, scenario_hash: str, seed: int) -> Path:

@@ -15,9 +15,9 @@ from typing import Any
 
 import yaml
 
+from drake_safety.evaluation.embedding_figure import cause_colours
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.report.cell_map import (
-    cause_colours,
     map_cells,
     map_figure,
     map_views,
