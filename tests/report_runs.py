@@ -2,9 +2,8 @@
 
 import json
 
-from drake_safety.evaluation.ablation_study import AblationFile, AblationRow
 from drake_safety.evaluation.figure_style import new_figure, save
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import proportion
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.simulation.dataset import EpisodeWriter
 from lip_episodes import make_episodes
@@ -44,67 +43,6 @@ def write_evaluation(folder, scenario_hash="0" * 64):
     (folder / "evaluation.json").write_text(json.dumps(content))
 
 
-def make_planning(gain=(0.5, 0.2, 0.8)):
-    """Figures of a plan study in which Γ comes half the way to hindsight."""
-    figures = {
-        "default": proportion(24, 40),
-        "any_candidate": proportion(26, 40),
-        "chosen": proportion(30, 40),
-        "chosen_if_accepted": proportion(27, 30),
-        "best_in_hindsight": proportion(36, 40),
-        "accepted": proportion(30, 40),
-        "gain": Figure(*gain, 40),
-    }
-    return {f"planning.{key}": figure for key, figure in figures.items()}
-
-
-def write_planning(folder, scenario_hash="0" * 64, **options):
-    content = {
-        "command": "drake-safety plan-study lip --assessment runs/lip",
-        "scenario": "lip",
-        "scenario_hash": scenario_hash,
-        "candidates": 5,
-        **{key: figure.to_json() for key, figure in make_planning(**options).items()},
-    }
-    (folder / "planning.json").write_text(json.dumps(content))
-
-
-def make_ablation_rows():
-    """A baseline, a variant that it beats, one that beats it, and one that may be as good."""
-    gains = {
-        "baseline": (0.0, 0.0, 0.0),
-        "perplexity=10": (-0.05, -0.08, -0.02),
-        "resolution=7": (0.02, 0.01, 0.03),
-        "min_count=1": (0.004, -0.01, 0.02),
-    }
-    rows = []
-    for name, gain in gains.items():
-        figures = {"auc_gain": Figure(*gain, 60), "k0.auc_gain": Figure(*gain, 60)}
-        for key in ("auc", "safe_recall", "unsafe_recall", "brier", "calibrated_auc"):
-            figures[key] = figures[f"k0.{key}"] = proportion(50, 60)
-        rows.append(
-            AblationRow(name=name, group=name.partition("=")[0], fingerprint=name, figures=figures)
-        )
-    return rows
-
-
-def write_ablation(path, scenario_hash="0" * 64, **entries):
-    counted = {"before_feedback": {"auc": proportion(40, 60).to_json()}}
-    counted["n_f_total"] = {"auc": proportion(45, 60).to_json()}
-    AblationFile(
-        path=path,
-        entries={
-            "command": "drake-safety ablate lip --assessment runs/lip",
-            "scenario": "lip",
-            "scenario_hash": scenario_hash,
-            "left_out": {"horizon H": "longer ones were not recorded"},
-            "n_f": {"actual.paper": counted},
-            **entries,
-        },
-        rows={row.name: row for row in make_ablation_rows()},
-    ).write()
-
-
 def write_run(folder):
     """Writes a whole run; returns its episodes and its sharpened assessment."""
     episodes = make_episodes(60)
@@ -127,8 +65,6 @@ def write_run(folder):
         assessments[mode] = SafetyAssessment(parameters).fit(episodes)
         assessments[mode].save(folder / f"{mode}.safetensors")
     write_evaluation(folder)
-    write_planning(folder)
-    write_ablation(folder / "ablation.json")
     for name in ("run/timeline", "roc", "a_new_figure"):
         figure = new_figure(4.0, 3.0)
         figure.subplots().plot([0, 1])

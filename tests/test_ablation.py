@@ -8,8 +8,14 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from drake_safety.evaluation import ablation_study
-from drake_safety.evaluation.ablation import (
+from drake_safety.evaluation.metrics import Bootstrap, Figure
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.feedback import feedback_sets
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.dataset import EpisodeWriter
+from lip_episodes import make_episodes
+from studies import ablation_study
+from studies.ablation import (
     BASELINE,
     AblationSets,
     EpisodeSet,
@@ -18,16 +24,16 @@ from drake_safety.evaluation.ablation import (
     list_variants,
     unsafe_scores,
 )
-from drake_safety.evaluation.ablation_adaptation import BEFORE, PER_CELL, TOTAL, counting_figures
-from drake_safety.evaluation.ablation_figure import ablation_figure
-from drake_safety.evaluation.ablation_study import AblationFile, rows_to_csv, run_ablation
-from drake_safety.evaluation.adaptation_study import TestSet
-from drake_safety.evaluation.metrics import Bootstrap
-from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
-from drake_safety.learning.feedback import feedback_sets
-from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.dataset import EpisodeWriter
-from lip_episodes import make_episodes
+from studies.ablation_adaptation import BEFORE, PER_CELL, TOTAL, counting_figures
+from studies.ablation_figure import ablation_figure
+from studies.ablation_study import (
+    AblationFile,
+    AblationRow,
+    ablation_verdict,
+    rows_to_csv,
+    run_ablation,
+)
+from studies.adaptation_study import TestSet
 
 BASE = AssessmentParameters(
     epochs=3, ensemble_size=1, hidden_sizes=[16], perplexity=8.0, min_count=3
@@ -246,3 +252,22 @@ def test_counting_all_feedback_in_every_cell_is_not_the_same_as_counting_its_own
     error = np.mean((1.0 - adapted.normalized - segments.is_unsafe) ** 2)
     assert found[PER_CELL]["brier"].value == pytest.approx(error)
     assert prior.parameters.adaptation.counts_per_cell
+
+
+def test_which_variants_win_is_what_the_intervals_of_their_gains_say():
+    gains = {
+        "baseline": (0.0, 0.0, 0.0),
+        "perplexity=10": (-0.05, -0.08, -0.02),
+        "resolution=7": (0.02, 0.01, 0.03),
+        "min_count=1": (0.004, -0.01, 0.02),
+    }
+    rows = [
+        AblationRow(name=name, group=name, fingerprint=name, figures={"auc_gain": Figure(*g, 60)})
+        for name, g in gains.items()
+    ]
+    words = ablation_verdict(rows)
+    assert "1 of 3 variants beat the baseline's AUC: resolution = 7 (+0.020)" in words
+    assert "it beats 1: perplexity = 10 (-0.050)" in words
+    assert "for 1 the interval of the difference includes zero" in words
+    assert ablation_verdict(rows[:1]) == "There is nothing yet to compare the baseline with."
+    assert ablation_verdict(rows[:2]).startswith("No variant beats the baseline's AUC")

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.adaptation_figure import adaptation_figure, study_figure
-from drake_safety.evaluation.adaptation_losses import STEPS, losses
-from drake_safety.evaluation.adaptation_study import TestSet, scores, study, trained_rivals
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import Episodes
 from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
+from studies.adaptation_figure import adaptation_figure, study_figure
+from studies.adaptation_losses import STEPS, losses
+from studies.adaptation_study import TestSet, scores, study, trained_rivals
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import typer
 from command_line import call
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.cli import app, main
-from drake_safety.cli.evaluate_plans import PlanOptions, check_options, parse_sizes
+from drake_safety.cli.evaluate_plans import PlanOptions, check_options
 from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import (
     MODES,
@@ -21,11 +21,11 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
-from drake_safety.evaluation import figure_style, planning_study
+from drake_safety.evaluation import figure_style
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation import rollouts
+from drake_safety.simulation import pushed_motions, rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO
@@ -60,9 +60,7 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "play",
         "evaluate",
         "compare",
-        "plan-study",
         "adapt",
-        "ablate",
         "report",
     ]
     for command in commands.values():
@@ -196,10 +194,10 @@ def evaluate_shuttle(monkeypatch, run, *arguments):
 @pytest.mark.slow
 def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, capsys, shuttle_run):
     _, folder = shuttle_run
-    arguments = ("--other-hand", 10, "--plane-step", 0.6, "--learning-curve", "40,60")
+    arguments = ("--other-hand", 10, "--plane-step", 0.6)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
     printed = capsys.readouterr().out
-    for title in ("30 fresh targets judged at k = 0: all targets", "the other hand", "Learning"):
+    for title in ("all targets", "the other hand", "paper sees the next H steps"):
         assert title in printed
     report = json.loads((folder / "evaluation.json").read_text())
     assert (
@@ -212,8 +210,8 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     assert report["plans.outcomes.safe"]["n"] == 30
     assert report["plans.other_hand.outcomes.safe"]["n"] == 10
     assert report["plans.sharpened.threshold"]["n"] == report["calibration_episodes"] == 20
-    assert {"plans.plane.sharpened.right", "plans.learning_curve.40.auc"} <= report.keys()
-    for name in ("plans", "plans_roc", "reachable_region", "learning_curve"):
+    assert "plans.plane.sharpened.right" in report
+    for name in ("plans", "plans_roc", "reachable_region"):
         assert (folder / f"{name}.png").is_file()
     # What takes throws or runs is no part of it.
     assert not any(key.startswith(("throws.", "segments.")) for key in report)
@@ -263,34 +261,6 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
 
 
 @pytest.mark.slow
-def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(
-    monkeypatch, capsys, shuttle_run, tmp_path
-):
-    file, run = shuttle_run
-    folder = tmp_path / "never_judged"  # Others evaluate theirs, which chooses a threshold.
-    folder.mkdir()
-    shutil.copy(run / "sharpened.safetensors", folder)
-    options = ("--assessment", folder, "--episodes", 10, "--candidates", 3, "--workers", 1)
-    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path) in (0, None)
-    printed = capsys.readouterr().out
-    report = json.loads((tmp_path / "planning.json").read_text())
-    shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
-    assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
-    assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
-    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
-        assert name in printed
-    # The motions are kept with the assessment: a second study simulates nothing.
-    monkeypatch.setattr(planning_study, "run_episode", None)
-    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path / "b") in (0, None)
-    again = json.loads((tmp_path / "b" / "planning.json").read_text())
-    assert all(again[key] == report[key] for key in report if key.startswith("planning."))
-    monkeypatch.undo()
-    assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "seed 0 would give episodes that begin as the 60 'nominal' episodes of its" in printed
-
-
-@pytest.mark.slow
 def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
     arguments = ("--plane-step", 0)
@@ -318,8 +288,6 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--learning-curve", "61"], "60 training episodes; got sizes [61]"),
-        (["--learning-curve", "many"], "--learning-curve 'many': give numbers of episodes"),
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
         (["--seed", "-3"], "seed 0 would give episodes that begin as the 60 'nominal'"),
@@ -338,14 +306,50 @@ def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
 
 def test_options_of_targets_are_refused_where_plans_have_no_goal():
     loop = load_scenario("laikago_balancing").make_loop()
-    check_options(loop, PlanOptions(), 100)
-    for options in (PlanOptions(other_hand=5), PlanOptions(learning_curve=(64,))):
+    check_options(loop, PlanOptions())
+    for options in (PlanOptions(other_hand=5), PlanOptions(plane_x=0.8)):
         with pytest.raises(
             ValueError, match=r"leave out --other-hand.*'Balancing' has no plans with a"
         ):
-            check_options(loop, options, 100)
+            check_options(loop, options)
 
 
-def test_sizes_of_a_learning_curve_are_numbers_between_commas():
-    assert parse_sizes("512,1024") == (512, 1024)
-    assert parse_sizes("") == ()
+@pytest.mark.slow
+def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    options = ("--assessment", folder, "--episodes", 20, "--calibration-episodes", 20)
+    options += ("--workers", 1, "--seed", 100, "--plane-step", 0, "--other-hand", 0)
+    assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
+    printed = capsys.readouterr().out
+    report = json.loads((folder / "evaluation.json").read_text())
+    judged = {key.split(".")[1] for key in report if key.startswith("monitoring.")}
+    assert judged == {
+        "motions",
+        "sharpened",
+        "sharpened_literal",
+        "sharpened_calibrated",
+        "paper",
+        "paper_literal",
+        "gradient_boosting",
+        "mlp",
+        "front_margin",
+        "smallest_margin",
+    }
+    pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
+    assert refused["n"] == 30 and pushed["n"] == 30 - round(30 * refused["value"])
+    assert 0 < pushed["value"] < 1
+    assert "Watching while it moves: pushes" in printed
+    assert (folder / "monitoring.png").is_file()
+    # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
+    monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
+    monkeypatch.setattr(rollouts, "run_episode", None)
+    assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
+    again = json.loads((folder / "evaluation.json").read_text())
+    assert all(again[key] == report[key] for key in report if key.startswith("monitoring."))
+
+
+def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, shuttle_run):
+    _, folder = shuttle_run
+    arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
+    assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
+    assert "have no goal to be pushed on the way to" in " ".join(capsys.readouterr().out.split())

@@ -12,9 +12,7 @@ from drake_safety.evaluation import comparison
 from drake_safety.evaluation.comparison import (
     Effort,
     compare_scenario,
-    figure_names,
-    to_csv,
-    to_markdown,
+    comparison_table,
 )
 from drake_safety.evaluation.comparison_figure import comparison_figure, standing_still
 from drake_safety.evaluation.metrics import Figure
@@ -34,19 +32,18 @@ ROW = {
 
 
 def test_markdown_has_shares_in_percent_and_a_dash_where_nothing_was_found():
-    head, _, line = to_markdown([ROW]).splitlines()
+    head, _, line = comparison_table([ROW]).to_markdown().splitlines()
     cells = dict(zip(head.split(" | "), line.split(" | "), strict=True))
-    assert cells["auc"] == "0.950 [0.930, 0.970]"
-    assert cells["falls without recovery"] == "40.0 [25.0, 55.0]"
+    assert cells["auc"] == "0.950 (0.930–0.970)"
+    assert cells["falls without recovery"] == "40.0 % (25.0–55.0)"
     assert cells["falls with recovery"] == "–"
 
 
 def test_csv_has_every_figure_with_its_interval():
-    (row,) = csv.DictReader(io.StringIO(to_csv([ROW])))
-    assert (row["scenario"], row["episodes"]) == (NAME, "256")
-    assert [float(row[f"auc_{end}"]) for end in ("value", "low", "high")] == [0.95, 0.93, 0.97]
-    assert row["falls_with_recovery_value"] == ""
-    assert {f"{name}_value" for name in figure_names()} < set(row)
+    (row,) = csv.DictReader(io.StringIO(comparison_table([ROW]).to_csv()))
+    assert (row["scenario"], float(row["episodes"])) == (NAME, 256)
+    assert [float(row[f"auc{end}"]) for end in ("", ".low", ".high")] == [0.95, 0.93, 0.97]
+    assert row["falls_with_recovery"] == ""
 
 
 def test_a_finished_row_is_read_again_and_another_effort_makes_another(tmp_path, monkeypatch):
@@ -84,8 +81,9 @@ def test_a_task_without_recovery_has_a_row_without_falls(tmp_path, monkeypatch, 
     assert row["throws"] == 0 and row["auc"]["n"] == 40
     assert 0.5 < row["auc"]["value"] <= 1.0
     assert not any(name.startswith("falls") for name in row)
-    assert (out / "comparison.md").read_text() == to_markdown([row])
-    assert to_markdown([row]).splitlines()[-1].split(" | ")[-1].startswith("–")
+    markdown = comparison_table([row]).to_markdown()
+    assert (out / "comparison.md").read_text() == markdown + "\n"
+    assert markdown.splitlines()[-1].split(" | ")[-1].startswith("–")
     assert "shuttling: training" in printed and "shuttling: t-SNE" in printed
     assert "picture" not in printed  # There is no robot to show.
     # Called again, it reads what it finished.

@@ -37,6 +37,7 @@ HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
 EXTRAS = {
     "logs": "drake_safety/logs/",
     "mujoco": "drake_safety/plants/mujoco",
+    "report": "drake_safety/evaluation/report/page",
     "robots": "drake_safety/robots/mesh_cache",
 }
 ONLY_IN = {
@@ -65,7 +66,7 @@ def relative(path):
 
 
 LIBRARY = source_files("drake_safety", *BESIDE)
-PYTHON = LIBRARY + source_files("tests", "benchmarks", "tutorials")
+PYTHON = LIBRARY + source_files("studies", "tests", "benchmarks", "tutorials")
 
 
 def module_of(name):
@@ -124,6 +125,8 @@ def upward_imports(source, name):
     room = room_of(module_of(name))
     offences = []
     for dotted, line, _ in imports_of(source, name):
+        if dotted.split(".")[0] == "studies":
+            offences.append(f"{name}:{line} imports {dotted}, which is not installed")
         if dotted.split(".")[0] != "drake_safety" or room == "__init__":
             continue
         target = room_of(dotted)
@@ -318,6 +321,7 @@ def test_a_folder_of_a_robot_is_no_python_package():
             "diagrams",
         ),
         (upward_imports, "drake_safety/cli/a.py", "from drake_safety import Scenario", "own room"),
+        (upward_imports, "drake_safety/cli/a.py", "from studies import x", "not installed"),
         (upward_imports, "models/__init__.py", "from drake_safety.control.qp import x", "models"),
         (upward_imports, "diagrams/a.py", "from drake_safety.evaluation import x", "diagrams"),
         (forbidden_imports, "drake_safety/learning/a.py", "import pydrake.math", "learning"),

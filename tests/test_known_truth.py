@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from cart_episodes import make_episode, make_info
-from drake_safety.evaluation.known_truth import (
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.episode_start import StatePlane
+from shuttle_task import shuttling
+from studies.known_truth import (
     KnownTruth,
     agreement,
     boundary_distance,
     random_plan_figures,
     simulate_truth,
 )
-from drake_safety.evaluation.known_truth_figure import known_truth_figure
-from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.episode_start import StatePlane
-from shuttle_task import shuttling
+from studies.known_truth_figure import known_truth_figure
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
 HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)

@@ -1,12 +1,12 @@
 import pytest
 
 from drake_safety import run_episodes
-from drake_safety.evaluation.learning_curve import learning_curve
-from drake_safety.evaluation.learning_curve_figure import learning_curve_figure
 from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL, plans_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.dataset import load_episodes
 from shuttle_task import shuttling
+from studies.learning_curve import learning_curve
+from studies.learning_curve_figure import learning_curve_figure
 
 
 @pytest.fixture(scope="module")

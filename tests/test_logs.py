@@ -1,12 +1,14 @@
 """Logs of any format say the same of a robot, and what is wrong with one is said where it is."""
 
 import builtins
+import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drake_safety.logs import tables
 from drake_safety.logs.conversion import angular_velocities, rates
 from drake_safety.logs.episodes import episodes_from_log
 from drake_safety.logs.log_map import LogMap, load_log_map
@@ -251,3 +253,11 @@ def test_a_date_column_needs_no_unit(few_rows, tmp_path):
     log = read_log(tmp_path / "run.parquet", map_of("parquet", tmp_path, changes), ROBOT)
     np.testing.assert_allclose(log.time_s, few_rows.time_s, atol=1e-12)
     assert LogMap() == LogMap()
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_table_without_what_reads_it_names_the_extra(kind, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    read = {"csv": tables.read_csv, "parquet": tables.read_parquet}[kind]
+    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[logs\]'"):
+        read(tmp_path / "log", [], None)

@@ -1,7 +1,9 @@
 """What a stranger gets: sdist → wheel → a clean environment, used from `/`."""
 
+import importlib.metadata
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -13,6 +15,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 # Where the source tree's folders stand once installed.
@@ -99,11 +103,88 @@ def clean_environment(wheel, tmp_path_factory):
     return folder
 
 
+def needed_by(*names):
+    """Packages and all that they bring, as pip would install them."""
+    found, wanted = set(), [*names]
+    while wanted:
+        name = wanted.pop()
+        if canonicalize_name(name) not in found:
+            found.add(canonicalize_name(name))
+            required = map(Requirement, importlib.metadata.requires(name) or ())
+            here = {"extra": ""}
+            wanted += [r.name for r in required if r.marker is None or r.marker.evaluate(here)]
+    return found
+
+
+@pytest.fixture(scope="module")
+def online_environment(wheel, tmp_path_factory):
+    """Makes an environment with the wheel and a few packages, this one's, and nothing else."""
+
+    def make(*names):
+        folder = tmp_path_factory.mktemp("online") / "environment"
+        run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
+        python = folder / "bin" / "python"
+        install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
+        run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
+        code = "import sysconfig; print(sysconfig.get_path('purelib'))"
+        site_packages = Path(run(python, "-c", code, cwd="/").strip())
+        for name in needed_by(*names):
+            distribution = importlib.metadata.distribution(name)
+            for top in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
+                link = site_packages / top
+                if not link.exists():
+                    link.symlink_to(distribution.locate_file(top))
+        return python
+
+    return make
+
+
+LOOP = """
+import importlib.util
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from drake_safety import load_assessment, load_scenario
+loop = load_scenario({0!r}).make_loop(assessment=load_assessment({0!r}))
+simulator = Simulator(loop)
+loop.reset(simulator.get_mutable_context(), np.random.default_rng(0))
+simulator.AdvanceTo(0.2)
+print(loop.GetOutputPort("safety_probability").Eval(simulator.get_context())[0])
+print(*(name for name in {1} if importlib.util.find_spec(name)))
+"""
+ABSENT = ["torch", "sklearn", "tslearn", "pandas", "pyarrow", "joblib", "jinja2", "numba"]
+
+
+def test_a_loop_with_an_assessment_runs_where_little_more_than_drake_is_installed(
+    online_environment,
+):
+    python = online_environment("drake", "numpy", "safetensors")
+    absent = [*ABSENT, "scipy", "typer", "daqp"]
+    probability, *found = run(
+        python, "-c", LOOP.format("laikago_balancing", absent), cwd="/"
+    ).splitlines()
+    assert 0.0 <= float(probability) <= 1.0
+    assert found == [""]
+
+
+def test_targets_are_asked_for_where_what_learns_is_not_installed(online_environment):
+    text = (ROOT / "docs/online.md").read_text(encoding="utf-8")
+    (named,) = re.findall(r"^pip install (.* typer)$", text, flags=re.MULTILINE)
+    python = online_environment(*named.split())
+    ask = ["ask", "atlas_reaching", "--target", "0.7", "0.3", "1.0", "--json"]
+    answer = json.loads(run(python, "-m", "drake_safety.cli", *ask, cwd="/"))
+    assert answer["verdict"] == "safe"
+    probability, *found = run(
+        python, "-c", LOOP.format("atlas_reaching", ABSENT), cwd="/"
+    ).splitlines()
+    assert 0.0 <= float(probability) <= 1.0
+    assert found == [""]
+
+
 def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "LICENSE", "README.md", "constraints.txt", "Makefile"} <= names
-    for folder in ("tests", "assessments"):
+    for folder in ("tests", "studies", "assessments"):
         assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
     assert names >= SHIPPED
 

@@ -3,8 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_safety.evaluation import planning_study as planning_study_module
-from drake_safety.evaluation.planning_study import planning_study, run_trials
+from drake_safety.evaluation.metrics import Figure, proportion
 from drake_safety.planning.plan_choice import plan_inputs
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import episode_rng
@@ -12,6 +11,8 @@ from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING
 from goal_field import FieldAssessment
 from shuttle_task import shuttling
+from studies import planning_study as planning_study_module
+from studies.planning_study import planning_study, planning_verdict, run_trials
 
 
 class Knowing(FieldAssessment):
@@ -119,3 +120,20 @@ def test_without_starts_or_plans_there_is_nothing_to_study():
     gliding = parse_scenario(GLIDING, name="gliding", folder=Path())
     with pytest.raises(ValueError, match="'Gliding' has no plans to choose from"):
         run_trials(gliding, 1, num_plans=2, seed=0, num_workers=1)
+
+
+@pytest.mark.parametrize(
+    ("gain", "said"),
+    [
+        ((0.5, 0.1, 0.8), "Γ wins: 75.0 % (58.8–87.3) of the starts stay safe with the plan that"),
+        ((-0.5, -0.9, -0.1), "The default plan wins: "),
+        ((0.1, -0.2, 0.4), "Nobody wins beyond chance: "),
+        ((np.nan, np.nan, np.nan), "Nobody wins: "),
+    ],
+)
+def test_who_wins_is_what_the_interval_of_the_gain_says(gain, said):
+    figures = {"default": proportion(24, 40), "chosen": proportion(30, 40)}
+    figures["gain"] = Figure(*gain, 40)
+    assert planning_verdict(figures).startswith(said)
+    del figures["gain"]
+    assert "incomplete" in planning_verdict(figures)

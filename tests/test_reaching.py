@@ -9,8 +9,8 @@ from drake_safety import load_scenario
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
 from drake_safety.plants.obstacles import Obstacle
-from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, REQUIRED_PORTS
-from drake_safety.simulation.rollouts import RECORDED_PORTS, episode_rng
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, RECORDED_PORTS, REQUIRED_PORTS
+from drake_safety.simulation.rollouts import episode_rng
 from legged_robots import edited, robot_model, write_biped, write_hexapod, write_porter
 from reaching_loops import (
     EASY,

@@ -6,25 +6,22 @@ import gzip
 import json
 import re
 import shutil
+import sys
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from drake_safety.evaluation.report import page
 from drake_safety.evaluation.report.cell_map import map_cells, map_views, most_typical
 from drake_safety.evaluation.report.page import write_report
 from drake_safety.evaluation.report.run_folder import read_run
-from drake_safety.evaluation.report.studies import ablation_verdict, planning_verdict
 from drake_safety.learning.beliefs import SAFE, UNSAFE
 from report_runs import (
     MODES,
-    make_ablation_rows,
     make_figures,
-    make_planning,
-    write_ablation,
     write_evaluation,
-    write_planning,
     write_run,
 )
 
@@ -101,7 +98,6 @@ def test_a_whole_run_has_nothing_missing_and_every_section(whole):
     assert not page.all("section", id="missing")
     sections = {a["id"] for a in page.all("section") if "id" in a}
     assert {"trained", "motion", "map", "paper", "verdicts", "calibration", "terms"} <= sections
-    assert {"planning", "ablation"} <= sections
     linked = {a["href"].removeprefix("#") for a in page.all("a") if a["href"].startswith("#")}
     assert linked <= sections
 
@@ -133,8 +129,6 @@ def test_every_figure_is_there_as_svg_and_png_and_every_table_as_csv_and_json(wh
         "a_new_figure",
         "map_sharpened",
         "map_paper",
-        "planning",
-        "ablation",
     ):
         assert {f"{stem}.svg", f"{stem}.png"} <= figures
     tables = {path.name for path in (whole.folder / "report/tables").iterdir()}
@@ -144,9 +138,6 @@ def test_every_figure_is_there_as_svg_and_png_and_every_table_as_csv_and_json(wh
         "throws",
         "calibration_sharpened",
         "cells_paper",
-        "planning",
-        "ablation",
-        "ablation_n_f_actual_paper",
     ):
         assert {f"{stem}.csv", f"{stem}.json"} <= tables
     with (whole.folder / "report/tables/segments.csv").open() as file:
@@ -155,99 +146,6 @@ def test_every_figure_is_there_as_svg_and_png_and_every_table_as_csv_and_json(wh
     assert float(rows["sharpened"]["auc"]) == figure.value
     assert float(rows["sharpened"]["auc.low"]) == figure.low
     assert int(rows["sharpened"]["auc.n"]) == 60
-
-
-def test_a_plan_study_has_a_table_with_intervals_and_says_who_wins(whole):
-    words = whole.page.words
-    assert "From each of 40 fresh starts 5 plans were simulated" in words
-    assert (
-        "Γ wins: 75.0 % (58.8–87.3) of the starts stay safe with the plan that Γ chooses" in words
-    )
-    assert "60.0 % (43.3–75.1) with the default plan" in words
-    assert "which is 50 % (20–80) of the way to the best plan in hindsight" in words
-    assert "drake-safety plan-study lip --assessment runs/lip" in words
-    with (whole.folder / "report/tables/planning.csv").open() as file:
-        rows = {row["plan"]: row for row in csv.DictReader(file)}
-    for key, figure in make_planning().items():
-        row = rows[key.removeprefix("planning.")]
-        assert [float(row[f"share{end}"]) for end in ("", ".low", ".high")] == [
-            figure.value,
-            figure.low,
-            figure.high,
-        ]
-        assert float(row["number"]) == int(row["share.n"]) == figure.n
-
-
-@pytest.mark.parametrize(
-    ("gain", "said"),
-    [
-        ((0.5, 0.1, 0.8), "Γ wins: "),
-        ((-0.5, -0.9, -0.1), "The default plan wins: "),
-        ((0.1, -0.2, 0.4), "Nobody wins beyond chance: "),
-        ((np.nan, np.nan, np.nan), "Nobody wins: "),
-    ],
-)
-def test_who_wins_a_plan_study_is_what_the_interval_of_the_gain_says(gain, said):
-    figures = make_planning(gain=gain)
-    figures = {key.removeprefix("planning."): figure for key, figure in figures.items()}
-    assert planning_verdict(figures).startswith(said)
-    del figures["gain"]
-    assert "incomplete" in planning_verdict(figures)
-
-
-def test_an_ablation_has_a_table_with_intervals_and_says_what_matters(whole):
-    words = whole.page.words
-    assert "1 of 3 variants beat the baseline's AUC: resolution = 7 (+0.020)" in words
-    assert "it beats 1: perplexity = 10 (-0.050)" in words
-    assert "for 1 the interval of the difference includes zero" in words
-    assert "-0.050 (-0.080–-0.020)" in words
-    assert "Left out, horizon H: longer ones were not recorded." in words
-    assert "What n_f counts: paper, adapted to “actual”" in words
-    with (whole.folder / "report/tables/ablation.csv").open() as file:
-        rows = {row["variant"]: row for row in csv.DictReader(file)}
-    assert float(rows["perplexity=10"]["auc_gain.low"]) == -0.08
-    rows = make_ablation_rows()
-    assert ablation_verdict(rows[:1]) == "There is nothing yet to compare the baseline with."
-    assert ablation_verdict(rows[:2]).startswith("No variant beats the baseline's AUC")
-
-
-def test_an_ablation_in_a_hurry_stands_in_for_a_whole_one_and_says_so(copy):
-    (copy / "ablation.json").rename(copy / "ablation_quick.json")
-    words = Page(page_of(copy).read_text(encoding="utf-8")).words
-    assert "Made in a hurry, with --quick" in words
-    write_ablation(copy / "ablation.json")
-    words = Page(page_of(copy).read_text(encoding="utf-8")).words
-    assert "Made in a hurry" not in words
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "named"),
-    [
-        ("planning.json", '{"planning.', "planning.json is not JSON"),
-        ("planning.json", '{"auc": {"value": 1, "low": 1, "high": 1, "n": 1}}', "no figure of a"),
-        ("ablation.json", "[]", "ablation.json holds no ablation"),
-        ("ablation.json", '{"schema": "drake_safety.ablation", "rows": []}', "no row 'baseline'"),
-    ],
-)
-def test_a_study_that_cannot_be_read_is_named_and_the_rest_shown(copy, name, content, named):
-    (copy / name).write_text(content)
-    page = Page(page_of(copy).read_text(encoding="utf-8"))
-    assert named in page.words
-    assert page.all("section", id="missing")
-    assert not page.all("section", id=name.partition(".")[0])
-    assert "0.900 (0.795–0.962)" in page.words
-
-
-def test_a_study_of_another_simulation_and_a_stopped_ablation_are_named(copy):
-    write_planning(copy, scenario_hash="f" * 64)
-    write_ablation(copy / "ablation.json", scenario_hash="f" * 64)
-    content = json.loads((copy / "ablation.json").read_text())
-    del content["left_out"]
-    (copy / "ablation.json").write_text(json.dumps(content))
-    words = Page(page_of(copy).read_text(encoding="utf-8")).words
-    assert "A plan study of this training" in words
-    assert "An ablation of this training" in words
-    assert "4 variants are here: it was stopped" in words
 
 
 def test_what_was_trained_is_told_with_its_share_of_unsafe_ones(whole):
@@ -331,8 +229,6 @@ def test_empty_cells_have_no_colour_and_safer_ones_are_bluer(whole):
         (["evaluation.json"], "It was not evaluated yet"),
         (["paper.safetensors"], "The learned assessment, mode “paper”"),
         (["run/recording.html"], "A recorded motion"),
-        (["planning.json"], "drake-safety plan-study lip --assessment"),
-        (["ablation.json"], "drake-safety ablate lip --assessment"),
         (["episodes", "sharpened.safetensors", "paper.safetensors"], "Training episodes"),
         (["sharpened.safetensors", "paper.safetensors", "evaluation.json", "run"], "evaluation"),
     ],
@@ -386,3 +282,10 @@ def test_names_that_look_like_html_stay_text(copy):
     text = page_of(copy).read_text(encoding="utf-8")
     assert "<script>alert" not in text
     assert "<script>alert(1)</script>" in Page(text).words
+
+
+def test_a_page_without_what_writes_it_names_the_extra(copy, monkeypatch):
+    page._environment.cache_clear()
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
+        page_of(copy)

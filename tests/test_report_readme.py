@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from drake_safety.evaluation.metrics import Figure, proportion
-from drake_safety.evaluation.report.readme import generate, rewrite_readme
-from drake_safety.evaluation.report.results import Results, read_results, store_results
+from drake_safety.evaluation.report.results import Results
 from report_runs import make_figures
+from studies.readme import generate, rewrite_readme
+from studies.stored_results import read_results, store_results
 
 ROOT = Path(__file__).resolve().parents[1]
 STORED = sorted((ROOT / "docs/results").glob("*.json"))

@@ -84,7 +84,7 @@ def test_without_the_extra_a_scenario_says_what_to_install(monkeypatch):
 
 
 def test_without_the_extra_the_list_of_scenarios_says_which_need_it(monkeypatch, capsys):
-    from drake_safety.cli.scenarios import scenarios
+    from drake_safety.cli.prepare import scenarios
     from drake_safety.robots import model_files
 
     monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)

@@ -10,8 +10,6 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from drake_safety.cli import adapt, calibrate, evaluate, train
-from drake_safety.cli.ablate import ablate
-from drake_safety.cli.plan_study import plan_study
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
@@ -29,6 +27,8 @@ from drake_safety.learning.seeds import (
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import run_pairs
 from lip_episodes import make_episodes
+from studies.ablate import ablate
+from studies.plan_study import plan_study
 
 
 def default_seed(function):

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 import drake_safety
+import studies.__main__ as studies
 from drake_safety import assessments
 from drake_safety.assessments import assessed_scenarios, load_assessment, shipped_folder
 from drake_safety.cli import main
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.evaluation.report.results import read_results
-from drake_safety.evaluation.shipping import NUM_EPISODES, check_shipped
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
+from studies.shipping import NUM_EPISODES, check_shipped
+from studies.stored_results import read_results
 
 NAME = "shuttling"
 MEGABYTE = 1e6
@@ -44,10 +45,10 @@ def test_what_is_shipped_is_small(name):
 
 
 def call(patch, *arguments):
-    """Runs the command as a shell would; returns its exit code."""
+    """Runs the command, or the study of that name, as a shell would; returns its exit code."""
     patch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
-        main()
+        (studies.main if arguments[0] in ("plan-study", "ship") else main)()
     return ended.value.code or 0
 
 
@@ -86,7 +87,7 @@ def shipped(run, tmp_path_factory):
     into = tmp_path_factory.mktemp("shipped")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: scenarios)
-        assert call(patch, "report", folder, "--ship", into) == 0
+        assert call(patch, "ship", "--assessment", folder, "--into", into) == 0
     return into
 
 
@@ -208,7 +209,7 @@ def test_what_was_not_evaluated_as_it_is_is_not_shipped(
         shutil.rmtree(episodes_folder(folder))
     else:
         (folder / "evaluation.json").unlink()
-    assert call(monkeypatch, "report", folder, "--ship", into) == 2
+    assert call(monkeypatch, "ship", "--assessment", folder, "--into", into) == 2
     assert message in capsys.readouterr().out
     assert not into.exists()
 

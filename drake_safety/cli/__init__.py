@@ -1,7 +1,7 @@
 """The command ``drake-safety``: train, run and evaluate safety assessments.
 
-One module a command. Another one is a module with a function of the command's name (its arguments
-are the command line, its docstring the help) and a line in `_COMMANDS`.
+Another command is a function of the command's name (its arguments are the command line, its
+docstring the help) and a line in `_COMMANDS`.
 """
 
 from __future__ import annotations
@@ -13,19 +13,15 @@ import typer
 from rich.logging import RichHandler
 
 from drake_safety.cli import (
-    ablate,
     adapt,
     ask,
     calibrate,
-    check,
     compare,
     evaluate,
-    new,
-    plan_study,
     play,
+    prepare,
     report,
     run,
-    scenarios,
     train,
 )
 from drake_safety.cli.console import console
@@ -33,9 +29,9 @@ from drake_safety.cli.targets import TargetCommand
 
 # In the order in which the help lists them.
 _COMMANDS = (
-    scenarios.scenarios,
-    new.new,
-    check.check,
+    prepare.scenarios,
+    prepare.new,
+    prepare.check,
     train.train,
     calibrate.calibrate,
     ask.ask,
@@ -43,9 +39,7 @@ _COMMANDS = (
     play.play,
     evaluate.evaluate,
     compare.compare,
-    plan_study.plan_study,
     adapt.adapt,
-    ablate.ablate,
     report.report,
 )
 
@@ -64,12 +58,22 @@ for _command in _COMMANDS:
 
 
 def main() -> None:
-    """Runs the command; what a user did wrong is one line, and with --debug a traceback."""
+    """Runs the command."""
+    run_app(app, "drake-safety")
+
+
+def run_app(commands: typer.Typer, program: str) -> None:
+    """Runs a command; what a user did wrong is one line, and with --debug a traceback.
+
+    Args:
+        commands: The commands.
+        program: What they are called by.
+    """
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
     try:
-        sys.exit(app(arguments, prog_name="drake-safety", standalone_mode=False))
+        sys.exit(commands(arguments, prog_name=program, standalone_mode=False))
     except (typer.Abort, KeyboardInterrupt):
         console.print("stopped; finished episodes are kept", highlight=False)
         sys.exit(130)

@@ -1,27 +1,29 @@
-"""``drake-safety adapt``: adapts Γ to an actual robot, and says what that was worth."""
+"""``drake-safety adapt``: adapts Γ to an actual robot, and judges it before and after."""
 
 from __future__ import annotations
 
 import json
-import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
     Stages,
+    WorkersOption,
+    command_line,
     console,
     interval,
     new_table,
     open_stages,
     print_path,
     print_shipped,
+    versions,
 )
-from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
     adapted_folder,
@@ -34,13 +36,15 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.adaptation_study import AdaptationStudy
+    from drake_safety.evaluation.metrics import Figure
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.feedback import EpisodePairs
     from drake_safety.simulation.scenario import Scenario
 
-_SCRATCH_SIZES = (40, 160, 400)
+_JUDGED = {"before": "before feedback", "after": "after feedback"}
+_COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
+_THRESHOLD = 0.5  # Safety probability below which a segment counts as judged unsafe.
 
 
 def adapt(
@@ -54,15 +58,6 @@ def adapt(
         int,
         typer.Option(help="Fresh actual episodes to judge by; 0 leaves judging out.", min=0),
     ] = 0,
-    orders: Annotated[int, typer.Option(help="Judging: orders of the feedback.", min=1)] = 5,
-    oracle: Annotated[
-        int,
-        typer.Option(help="Judging: other actual episodes to train a rival on.", min=0),
-    ] = 0,
-    scratch: Annotated[
-        bool,
-        typer.Option("--scratch", help="Judging: also train from scratch on the feedback itself."),
-    ] = False,
     log: Annotated[
         list[Path] | None,
         typer.Option(
@@ -85,8 +80,6 @@ def adapt(
     stopped goes on when it is called again. For an assessment that came with the package,
     ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.evaluation.adaptation_figure import adaptation_figure
-    from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -106,35 +99,33 @@ def adapt(
     name = logs[0].stem if logs else variation
     print_shipped(learned)
     folder = adapted_folder(learned.out, name)
+    judged: dict[str, Figure] = {}
     with open_stages() as stages:
         if log_map is not None:
             pairs = _logged_pairs(loaded, logs, log_map, seed)
         else:
-            pairs = _run_pairs(loaded, feedback, variation, seed, learned.out, workers, stages)
+            pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
         sets = pairs.feedback()
-        adapted = {}
-        for mode, prior in priors.items():
-            adapted[mode] = prior.adapt(sets)
+        adapted = {mode: prior.adapt(sets) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
-        files = []
         for mode, one in adapted.items():
             one.save(assessment_file(folder, mode))
-            files.append(assessment_file(folder, mode))
-        pictures = []
-        interval_sets = priors[MODES[0]].parameters.adaptation.update_interval
-        if len(sets) >= interval_sets:
-            for mode, prior in priors.items():
-                pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
-        studies: dict[str, AdaptationStudy] = {}
         if evaluate:
-            judge = _Judge(loaded, variation, seeds, learned.out, workers, stages)
-            studies = judge.studies(priors, pairs, evaluate, orders, oracle, scratch)
-            from drake_safety.evaluation.adaptation_figure import study_figure
-
-            for published in ("calibrated", "grid"):
-                pictures += save(
-                    study_figure(studies, published=published), folder / f"study_{published}"
-                )
+            fresh = fresh_actual_episodes(
+                loaded,
+                evaluate,
+                variation,
+                seeds["evaluation of the adaptation"],
+                learned.out,
+                workers,
+                stages,
+            )
+            for mode in MODES:
+                judged |= {
+                    f"{mode}.{who}.{key}": figure
+                    for who, one in (("before", priors[mode]), ("after", adapted[mode]))
+                    for key, figure in _judge(one, fresh).items()
+                }
     differing, num_pairs = pairs.gap
     report = {
         "command": command_line(),
@@ -148,28 +139,19 @@ def adapt(
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
-        **{
-            f"{mode}.{key}": figure.to_json()
-            for mode, found in studies.items()
-            for key, figure in found.figures.items()
-        },
+        **{key: figure.to_json() for key, figure in judged.items()},
     }
     file = folder / "adaptation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(_adaptation_table(adapted, differing, num_pairs, name))
-    for mode, found in studies.items():
-        for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
-            console.print(_study_table(found, mode, published, variation))
-        if "losses.x.brier" in found.figures:
-            console.print(_losses_table(found, mode))
-    for path in files:
-        print_path("assessment", path)
+    if judged:
+        console.print(_judged_table(judged, variation))
+    for mode in adapted:
+        print_path("assessment", assessment_file(folder, mode))
     print_path("figures   ", file)
-    for picture in pictures:
-        print_path("picture   ", picture)
 
 
-def _run_pairs(
+def paired_episodes(
     scenario: Scenario,
     num_pairs: int,
     variation: str,
@@ -178,6 +160,17 @@ def _run_pairs(
     workers: int | None,
     stages: Stages,
 ) -> EpisodePairs:
+    """Actual episodes beside their nominal twins; those that the folder has are not run again.
+
+    Args:
+        scenario: The scenario.
+        num_pairs: How many.
+        variation: Which plant is the actual one.
+        seed: Of the episodes.
+        folder: The folder of the training.
+        workers: Processes; None for as many as there are cores.
+        stages: Shows how far it is.
+    """
     from drake_safety.simulation.feedback import run_pairs
 
     return run_pairs(
@@ -192,6 +185,44 @@ def _run_pairs(
     )
 
 
+def fresh_actual_episodes(
+    scenario: Scenario,
+    num_episodes: int,
+    variation: str,
+    seed: int,
+    folder: Path,
+    workers: int | None,
+    stages: Stages,
+    what: str = "fresh actual episodes",
+) -> Episodes:
+    """Other episodes of the actual plant, kept and gone on with as the pairs are.
+
+    Args:
+        scenario: The scenario.
+        num_episodes: How many.
+        variation: Which plant.
+        seed: Of the episodes.
+        folder: The folder of the training.
+        workers: Processes; None for as many as there are cores.
+        stages: Shows how far it is.
+        what: What the stage is called.
+    """
+    from drake_safety.simulation.capabilities import pairing_options
+    from drake_safety.simulation.rollouts import run_episodes
+
+    return run_episodes(
+        scenario,
+        num_episodes,
+        variation=variation,
+        seed=seed,
+        num_workers=workers,
+        path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
+        progress=partial(stages, what),
+        extra={"command": command_line()},
+        **pairing_options(scenario, variation),
+    )
+
+
 def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int) -> EpisodePairs:
     from drake_safety.logs.episodes import cut_log
     from drake_safety.logs.robot_log import read_log
@@ -203,81 +234,23 @@ def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int
     return pair_starts(scenario, actual, starts, seed=seed)
 
 
-class _Judge:
-    """Simulates what the study needs, and conducts it."""
+def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Figure]:
+    """How well Γ judges every segment of fresh actual episodes, by its heads and by its grid."""
+    from drake_safety.evaluation.metrics import segment_figures
+    from drake_safety.learning.segments import split
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        variation: str,
-        seeds: dict[str, int],
-        folder: Path,
-        workers: int | None,
-        stages: Stages,
-    ):
-        self._scenario, self._variation, self._seeds = scenario, variation, seeds
-        self._folder, self._workers, self._stages = folder, workers, stages
-
-    def _run(self, what: str, num_episodes: int, purpose: str) -> Episodes:
-        from drake_safety.simulation.capabilities import pairing_options
-        from drake_safety.simulation.rollouts import run_episodes
-
-        seed = self._seeds[purpose]
-        scenario_hash = self._scenario.simulation_hash(self._variation)
-        episodes = run_episodes(
-            self._scenario,
-            num_episodes,
-            variation=self._variation,
-            seed=seed,
-            num_workers=self._workers,
-            path=feedback_folder(self._folder, scenario_hash, seed) / self._variation,
-            progress=partial(self._stages, what),
-            extra={"command": command_line()},
-            **pairing_options(self._scenario, self._variation),
-        )
-        return episodes
-
-    def studies(
-        self,
-        priors: dict[str, SafetyAssessment],
-        pairs: EpisodePairs,
-        num_test: int,
-        num_orders: int,
-        num_oracle: int,
-        has_scratch: bool,
-    ) -> dict[str, AdaptationStudy]:
-        """One study a mode."""
-        from drake_safety.evaluation.adaptation_losses import losses
-        from drake_safety.evaluation.adaptation_study import TestSet, study, trained_rivals
-
-        fresh = self._run("fresh actual episodes", num_test, "evaluation of the adaptation")
-        learned_from = {}
-        if num_oracle:
-            learned_from["oracle"] = self._run("episodes of the oracle", num_oracle, "oracle")
-        if has_scratch:
-            learned_from |= {
-                f"scratch.{n}": pairs.actual[:n] for n in _SCRATCH_SIZES if n <= len(pairs.actual)
-            }
-        found = {}
-        for mode, prior in priors.items():
-            rivals: dict[str, Any] = {}
-            if learned_from:
-                rivals = trained_rivals(
-                    prior, learned_from, num_workers=self._workers, progress=self._stages
-                )
-            test = TestSet.of(fresh, prior.parameters.shortest)
-            found[mode] = study(
-                prior,
-                pairs.feedback(),
-                test,
-                num_orders=num_orders,
-                seed=self._seeds["adaptation"],
-                rivals=rivals,
-                progress=self._stages,
-            )
-            if mode == "paper" and "oracle" in learned_from:
-                found[mode].figures |= losses(prior, pairs.feedback(), learned_from["oracle"], test)
-        return found
+    segments = split(fresh, stride=1, discount=1.0, shortest=assessment.parameters.shortest)
+    is_plain = not assessment.parameters.is_sharpened and fresh.info.variation == "nominal"
+    result = assessment.predict(
+        segments.true_state if is_plain else segments.state,
+        segments.desired_preview,
+        segments.features if assessment.uses_features else None,
+    )
+    found: dict[str, Figure] = {}
+    for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
+        figures = segment_figures(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
+        found |= {f"{name}.{key}": figure for key, figure in figures.items()}
+    return found
 
 
 def _adaptation_table(
@@ -300,48 +273,12 @@ def _adaptation_table(
     return table
 
 
-def _losses_table(found: AdaptationStudy, mode: str) -> Table:
-    from drake_safety.evaluation.adaptation_losses import STEPS
-
-    brier = {name: found.figures[f"losses.{name}.brier"].value for name in STEPS}
-    table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
-    table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
-    for name, before, label in (
-        ("psi", "x", "Ψ: their nearest in the embedding"),
-        ("grid", "psi", "the grid: their share in the cell"),
-        ("update", "grid", "the update, from all feedback"),
-        ("update_without_gpr", "grid", "the update without the discrepancy function"),
-    ):
-        table.add_row(label, f"{brier[name]:.3f}", f"{brier[name] - brier[before]:+.3f}")
-    return table
-
-
-def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
-    columns = ("brier", "auc", "unsafe_recall", "safe_recall")
-    figures = found.figures
-    table = new_table(
-        "",
-        *columns,
-        "better in",
-        "gap closed",
-        title=f"{mode}, {published}: fresh episodes of '{variation}', {found.num_orders} orders of "
-        "feedback (mean, least and largest)",
-    )
-    names = {"prior": "before feedback"}
-    names |= {f"adapted.{n}": f"after {n} sets" for n in found.sizes}
-    names |= {f"scratch.{n}": f"from scratch on {n}" for n in _SCRATCH_SIZES}
-    names["oracle"] = "oracle"
-    for who, label in names.items():
-        key = f"{who}.{published}"
-        if f"{key}.brier" not in figures:
-            continue
-        won, closed = figures.get(f"{key}.orders_won"), figures.get(f"{key}.gap_closed")
-        table.add_row(
-            label,
-            *(interval(figures[f"{key}.{column}"]) for column in columns),
-            f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
-            f"{100 * closed.value:.0f} %"
-            if closed is not None and math.isfinite(closed.value)
-            else "",
-        )
+def _judged_table(judged: dict[str, Figure], variation: str) -> Table:
+    n = judged[f"{MODES[0]}.before.grid.auc"].n
+    table = new_table("", *_COLUMNS, title=f"{n} fresh episodes of '{variation}'")
+    for mode in MODES:
+        for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
+            for who, label in _JUDGED.items():
+                figures = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
+                table.add_row(f"{mode}, {published}, {label}", *map(interval, figures))
     return table

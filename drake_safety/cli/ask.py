@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import console, print_shipped
+from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
 from drake_safety.cli.targets import (
     TARGET,
     TARGET_HELP,

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    WorkersOption,
     console,
     interval,
     new_table,
@@ -21,8 +23,8 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     assessment_folder,
     check_fresh,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 from drake_safety.learning.seeds import CALIBRATION
 
@@ -65,8 +67,6 @@ def calibrate(
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
     from drake_safety.learning.segments import split
-    from drake_safety.simulation.capabilities import judging_options
-    from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -81,17 +81,9 @@ def calibrate(
     for gamma in learned.values():
         check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
-    judging = judging_options(loaded.task_class())
     with open_stages() as stages:
-        fresh = run_episodes(
-            loaded,
-            episodes,
-            seed=seed,
-            num_workers=workers,
-            path=fresh_episodes_folder(folder.out, scenario_hash, seed, judging),
-            progress=partial(stages, "calibration episodes"),
-            **judging,
-        )
+        progress = partial(stages, "calibration episodes")
+        fresh = run_fresh_episodes(loaded, folder.out, episodes, seed, progress, workers)
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}

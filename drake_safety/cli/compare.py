@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_safety.cli.arguments import WorkersOption
-from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
-from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.console import (
+    WorkersOption,
+    command_line,
+    console,
+    figures_table,
+    open_stages,
+    print_path,
+    versions,
+)
+
+if TYPE_CHECKING:
+    from drake_safety.evaluation.report.tables import Table
 
 
 def compare(
@@ -35,10 +44,7 @@ def compare(
     from drake_safety.evaluation.comparison import (
         Effort,
         compare_scenario,
-        figure_names,
-        row_figure,
-        to_csv,
-        to_markdown,
+        comparison_table,
     )
     from drake_safety.evaluation.comparison_figure import comparison_figure, standing_still
     from drake_safety.evaluation.figure_style import save
@@ -58,12 +64,8 @@ def compare(
             )
             rows.append(row)
             # After every row: what is finished can be read while the next is simulated.
-            _write(out, rows, to_csv(rows), to_markdown(rows))
-    table = new_table("scenario", *(name.replace("_", " ") for name in figure_names()))
-    for row in rows:
-        figures = [row_figure(row, name) for name in figure_names()]
-        table.add_row(row["scenario"], *("–" if f is None else interval(f) for f in figures))
-    console.print(table)
+            _write(out, rows, comparison_table(rows))
+    console.print(figures_table(comparison_table(rows)))
     for suffix in ("json", "csv", "md"):
         print_path("table", out / f"comparison.{suffix}")
     found = {scenario.name: standing_still(scenario.make_loop()) for scenario in loaded}
@@ -73,8 +75,12 @@ def compare(
             print_path("picture", picture)
 
 
-def _write(out: Path, rows: list[dict[str, object]], csv: str, markdown: str) -> None:
+def _write(out: Path, rows: list[dict[str, object]], table: Table) -> None:
     report = {"command": command_line(), "versions": versions(), "rows": rows}
-    texts = {"json": json.dumps(report, indent=2) + "\n", "csv": csv, "md": markdown}
+    texts = {
+        "json": json.dumps(report, indent=2) + "\n",
+        "csv": table.to_csv(),
+        "md": table.to_markdown() + "\n",
+    }
     for suffix, text in texts.items():
         (out / f"comparison.{suffix}").write_text(text, encoding="utf-8")

@@ -1,14 +1,16 @@
-"""What all commands write with: one console, its tables, its progress, its paths."""
+"""What all commands share: the arguments that several take, and what they write with."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -26,8 +28,32 @@ if TYPE_CHECKING:
 
     from drake_safety.cli.training_folder import AssessmentFolder
     from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.report.tables import Table as Figures
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
+]
+AssessmentOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--assessment",
+        help="Folder that `train` wrote; by default the scenario's own trained assessment, which "
+        "comes with the package.",
+        file_okay=False,
+    ),
+]
+TrainingOption = Annotated[
+    Path,
+    typer.Option(
+        "--assessment", help="Folder that `train` wrote, with its episodes.", file_okay=False
+    ),
+]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
+]
 
 # Square brackets are units here, not markup. A log has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
@@ -36,6 +62,25 @@ console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 def new_table(*columns: str, title: str | None = None) -> Table:
     """A table whose cells fold where they do not fit: no figure is cut short."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
+
+
+def figures_table(found: Figures) -> Table:
+    """A table of the report on the console: figures with their intervals, and what they mean.
+
+    Args:
+        found: The table.
+    """
+    table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
+    for row in found.rows:
+        cells = [
+            column.text(figure) for column, figure in zip(found.columns, row.figures, strict=True)
+        ]
+        table.add_row(row.label, *cells)
+    ahead = found.rivals_ahead()
+    table.caption = found.meaning or None
+    if ahead:
+        table.caption = f"{found.meaning}\nAhead of sharpened: {'; '.join(ahead)}"
+    return table
 
 
 def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
@@ -90,6 +135,26 @@ def print_shipped(folder: AssessmentFolder) -> None:
     """Says which assessment is used where none was asked for."""
     if folder.is_shipped:
         print_path("assessment        comes with the package,", folder.path)
+
+
+def command_line(program: str = "drake-safety") -> str:
+    """The command as it was typed.
+
+    Args:
+        program: What was called.
+    """
+    return shlex.join([*program.split(), *sys.argv[1:]])
+
+
+def versions() -> dict[str, str]:
+    """Versions of the library and of what its figures depend on."""
+    import importlib.metadata
+
+    import drake_safety
+
+    names = ("drake", "numpy", "scipy", "scikit-learn", "torch")
+    installed = {name: importlib.metadata.version(name) for name in names}
+    return {"drake_safety": drake_safety.__version__, **installed}
 
 
 class Stages:

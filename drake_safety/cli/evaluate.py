@@ -9,28 +9,32 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from rich.table import Table
 
-from drake_safety.cli.arguments import ScenarioArgument, TrainingOption, WorkersOption
-from drake_safety.cli.console import console, interval, new_table, open_stages, print_path
-from drake_safety.cli.evaluate_calibration import evaluate_calibration
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    command_line,
+    console,
+    figures_table,
+    open_stages,
+    print_path,
+    versions,
+)
 from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
 from drake_safety.cli.evaluate_plans import (
     PlanOptions,
     check_options,
     evaluate_plans,
-    parse_sizes,
 )
-from drake_safety.cli.evaluate_truth import evaluate_truth
 from drake_safety.cli.findings import Findings, Judged
-from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
     check_fresh,
     episodes_folder,
-    fresh_episodes_folder,
     load_assessment,
+    run_fresh_episodes,
 )
 from drake_safety.learning.seeds import EVALUATION
 
@@ -67,12 +71,6 @@ def evaluate(
             help="Targets: how many to mirror to the other hand; at most 400 by default.", min=0
         ),
     ] = None,
-    learning_curve: Annotated[
-        str,
-        typer.Option(
-            help="Targets: learn from fewer episodes, too, such as '512,1024'; takes long."
-        ),
-    ] = "",
     plane_x: Annotated[
         float | None,
         typer.Option(help="Targets: x of the reachable region's plane [m]; the task's by default."),
@@ -89,12 +87,13 @@ def evaluate(
             min=0,
         ),
     ] = 0,
-    truth_resolution: Annotated[
-        int,
+    baselines: Annotated[
+        bool,
         typer.Option(
-            help="State planes: starts simulated along either axis; 0 leaves them out.", min=0
+            "--baselines/--no-baselines",
+            help="Beside direct classifiers, trained on the same episodes; takes half of the time.",
         ),
-    ] = 41,
+    ] = True,
     seed: Annotated[
         int, typer.Option(help="First of the seeds of all that is fresh.")
     ] = EVALUATION.first,
@@ -106,25 +105,23 @@ def evaluate(
     """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers.
 
     Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
-    kinematics too. Their episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
+    kinematics too. Episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
     With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
     watch instead.
-    Where a task has state planes, Γ is drawn beside the truth, simulated from every start.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.report.results import Results
+    from drake_safety.evaluation.report.verdicts import verdict_tables
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.capabilities import (
         CanBePushed,
         HasBall,
         HasGoals,
-        HasStatePlanes,
-        judging_options,
         require,
     )
     from drake_safety.simulation.dataset import load_episodes
-    from drake_safety.simulation.rollouts import run_episodes
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -140,7 +137,6 @@ def evaluate(
         loaded.variation("actual")
     options = PlanOptions(
         other_hand=other_hand,
-        learning_curve=parse_sizes(learning_curve),
         plane_x=plane_x,
         plane_step=plane_step,
     )
@@ -150,23 +146,18 @@ def evaluate(
     seeds = EVALUATION.seeds(seed)
     for gamma in (sharpened, paper):
         check_fresh(gamma, loaded, seeds.values())
-    check_options(loop, options, len(train_set))
+    check_options(loop, options)
     with open_stages() as stages:
 
         def run_set(what: str, num_episodes: int, purpose: str, **loop_options: Any) -> Episodes:
-            path = None
-            loop_options = {**judging_options(type(loop)), **loop_options}
-            if has_goals:
-                path = fresh_episodes_folder(
-                    assessment, loaded.simulation_hash(), seeds[purpose], loop_options
-                )
-            return run_episodes(
+            progress = partial(stages, what)
+            return run_fresh_episodes(
                 loaded,
+                assessment,
                 num_episodes,
-                seed=seeds[purpose],
-                num_workers=workers,
-                path=path,
-                progress=partial(stages, what),
+                seeds[purpose],
+                progress,
+                workers,
                 **loop_options,
             )
 
@@ -177,7 +168,9 @@ def evaluate(
             scenario=loaded,
             sharpened=sharpened,
             paper=paper,
-            classifiers=classifier_scorers(train_set, stages, shortest=shortest),
+            classifiers=classifier_scorers(train_set, stages, shortest=shortest)
+            if baselines
+            else [],
             run_folder=assessment,
             train_set=train_set,
             calibration_set=calibration_set,
@@ -196,7 +189,7 @@ def evaluate(
             findings.add(evaluate_plans(judged, options, partial(run_set, purpose="evaluation")))
         else:
             findings.add(_evaluate_segments(judged))
-        findings.add(evaluate_calibration(judged))
+        findings.add(_evaluate_calibration(judged))
         if throws:
             findings.add(_evaluate_throws(judged, throws, calibration_throws, seeds))
         if pushes:
@@ -210,8 +203,6 @@ def evaluate(
                     calibration_seed=seeds["disturbance thresholds"],
                 )
             )
-        if isinstance(loop, HasStatePlanes) and truth_resolution:
-            findings.add(evaluate_truth(judged, list(loop.state_planes), truth_resolution))
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -226,8 +217,8 @@ def evaluate(
     }
     file = folder / "evaluation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for table in findings.tables:
-        console.print(table)
+    for table in verdict_tables(Results(figures=findings.figures)):
+        console.print(figures_table(table))
     print_path("figures", file)
     for picture in findings.pictures:
         print_path("picture", picture)
@@ -247,14 +238,9 @@ def _evaluate_segments(judged: Judged) -> Findings:
     ]
     figures, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
     curves = {name: (score, labels) for name, score in scores.items()}
-    names = [scorer.name for scorer in scorers]
     return Findings(
         figures=figures,
         pictures=save(roc_figure(curves), judged.folder / "roc"),
-        tables=[
-            _episodes_table(figures, names, "segments", "per segment"),
-            _episodes_table(figures, names, "episodes", "per episode, at k = 0"),
-        ],
     )
 
 
@@ -289,7 +275,6 @@ def _evaluate_throws(
     findings = Findings(
         figures=figures,
         pictures=save(_throws_picture(study), judged.folder / "throws"),
-        tables=[_throws_table(figures, [rule.name for rule in rules])],
     )
     findings.add(
         evaluate_monitoring(
@@ -316,37 +301,36 @@ def _throws_picture(study: ThrowStudy) -> Picture:
     )
 
 
-def _episodes_table(figures: dict[str, Figure], names: list[str], kind: str, title: str) -> Table:
-    columns = ("auc", "safe_recall", "unsafe_recall", "brier")
-    table = new_table("scorer", *columns, title=f"Fresh nominal episodes, {title}")
-    for name in names:
-        table.add_row(name, *(interval(figures[f"{kind}.{name}.{key}"]) for key in columns))
-    return table
+def _evaluate_calibration(judged: Judged) -> Findings:
+    """Reliability of either mode at k = 0, and whether stored promises are kept."""
+    from drake_safety.evaluation.calibration_study import reliability, verdict_shares
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.metrics import Bootstrap
+    from drake_safety.evaluation.reliability_figure import reliability_figure
+    from drake_safety.evaluation.scorers import assessment_scorer
+    from drake_safety.learning.calibration import PLAN, episode_scores
+    from drake_safety.learning.segments import split
 
+    segments = split(judged.test_set, stride=1, discount=1.0, shortest=1)
+    figures: dict[str, Figure] = {}
+    curves = {}
+    for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
+        score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
+        expected, is_unsafe = episode_scores(segments, score, PLAN)
+        curves[mode] = reliability(expected, is_unsafe)
 
-def _throws_table(figures: dict[str, Figure], names: list[str]) -> Table:
-    alone = figures["throws.falls_without_recovery"]
-    table = new_table(
-        "trigger",
-        "Γ_thre",
-        "falls [%]",
-        "false triggers [%]",
-        "falls missed",
-        "after impact [ms]",
-        "before the fall [s]",
-        title=f"{alone.n} fresh throws at the actual plant; balancing alone falls in "
-        f"{interval(alone, 100, 1)} %",
+        def error(
+            weight: np.ndarray, p: np.ndarray = expected, label: np.ndarray = is_unsafe
+        ) -> float:
+            drawn = np.repeat(np.arange(len(p)), weight.astype(int))
+            return reliability(p[drawn], label[drawn]).calibration_error
+
+        figures[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
+            num_resamples=100
+        ).over_episodes(error, np.arange(len(expected)))
+        for kind, one in gamma.calibrations_.items():
+            shares = verdict_shares(one, *episode_scores(segments, score, kind))
+            figures |= {f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()}
+    return Findings(
+        figures=figures, pictures=save(reliability_figure(curves), judged.folder / "reliability")
     )
-    for name in names:
-        prefix = f"throws.{name}."
-        missed = figures[f"{prefix}falls_missed"]
-        table.add_row(
-            name,
-            f"{figures[f'{prefix}threshold'].value:.2f}",
-            interval(figures[f"{prefix}falls_with_recovery"], 100, 1),
-            interval(figures[f"{prefix}false_triggers"], 100, 1),
-            f"{round(missed.value * missed.n) if missed.n else 0} of {missed.n}",
-            f"{1000 * figures[f'{prefix}trigger_after_impact_s'].value:.0f}",
-            f"{figures[f'{prefix}trigger_before_fall_s'].value:.2f}",
-        )
-    return table

@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from drake_safety.cli.console import new_table
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import fresh_episodes_folder
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
     from drake_safety.simulation.watched_motion import WatchedMotion
 
 _PLANT = "actual"  # Which is pushed.
@@ -90,7 +86,7 @@ def evaluate_monitoring(
     from drake_safety.simulation.capabilities import HasWatchedFeatures
 
     if all(motion.has_left for motion in calibration):
-        # Nobody could be allowed the same share of false alarms.
+        # Nobody could be allowed the same share of false alarms: thresholds need calm motions.
         return Findings()
     loop = judged.scenario.make_loop()
     watched = loop.watched_features if isinstance(loop, HasWatchedFeatures) else {}
@@ -104,25 +100,4 @@ def evaluate_monitoring(
     return Findings(
         figures=study.figures,
         pictures=save(monitoring_figure(study), judged.folder / "monitoring"),
-        tables=[_table(study.figures)],
     )
-
-
-def _table(figures: dict[str, Figure]) -> Table:
-    """The report's own table on the console, and below it where others are ahead."""
-    from drake_safety.evaluation.report.results import Results
-    from drake_safety.evaluation.report.verdicts import alarm_table
-
-    found = alarm_table(Results(figures=figures))
-    table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
-    for row in found.rows:
-        cells = [
-            f"{column.value_text(figure)} {column.interval_text(figure)}".strip()
-            for column, figure in zip(found.columns, row.figures, strict=True)
-        ]
-        table.add_row(row.label, *cells)
-    ahead = found.rivals_ahead()
-    table.caption = found.meaning
-    if ahead:
-        table.caption += "\nAhead of sharpened: " + "; ".join(ahead)
-    return table

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from drake_safety.cli.console import Stages
     from drake_safety.evaluation.metrics import Figure
     from drake_safety.evaluation.scorers import Scorer
@@ -57,17 +55,14 @@ class Findings:
         figures: By dotted key.
         entries: What else belongs in the report.
         pictures: Files that were written.
-        tables: For the console.
     """
 
     figures: dict[str, Figure] = field(default_factory=dict)
     entries: dict[str, Any] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
 
     def add(self, other: Findings) -> None:
         """Takes over what another part has found."""
         self.figures |= other.figures
         self.entries |= other.entries
         self.pictures += other.pictures
-        self.tables += other.tables

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import console, print_shipped
+from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 

@@ -9,9 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
-from drake_safety.cli.console import cause_words, new_table, print_shipped
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, save_moving_picture
+from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    cause_words,
+    print_shipped,
+)
+from drake_safety.cli.run_settings import (
+    LOG_PERIOD_S,
+    Recording,
+    RunSettings,
+    events_table,
+    save_moving_picture,
+)
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
@@ -224,9 +234,6 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
 def _table_of_events(
     loop: ClosedLoop, assessment: SafetyAssessment, log: ThrowLog, throws: list[Throw]
 ) -> Table:
-    def row_at(time_s: float) -> int:
-        return min(round(time_s / LOG_PERIOD_S), len(log.time_s) - 1)
-
     events = [
         (
             throw.time_s,
@@ -236,7 +243,7 @@ def _table_of_events(
         for throw in throws
     ]
     for time_s, _ in log.recovery_intervals_s:
-        row = row_at(time_s)
+        row = int(np.abs(log.time_s - time_s).argmin())
         expected = cause_words(
             loop,
             assessment,
@@ -248,8 +255,4 @@ def _table_of_events(
         events.append((log.fall_time_s, "the robot fell"))
     else:
         events.append((float(log.time_s[-1]), "standing"))
-    probability = log.extra[loop.trigger_port][:, 0]
-    table = new_table("time [s]", "event", "Γ")
-    for time_s, event in sorted(events):
-        table.add_row(f"{time_s:.2f}", event, f"{probability[row_at(time_s)]:.2f}")
-    return table
+    return events_table(events, log.time_s, log.extra[loop.trigger_port][:, 0])

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_safety.cli.console import console, print_path
-from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.console import command_line, console, new_table, print_path, versions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,6 +114,23 @@ class Recording:
         print_path("recording", recording)
         for path in pictures:
             print_path("picture  ", path)
+
+
+def events_table(
+    events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray
+) -> Table:
+    """What happened when, and what Γ was then.
+
+    Args:
+        events: When [s], and what.
+        time_s: Instants of the log [s], (N,).
+        gamma: Safety probability, (N,).
+    """
+    table = new_table("time [s]", "event", "Γ")
+    for instant, event in sorted(events, key=lambda one: one[0]):
+        row = abs(time_s - instant).argmin()
+        table.add_row(f"{instant:.2f}", event, f"{gamma[row]:.2f}")
+    return table
 
 
 def save_moving_picture(

@@ -6,8 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.cli.console import cause_words, console, new_table
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, save_moving_picture
+from drake_safety.cli.console import cause_words, console
+from drake_safety.cli.run_settings import (
+    LOG_PERIOD_S,
+    Recording,
+    RunSettings,
+    events_table,
+    save_moving_picture,
+)
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 
 if TYPE_CHECKING:
@@ -205,8 +211,4 @@ def table_of_motion(
         place = "" if motion.has_left else ", inside the safe set throughout"
         missed = f"standing{place}; {100 * motion.miss_m:.1f} cm from the target"
         events.append((float(motion.time_s[-1]), missed))
-    table = new_table("time [s]", "event", "Γ")
-    for time_s, event in sorted(events, key=lambda one: one[0]):
-        row = int(np.abs(motion.time_s - time_s).argmin())
-        table.add_row(f"{time_s:.2f}", event, f"{gamma[row]:.2f}")
-    return table
+    return events_table(events, motion.time_s, gamma)

@@ -11,9 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drake_safety.cli.arguments import ScenarioArgument, WorkersOption
-from drake_safety.cli.console import Stages, console, new_table, open_stages, print_path
-from drake_safety.cli.provenance import command_line
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    Stages,
+    WorkersOption,
+    command_line,
+    console,
+    new_table,
+    open_stages,
+    print_path,
+)
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.learning.seeds import TRAINING
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import Episodes
+    from drake_safety.simulation.rollouts import Progress
     from drake_safety.simulation.scenario import Scenario
 
 
@@ -69,16 +71,39 @@ def fresh_episodes_folder(
     return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
 
 
-def planning_folder(folder: Path, scenario_hash: str, seed: int, num_plans: int) -> Path:
-    """Where ``plan-study`` keeps the motions it executed, so that it can go on with them.
+def run_fresh_episodes(
+    scenario: Scenario,
+    folder: Path,
+    num_episodes: int,
+    seed: int,
+    progress: Progress,
+    num_workers: int | None = None,
+    **loop_options: str,
+) -> Episodes:
+    """Simulates nominal episodes to judge by, and keeps them; goes on with those that are there.
 
     Args:
+        scenario: The scenario.
         folder: The folder of the training.
-        scenario_hash: Of what was simulated: another simulation is another set.
-        seed: Of the starts.
-        num_plans: Candidates of each start.
+        num_episodes: How many.
+        seed: Of the set.
+        progress: Called with the number done and the number wanted.
+        num_workers: Processes; as many as there are cores by default.
+        **loop_options: Of the task's diagram, besides those that it is judged with.
     """
-    return folder / "planning" / f"{scenario_hash[:12]}-{seed}-of-{num_plans}"
+    from drake_safety.simulation.capabilities import judging_options
+    from drake_safety.simulation.rollouts import run_episodes
+
+    options = {**judging_options(scenario.task_class()), **loop_options}
+    return run_episodes(
+        scenario,
+        num_episodes,
+        seed=seed,
+        num_workers=num_workers,
+        path=fresh_episodes_folder(folder, scenario.simulation_hash(), seed, options),
+        progress=progress,
+        **options,
+    )
 
 
 def feedback_folder(folder: Path, scenario_hash: str, seed: int) -> Path:

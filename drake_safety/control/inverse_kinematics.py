@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from pydrake.math import RigidTransform
-from scipy.linalg.lapack import dposv
 
 from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
     NUM_BASE_VELOCITIES,
     RobotKinematics,
+    dposv,
 )
 
 _TOLERANCE_M = 1e-4  # Error of a contact point's coordinate at which the search ends.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
     NUM_BASE_VELOCITIES,
     RobotKinematics,
+    dposv,
 )
 from drake_safety.control.whole_body_model import Hand, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors

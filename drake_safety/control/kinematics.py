@@ -8,7 +8,6 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
-from scipy.linalg.lapack import dposv
 
 from drake_safety.robots.robot import (
     PlantVariation,
@@ -18,6 +17,15 @@ from drake_safety.robots.robot import (
     servo_joints,
 )
 from drake_safety.robots.robot_model import ReachingFrame, RobotModel
+
+try:
+    from scipy.linalg.lapack import dposv
+except ImportError:  # On a robot's computer scipy need not be installed: see docs/online.md.
+
+    def dposv(a: np.ndarray, b: np.ndarray) -> tuple[None, np.ndarray, int]:
+        """Solves a positive definite system as LAPACK's routine does, a few microseconds slower."""
+        return None, np.linalg.solve(a, b), 0
+
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from drake_safety.evaluation.episode_study import evaluate_episodes
+from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.report.results import as_figure
+from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
@@ -154,44 +156,34 @@ def row_figure(row: Mapping[str, Any], name: str) -> Figure | None:
     stored = row.get(name)
     if not isinstance(stored, dict) or stored["value"] is None:
         return None
-    return Figure(stored["value"], stored["low"], stored["high"], stored["n"])
+    return as_figure(stored)
 
 
-def figure_names() -> list[str]:
-    """The columns that hold figures."""
-    return list(_FIGURES)
-
-
-def to_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as CSV; each figure has its value and the ends of its interval."""
-    text = io.StringIO()
-    plain = ["scenario", "robot", "episodes", "throws"]
-    ends = ("value", "low", "high")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(plain + [f"{name}_{end}" for name in _FIGURES for end in ends])
-    for row in rows:
-        cells = [row[name] for name in plain]
-        for name in _FIGURES:
-            cells += [row.get(name, {}).get(end) for end in ends]
-        writer.writerow(cells)
-    return text.getvalue()
-
-
-def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a Markdown table, shares in percent, 95 % intervals in brackets."""
-    heads = ["scenario", "robot", "episodes", "throws", *(n.replace("_", " ") for n in _FIGURES)]
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        cells = [str(row[name]) for name in ("scenario", "robot", "episodes", "throws")]
-        for name in _FIGURES:
-            cells.append(_in_words(row_figure(row, name), name))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _in_words(figure: Figure | None, name: str) -> str:
-    if figure is None:
-        return "–"
-    scale, digits = (1.0, 3) if name == "auc" else (100.0, 1)
-    low, value, high = (f"{scale * x:.{digits}f}" for x in (figure.low, figure.value, figure.high))
-    return f"{value} [{low}, {high}]"
+def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """The rows side by side, shares in percent."""
+    nothing = Figure(math.nan, math.nan, math.nan, 0)
+    counts = [Column(key=name, title=name, meaning="", unit="n") for name in ("episodes", "throws")]
+    columns = [
+        Column(key=name, title=spoken(name), meaning="")
+        if name == "auc"
+        else Column(key=name, title=spoken(name), meaning="", unit="%", digits=1)
+        for name in _FIGURES
+    ]
+    return Table(
+        key="comparison",
+        title="",
+        meaning="",
+        corner="scenario",
+        columns=[*counts, *columns],
+        rows=[
+            Row(
+                key=row["scenario"],
+                label=f"{row['scenario']} ({row['robot']})",
+                figures=[
+                    *(Figure(row[one.key], math.nan, math.nan, row[one.key]) for one in counts),
+                    *(row_figure(row, one.key) or nothing for one in columns),
+                ],
+            )
+            for row in rows
+        ],
+    )

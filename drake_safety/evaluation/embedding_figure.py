@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_POINTS = 12000
-_FIRST_CAUSE = 3  # Column of a cell's masses at which those of the causes begin.
+FIRST_CAUSE = 3
+"""Column of a cell's masses at which those of the causes begin."""
+SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80")
+"""From unsafe over a pale middle to safe."""
 
 
 def embedding_figure(
@@ -67,8 +70,12 @@ def embedding_figure(
         fig = new_figure(14.0, 4.6)
         left, middle, last = fig.subplots(1, 3)
         _draw_segments(fig, left, assessment, episodes)
-        most = 1.0 - assessment.parameters.initial_uncertainty
-        _draw_safety(fig, middle, grid, cells, count, most)
+        safe, is_empty = cells[:, SAFE], cells[:, UNCERTAINTY] >= 1.0
+        most = max(1.0 - assessment.parameters.initial_uncertainty, safe.max())
+        draw_safety(
+            fig, middle, grid, safe, is_empty, count, label="belief mass of safe", most=most
+        )
+        middle.set_title("Belief of each cell: safe")
         if right == "causes":
             _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
         else:
@@ -110,25 +117,34 @@ def _draw_segments(
         bar.solids.set_alpha(1.0)
 
 
-def _draw_safety(
-    fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray, count: np.ndarray, most: float
+def draw_safety(
+    fig: Figure,
+    axes: Axes,
+    grid: Grid,
+    safe: np.ndarray,
+    is_empty: np.ndarray,
+    count: np.ndarray,
+    *,
+    label: str,
+    most: float = 1.0,
 ) -> None:
-    """Beliefs of safe, over the number of segments each cell was learned from.
+    """Cells by how safe they are, over the number of segments each was learned from.
 
     Args:
         fig: The figure.
         axes: Where to in it.
         grid: The grid.
-        cells: Masses of each cell, (R*R, 3 + n_c).
+        safe: What the colour shows of each cell, (R*R,).
+        is_empty: Whether it holds no belief, (R*R,).
         count: Segments in each cell, (R*R,).
-        most: The belief of safe that has the bluest colour, if none exceeds it.
+        label: What the colour is.
+        most: What has the bluest colour.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    shade = ScalarMappable(Normalize(0.0, max(most, cells[:, SAFE].max())), safety_colours())
-    is_empty = cells[:, UNCERTAINTY] >= 1.0
-    colours = shade.to_rgba(cells[:, SAFE])
+    shade = ScalarMappable(Normalize(0.0, most), safety_colours())
+    colours = shade.to_rgba(safe)
     draw_cells(axes, grid, colours, is_empty)
     brightness = colours[:, :3] @ [0.299, 0.587, 0.114]
     for (x, y), number, light, empty in zip(
@@ -139,9 +155,13 @@ def _draw_safety(
             axes.text(
                 x, y, _short(number), ha="center", va="center_baseline", fontsize=6.5, color=ink
             )
-    axes.set_title("Belief of each cell: safe")
     axes.set_xlabel("numbers: segments learned from; hatched: EMPTY")
-    add_colour_bar(fig, axes, shade, "belief mass of safe")
+    add_colour_bar(fig, axes, shade, label)
+
+
+def cause_colours(num_causes: int) -> list[str]:
+    """A colour a cause; from the second of the series on: the first is the colour of safe."""
+    return [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(num_causes)]
 
 
 def _draw_causes(
@@ -150,10 +170,8 @@ def _draw_causes(
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
-    # From the second on: the first is the colour of safe.
-    colours_of_causes = [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(len(names))]
-    palette = np.array([to_rgb(colour) for colour in colours_of_causes])
-    cause = cells[:, _FIRST_CAUSE:].argmax(axis=1)
+    palette = np.array([to_rgb(colour) for colour in cause_colours(len(names))])
+    cause = cells[:, FIRST_CAUSE:].argmax(axis=1)
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     # White where nothing is unsafe, the cause's own colour where all that is known is.
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
@@ -213,8 +231,7 @@ def safety_colours() -> Colormap:
     """From unsafe (0) over a pale middle to safe (1)."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    stops = ["#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80"]
-    return LinearSegmentedColormap.from_list("safety", stops)
+    return LinearSegmentedColormap.from_list("safety", list(SAFETY_STOPS))
 
 
 def add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:

@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.evaluation.figure_style import (
-    FAINT_INK,
-    SERIES_COLOURS,
-    SERIES_DASHES,
-    drawing_style,
-    new_figure,
-    spoken,
-)
+from drake_safety.evaluation.figure_style import FAINT_INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.monitoring_study import MonitoringStudy
-from drake_safety.evaluation.roc_figure import operating_points
+from drake_safety.evaluation.roc_figure import draw_roc, series_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,27 +38,9 @@ def monitoring_figure(study: MonitoringStudy, names: Sequence[str] | None = None
         roc, lead_axes = fig.subplots(1, 2)
         for i, name in enumerate(names):
             score = study.unsafe_score[name]
-            style = {
-                "color": SERIES_COLOURS[i % len(SERIES_COLOURS)],
-                # Beyond as many as there are colours, a colour comes with another dash.
-                "linestyle": SERIES_DASHES[(i + i // len(SERIES_COLOURS)) % len(SERIES_DASHES)],
-                "linewidth": 2.4 if i == 0 else 1.5,
-                "zorder": 4 if i == 0 else 3,
-            }
-            area = study.figures[f"monitoring.{name}.auc"].value
-            roc.plot(*operating_points(score, label), label=f"{spoken(name)}   {area:.3f}", **style)
-            is_alarm = score > -study.thresholds[name]
-            if label.any() and not label.all():
-                roc.plot(
-                    is_alarm[~label].mean(),
-                    is_alarm[label].mean(),
-                    "o",
-                    color=style["color"],
-                    markeredgecolor="white",
-                    markersize=7,
-                    clip_on=False,
-                    zorder=5,
-                )
+            style = series_style(i) | {"linewidth": 2.4 if i == 0 else 1.5, "zorder": 4 - (i > 0)}
+            words = f"{spoken(name)}   {study.figures[f'monitoring.{name}.auc'].value:.3f}"
+            draw_roc(roc, score, label, words, -study.thresholds[name], **style)
             lead_s = np.sort(study.lead_s[name])
             if lead_s.size:
                 shown = np.concatenate([[longest], lead_s[::-1]])

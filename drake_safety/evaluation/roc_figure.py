@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from drake_safety.evaluation.figure_style import (
 from drake_safety.evaluation.metrics import area_under_curve
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -39,30 +40,9 @@ def roc_figure(
         whole, magnified = fig.subplots(1, 2)
         for i, (name, (score, label)) in enumerate(curves.items()):
             score = np.where(np.isnan(score), np.inf, np.asarray(score, dtype=float))
-            false_alarm, unsafe_recall = operating_points(score, label)
-            area = area_under_curve(score, label)
-            colour = SERIES_COLOURS[i % len(SERIES_COLOURS)]
+            words = f"{name}   {area_under_curve(score, label):.3f}"
             for axes in (whole, magnified):
-                axes.plot(
-                    false_alarm,
-                    unsafe_recall,
-                    color=colour,
-                    linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
-                    linewidth=1.8,
-                    label=f"{name}   {area:.3f}",
-                )
-                if name in thresholds:
-                    is_alarm = score > thresholds[name]
-                    axes.plot(
-                        is_alarm[~label].mean(),
-                        is_alarm[label].mean(),
-                        "o",
-                        color=colour,
-                        markeredgecolor="white",
-                        markersize=8,
-                        clip_on=False,
-                        zorder=5,
-                    )
+                draw_roc(axes, score, label, words, thresholds.get(name), **series_style(i))
         whole.set(xlim=(0, 1), ylim=(0, 1))
         magnified.set(xlim=(0, corner), ylim=(1.0 - corner, 1.0))
         frame = [[0, corner, corner, 0, 0], [1 - corner, 1 - corner, 1, 1, 1 - corner]]
@@ -76,6 +56,46 @@ def roc_figure(
         magnified.set_title("The corner, magnified")
         whole.legend(loc="lower right", title="area under the curve", alignment="left")
     return fig
+
+
+def series_style(number: int) -> dict[str, Any]:
+    """How a curve is drawn among others; beyond as many as there are colours dashes change."""
+    num_colours = len(SERIES_COLOURS)
+    dashes = SERIES_DASHES[(number + number // num_colours) % len(SERIES_DASHES)]
+    return {"color": SERIES_COLOURS[number % num_colours], "linestyle": dashes, "linewidth": 1.8}
+
+
+def draw_roc(
+    axes: Axes,
+    score: np.ndarray,
+    label: np.ndarray,
+    words: str,
+    threshold: float | None,
+    **style: Any,
+) -> None:
+    """One scorer's curve, and the point of its threshold.
+
+    Args:
+        axes: Where to.
+        score: Unsafe scores, (N,).
+        label: Whether each is unsafe, (N,).
+        words: In the legend.
+        threshold: Whose point is marked, if any.
+        **style: Of the curve.
+    """
+    axes.plot(*operating_points(score, label), label=words, **style)
+    if threshold is not None and label.any() and not label.all():
+        is_alarm = score > threshold
+        axes.plot(
+            is_alarm[~label].mean(),
+            is_alarm[label].mean(),
+            "o",
+            color=style["color"],
+            markeredgecolor="white",
+            markersize=8,
+            clip_on=False,
+            zorder=5,
+        )
 
 
 def operating_points(score: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.logs.channel import Channel, listed
+from drake_safety.logs.channel import Channel, listed, missing_extra
 from drake_safety.logs.log_map import LogTime
 
 Message = tuple[str, int, Any]
@@ -35,7 +35,7 @@ def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) ->
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
-        raise _missing_extra(path, error) from error
+        raise missing_extra(path, error) from error
     try:
         with path.open("rb") as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -70,7 +70,7 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise _missing_extra(path, error) from error
+        raise missing_extra(path, error) from error
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             connections = [c for c in reader.connections if c.topic in wanted]
@@ -82,12 +82,6 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
             return _channels(path, messages, wanted, time)
     except AnyReaderError as error:
         raise ValueError(f"log '{path}' is damaged or no ROS bag: {error}") from error
-
-
-def _missing_extra(path: Path, error: ImportError) -> ValueError:
-    return ValueError(
-        f"log '{path}' needs the package '{error.name}': pip install drake_safety[logs]"
-    )
 
 
 def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:

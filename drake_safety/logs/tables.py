@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.logs.channel import Channel, listed
+from drake_safety.logs.channel import Channel, listed, missing_extra
 from drake_safety.logs.log_map import LogTime
 
 if TYPE_CHECKING:
@@ -25,10 +26,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         time: Where the time is.
 
     Raises:
-        ValueError: A column is missing or there twice, or what stands in it is no number.
+        ValueError: A column is missing or there twice, what stands in it is no number, or the
+            extra is not installed.
     """
-    import pandas as pd
-
+    pd = _pandas(path)
     names = _checked_names(path, wanted, time, _header_of(path))
     try:
         # Cells stay text: whatever is no number can then be quoted as it stands.
@@ -49,11 +50,13 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         time: Where the time is.
 
     Raises:
-        ValueError: It is no Parquet file, or a column is missing or holds no numbers.
+        ValueError: It is no Parquet file, a column is missing or holds no numbers, or the extra is
+            not installed.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    _pandas(path)
     try:
         with pq.ParquetFile(path) as file:
             names = _checked_names(path, wanted, time, file.schema_arrow.names)
@@ -61,6 +64,14 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
     except (pa.ArrowInvalid, OSError) as error:
         raise ValueError(f"log '{path}' is damaged or no Parquet file: {error}") from error
     return _channel(path, frame, wanted, time, "row", 0)
+
+
+def _pandas(path: Path) -> ModuleType:
+    try:
+        import pandas
+    except ImportError as error:
+        raise missing_extra(path, error) from error
+    return pandas
 
 
 def _header_of(path: Path) -> list[str]:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_safety.evaluation.figure_style import (
-    SAFE_COLOUR,
-    SERIES_COLOURS,
-    UNSAFE_COLOUR,
-    drawing_style,
-    new_figure,
-    spoken,
+from drake_safety.evaluation.embedding_figure import (
+    FIRST_CAUSE,
+    SAFETY_STOPS,
+    cause_colours,
+    draw_safety,
 )
+from drake_safety.evaluation.figure_style import drawing_style, new_figure, spoken
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.grid import OUTSIDE
@@ -24,16 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80")
-"""From unsafe over a pale middle to safe."""
 _UNKNOWN_STOPS = ("#f3f1f6", "#b3a5c9", "#3f2a63")
 _COUNT_STOPS = ("#eaf3ef", "#7fbfa7", "#0f5c45")
-_FIRST_CAUSE = 3  # Column of a cell's masses at which those of the causes begin.
-
-
-def cause_colours(num_causes: int) -> list[str]:
-    """A colour a cause; from the second of the series on: the first is the colour of safe."""
-    return [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(num_causes)]
 
 
 def map_cells(
@@ -67,7 +58,7 @@ def map_cells(
             "row": cell % grid.resolution,
             "belief": [round(float(mass), 4) for mass in masses[:3]],
             "count": int(count[cell]),
-            "causes": [round(float(mass), 4) for mass in masses[_FIRST_CAUSE:]],
+            "causes": [round(float(mass), 4) for mass in masses[FIRST_CAUSE:]],
             "typical": typical.get(cell),
         }
         for cell, masses in enumerate(beliefs)
@@ -205,36 +196,21 @@ def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Fig
         assessment: The assessment.
         cells: Of `map_cells`.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    size = assessment.grid_.resolution
-    shares = np.full((size, size), np.nan)
-    for cell in cells:
-        if not _is_empty(cell):
-            shares[cell["row"], cell["column"]] = safe_share(cell)
     with drawing_style():
         fig = new_figure(7.0, 6.0)
         axes = fig.subplots()
-        axes.set_facecolor("#f1f2f4")
-        norm, ramp = Normalize(0.0, 1.0), _ramp(SAFETY_STOPS)
-        shade = ScalarMappable(norm, ramp)
-        axes.pcolormesh(shares, cmap=ramp, norm=norm, edgecolors="white", linewidth=0.8)
-        for cell in cells:
-            if cell["count"]:
-                is_pale = _is_empty(cell) or 0.25 < safe_share(cell) < 0.75
-                axes.text(
-                    cell["column"] + 0.5,
-                    cell["row"] + 0.5,
-                    str(cell["count"]),
-                    ha="center",
-                    va="center",
-                    fontsize=6.5,
-                    color="#22262b" if is_pale else "white",
-                )
-        axes.set(xticks=[], yticks=[], aspect="equal", xlabel="numbers: segments learned from")
+        half = assessment.grid_.half_width
+        draw_safety(
+            fig,
+            axes,
+            assessment.grid_,
+            np.array([safe_share(cell) for cell in cells]),
+            np.array([_is_empty(cell) for cell in cells]),
+            np.array([cell["count"] for cell in cells]),
+            label="b_safe / (1 − μ)",
+        )
+        axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
         axes.set_title(f"Safe share of each cell, mode {assessment.parameters.mode}")
-        fig.colorbar(shade, ax=axes, shrink=0.8, label="b_safe / (1 − μ)")
     return fig
 
 

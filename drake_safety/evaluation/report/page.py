@@ -15,16 +15,15 @@ from typing import Any
 
 import yaml
 
+from drake_safety.evaluation.embedding_figure import cause_colours
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.report.cell_map import (
-    cause_colours,
     map_cells,
     map_figure,
     map_views,
     safe_share,
 )
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
-from drake_safety.evaluation.report.studies import Study, ablation_section, planning_section
 from drake_safety.evaluation.report.tables import Column, Table
 from drake_safety.evaluation.report.verdicts import other_figures, verdict_tables
 from drake_safety.learning.assessment import SafetyAssessment
@@ -63,15 +62,8 @@ def write_report(
         mode: _map(run, assessment, folder, angular_constraints)
         for mode, assessment in run.assessments.items()
     }
-    studies = _studies(run)
-    # Drawn from what the section tells, they cannot be older than its table.
-    drawn = {key: save(study.picture, folder / "figures" / key) for key, study in studies.items()}
-    for key in drawn:
-        run.pictures.pop(key, None)
-        run.pictures.pop(f"{key}_quick", None)
     pictures = _pictures(run, folder)
-    groups = [*others.values(), *(study.tables for study in studies.values())]
-    for table in [*tables, *(table for group in groups for table in group)]:
+    for table in [*tables, *(table for group in others.values() for table in group)]:
         _save_table(table, folder / "tables")
     page = (
         _environment()
@@ -85,14 +77,13 @@ def write_report(
             counts=_counts(run),
             tiles=_tiles(run),
             paper=_beside_the_paper(run, pictures),
-            tables=tables,
-            calibration=others.pop("calibration", []),
+            tables=[table for table in tables if table.key != "calibrations"],
+            calibration=[
+                *(table for table in tables if table.key == "calibrations"),
+                *others.pop("calibration", []),
+            ],
             others=others,
             pictures=pictures,
-            studies=[
-                {"study": study, "picture": _shown(key, {p.suffix: p for p in drawn[key]})}
-                for key, study in studies.items()
-            ],
             motions=_motions(run, pictures),
             maps=maps,
             all_figures=[
@@ -110,8 +101,13 @@ def write_report(
 
 @cache
 def _environment() -> Any:
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
+    try:
+        from jinja2 import Environment, FunctionLoader, StrictUndefined
+    except ImportError as error:
+        raise ValueError(
+            f"report: the package '{error.name}' is not installed: pip install "
+            "'drake_safety[report]'"
+        ) from error
     environment = Environment(
         loader=FunctionLoader(_text),
         autoescape=True,
@@ -226,15 +222,6 @@ def _beside_the_paper(run: Run, pictures: dict[str, dict[str, Any]]) -> dict[str
 
 def _digits(unit: str) -> int:
     return {"%": 1, "=": 2}.get(unit, 3)
-
-
-def _studies(run: Run) -> dict[str, Study]:
-    found = []
-    if run.planning is not None:
-        found.append(planning_section(run.planning))
-    if run.ablation is not None:
-        found.append(ablation_section(run.ablation))
-    return {study.key: study for study in found}
 
 
 def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:

@@ -1,21 +1,15 @@
-"""What an evaluation found, read from ``evaluation.json`` or from a compact stored copy of it."""
+"""What an evaluation found, read from ``evaluation.json``."""
 
 from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from drake_safety.evaluation.metrics import Figure
-
-SCHEMA = "drake_safety.results"
-SCHEMA_VERSION = 1
-_NUM_DIGITS = 6  # Significant ones of what is stored: more than any table shows.
-_FOLDER_OPTIONS = ("--assessment", "--out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +35,7 @@ def read_evaluation(path: Path) -> Results:
     Raises:
         ValueError: It is none.
     """
-    content = _read(path)
+    content = read_object(path)
     figures = {key: as_figure(value) for key, value in content.items() if is_figure(value)}
     if not figures:
         raise ValueError(f"{path} is no evaluation: no key of it holds a figure")
@@ -51,64 +45,12 @@ def read_evaluation(path: Path) -> Results:
     )
 
 
-def read_results(path: Path) -> Results:
-    """Reads what `store_results` wrote.
+def read_object(path: Path) -> dict[str, Any]:
+    """Reads a file that holds one JSON object.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It holds something else.
     """
-    content = _read(path)
-    if content.get("schema") != SCHEMA or content.get("schema_version") != SCHEMA_VERSION:
-        raise ValueError(
-            f"{path} holds no results: its schema is {content.get('schema')!r}, version "
-            f"{content.get('schema_version')!r}; expected '{SCHEMA}', {SCHEMA_VERSION}"
-        )
-    try:
-        return Results(
-            figures={
-                key: as_figure(dict(zip(("value", "low", "high", "n"), row, strict=True)))
-                for key, row in content["figures"].items()
-            },
-            entries=dict(content["entries"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path} holds damaged results: {error!r}") from error
-
-
-def store_results(results: Results, path: Path, *, train_command: str | None = None) -> None:
-    """Writes a compact copy that is fit to be kept beside the code: a figure a line.
-
-    Figures keep six significant digits. A folder that a command names absolutely is somebody's
-    own; it is written as ``runs/NAME``.
-
-    Args:
-        results: What an evaluation found.
-        path: Where to; its folder is made.
-        train_command: What the assessment was trained with.
-    """
-    entries = dict(results.entries)
-    if train_command is not None:
-        entries["train_command"] = train_command
-    for key in ("command", "train_command"):
-        if key in entries:
-            entries[key] = _portable(entries[key])
-    rows = ",\n".join(
-        f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (f.value, f.low, f.high)), f.n])}"
-        for key, f in results.figures.items()
-    )
-    text = (
-        "{\n"
-        f'  "schema": {json.dumps(SCHEMA)},\n'
-        f'  "schema_version": {SCHEMA_VERSION},\n'
-        f'  "entries": {_indented(entries)},\n'
-        f'  "figures": {{\n{rows}\n  }}\n'
-        "}\n"
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-
-
-def _read(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -130,23 +72,3 @@ def as_figure(fields: Mapping[str, Any]) -> Figure:
         for name in ("value", "low", "high")
     )
     return Figure(value, low, high, int(fields["n"]))
-
-
-def _rounded(number: float) -> float | None:
-    return float(f"{number:.{_NUM_DIGITS}g}") if math.isfinite(number) else None
-
-
-def _indented(entries: Mapping[str, Any]) -> str:
-    return json.dumps(entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
-
-
-def _portable(command: str) -> str:
-    # Going on gives what one call would have given.
-    words = [word for word in shlex.split(command) if word != "--resume"]
-    for i, word in enumerate(words):
-        option, equals, value = word.partition("=")
-        if equals and option in _FOLDER_OPTIONS and Path(value).is_absolute():
-            words[i] = f"{option}=runs/{Path(value).name}"
-        elif i and words[i - 1] in _FOLDER_OPTIONS and Path(word).is_absolute():
-            words[i] = f"runs/{Path(word).name}"
-    return shlex.join(words)

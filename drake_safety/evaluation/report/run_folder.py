@@ -12,8 +12,6 @@ from typing import Any
 
 import yaml
 
-from drake_safety.evaluation.ablation import BASELINE
-from drake_safety.evaluation.ablation_study import AblationFile
 from drake_safety.evaluation.report.results import Results, read_evaluation
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, EpisodesInfo
@@ -63,8 +61,6 @@ class Run:
         episodes: The training episodes.
         assessments: By mode.
         results: What the evaluation found.
-        planning: What `plan-study` found, if it was called.
-        ablation: What `ablate` found, if it was called.
         motions: Recorded simulations.
         pictures: By path within the run without suffix, the files by suffix.
         missing: What is not there, or amiss.
@@ -76,8 +72,6 @@ class Run:
     episodes: Episodes | None = None
     assessments: dict[str, SafetyAssessment] = field(default_factory=dict)
     results: Results = field(default_factory=Results)
-    planning: Results | None = None
-    ablation: AblationFile | None = None
     motions: list[Motion] = field(default_factory=list)
     pictures: dict[str, dict[str, Path]] = field(default_factory=dict)
     missing: list[Missing] = field(default_factory=list)
@@ -133,8 +127,6 @@ def read_run(folder: Path, *, episodes: Path, assessments: Mapping[str, Path]) -
     if run.info is None and run.assessments:
         run.info = next(iter(run.assessments.values())).info_
     _read_results(run, evaluation)
-    _read_planning(run, folder / "planning.json")
-    _read_ablation(run, [folder / "ablation.json", folder / "ablation_quick.json"])
     _find_pictures(run)
     _find_motions(run)
     return run
@@ -189,7 +181,8 @@ def _read_assessment(run: Run, mode: str, path: Path) -> None:
 
 
 def _read_results(run: Run, path: Path) -> None:
-    command = _command(run, "evaluate")
+    scenario = "SCENARIO" if run.info is None else run.info.scenario
+    command = f"drake-safety evaluate {scenario} --assessment {run.folder}"
     if not path.is_file():
         run.missing.append(
             Missing(
@@ -204,74 +197,17 @@ def _read_results(run: Run, path: Path) -> None:
     except (ValueError, OSError) as error:
         run.missing.append(Missing(what="The evaluation", why=_sentence(error), command=command))
         return
-    _check_is_own(run, "An evaluation", path, run.results.entries, command)
-
-
-def _read_planning(run: Run, path: Path) -> None:
-    what, command = "What choosing plans by Γ is worth", _command(run, "plan-study")
-    if not path.is_file():
-        why = "There is no planning.json; a task that offers one plan only has none to choose."
-        run.missing.append(Missing(what=what, why=why, command=command))
-        return
-    try:
-        planning = read_evaluation(path)
-    except (ValueError, OSError, TypeError) as error:
-        run.missing.append(Missing(what=what, why=_sentence(error), command=command))
-        return
-    if not planning.has("planning."):
-        why = f"{path} holds no figure of a plan study: none of its keys begins with 'planning.'."
-        run.missing.append(Missing(what=what, why=why, command=command))
-        return
-    run.planning = planning
-    _check_is_own(run, "A plan study", path, planning.entries, command)
-
-
-def _read_ablation(run: Run, paths: list[Path]) -> None:
-    """Reads the first that is there: a whole ablation rather than one in a hurry."""
-    what, command = "What each choice in learning Γ is worth", _command(run, "ablate")
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        why = f"There is neither {' nor '.join(path.name for path in paths)}."
-        run.missing.append(Missing(what=what, why=why, command=command))
-        return
-    if path.stem.endswith("_quick"):
-        command += " --quick"
-    try:
-        ablation = AblationFile.read(path)
-    except (ValueError, OSError) as error:
-        run.missing.append(Missing(what=what, why=_sentence(error), command=command))
-        return
-    if BASELINE not in ablation.rows:
-        why = f"{path} has no row '{BASELINE}'; it has {list(ablation.rows)}."
-        run.missing.append(Missing(what=what, why=why, command=command))
-        return
-    run.ablation = ablation
-    _check_is_own(run, "An ablation", path, ablation.entries, command)
-    if not ablation.is_whole:
-        why = f"{len(ablation.rows)} variants are here: it was stopped, or is still under way."
-        run.missing.append(Missing(what="Part of the ablation", why=why, command=command))
-
-
-def _check_is_own(
-    run: Run, what: str, path: Path, entries: Mapping[str, Any], command: str
-) -> None:
-    """Names figures that are of another simulation than the training."""
-    stored = entries.get("scenario_hash")
+    stored = run.results.entries.get("scenario_hash")
     if run.info is not None and stored != run.info.scenario_hash:
         run.missing.append(
             Missing(
-                what=f"{what} of this training",
-                why=f"{path.name} is of scenario '{entries.get('scenario')}' with hash "
+                what="An evaluation of this training",
+                why=f"{path.name} is of scenario '{run.results.entries.get('scenario')}' with hash "
                 f"{str(stored)[:12]}, the training of '{run.info.scenario}' with hash "
                 f"{run.info.scenario_hash[:12]}: its figures below are of something else.",
                 command=command,
             )
         )
-
-
-def _command(run: Run, name: str) -> str:
-    scenario = "SCENARIO" if run.info is None else run.info.scenario
-    return f"drake-safety {name} {scenario} --assessment {run.folder}"
 
 
 def _find_pictures(run: Run) -> None:

@@ -26,7 +26,7 @@ class Column:
         title: Its heading.
         meaning: A sentence for somebody who has not read the paper.
         unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
-            rate, or "=" for what has no interval.
+            rate, or "=" and "=%" for what has no interval.
         better: 1 where more is better, -1 where less is, 0 where neither.
         digits: After the decimal point.
     """
@@ -54,7 +54,8 @@ class Column:
             return "never"
         if self.unit == "n":
             return f"{figure.value:.0f}"
-        space = "" if self.unit in ("", "=", "/h") else f" {self.unit}"
+        unit = self.unit.removeprefix("=")
+        space = "" if unit in ("", "/h") else f" {unit}"
         return f"{self._scale * figure.value:.{self.digits}f}{space}"
 
     def interval_text(self, figure: Figure | None) -> str:
@@ -66,9 +67,13 @@ class Column:
         low, high = (f"{self._scale * end:.{self.digits}f}" for end in (figure.low, figure.high))
         return f"({low}–{high})"
 
+    def text(self, figure: Figure | None) -> str:
+        """The figure and its interval."""
+        return f"{self.value_text(figure)} {self.interval_text(figure)}".strip()
+
     @property
     def _scale(self) -> float:
-        return {"%": 100.0, "ms": 1000.0}.get(self.unit, 1.0)
+        return {"%": 100.0, "=%": 100.0, "ms": 1000.0}.get(self.unit, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,9 +192,7 @@ class Table:
         for row in self.rows:
             cells = [row.label if row.is_quoted else _MODES.sub(r"`\1`", row.label)]
             for column, figure in zip(self.columns, row.figures, strict=True):
-                text = "" if figure is None else column.value_text(figure)
-                interval = column.interval_text(figure)
-                cells.append(f"{text} {interval}".strip())
+                cells.append("" if figure is None else column.text(figure))
             if row.is_quoted:
                 cells = [f"*{cell}*" if cell else "" for cell in cells]
             lines.append("| " + " | ".join(cells).replace("|  |", "| |") + " |")

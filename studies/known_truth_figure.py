@@ -14,7 +14,7 @@ from drake_safety.evaluation.figure_style import (
     drawing_style,
     new_figure,
 )
-from drake_safety.evaluation.known_truth import CONFIDENT, Agreement, KnownTruth
+from studies.known_truth import CONFIDENT, Agreement, KnownTruth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

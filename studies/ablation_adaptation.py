@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_safety.evaluation.adaptation_study import THRESHOLD, TestSet
 from drake_safety.evaluation.metrics import Bootstrap, Figure, auc_difference, segment_figures
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
+from studies.adaptation_study import THRESHOLD, TestSet
 
 BEFORE, PER_CELL, TOTAL = "before_feedback", "n_f_per_cell", "n_f_total"
 

@@ -7,13 +7,22 @@ What stands between ``<!-- results: NAME -->`` and ``<!-- end -->`` is made from
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from drake_safety.evaluation.metrics import Figure
-from drake_safety.evaluation.report.results import Results, read_results
+from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
+from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Column, Row, Table
-from drake_safety.evaluation.report.verdicts import one_judge_on_sets, set_title, verdict_tables
+from drake_safety.evaluation.report.verdicts import (
+    INPUTS,
+    columns_of,
+    figure_rows,
+    plan_sets,
+    set_title,
+    verdict_tables,
+)
+from studies.stored_results import read_results
 
 RESULTS_FOLDER = Path("docs/results")
 _BLOCK = re.compile(
@@ -22,7 +31,7 @@ _BLOCK = re.compile(
 _OPEN = re.compile(r"<!-- results: ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
-_PRINTED = {"safe_recall": 0.952, "unsafe_recall": 0.987}
+_PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
 """Of 1000 random targets, in the paper."""
 
 
@@ -73,7 +82,7 @@ def generate(text: str, folder: Path) -> str:
             there = sorted(path.stem for path in folder.glob("*.json"))
             raise ValueError(
                 f"README: there are no results '{match['name']}' in {folder}; there are {there}: "
-                "`drake-safety report RUN --store` writes them"
+                "`python -m studies store RUN` writes them"
             )
         return f"{match['start']}{results_text(read_results(file))}\n{match['end']}"
 
@@ -93,7 +102,8 @@ def results_text(results: Results) -> str:
 
 
 def _commands(results: Results) -> str:
-    lines = [results.entries.get(key) for key in ("train_command", "command")]
+    keys = ("train_command", "command", "learning_curve_command")
+    lines = [results.entries.get(key) for key in keys]
     return "\n".join(["```sh", *(line for line in lines if line), "```"])
 
 
@@ -108,24 +118,26 @@ def _counts(results: Results) -> str:
         kind = "safe" if "plans.outcomes.safe" in figures else "unsafe"
         words.append(
             f"Judged on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
-            f"{_written(judged, _PERCENT)} are {kind}."
+            f"{_PERCENT.text(judged)} are {kind}."
         )
     calibration = entries.get("calibration_episodes")
     if calibration is not None:
         words.append(f"Thresholds come from {calibration} other episodes.")
     words.append("Intervals are 95 %.")
+    if results.has("segments.paper.") or results.has("plans.paper."):
+        words.append(INPUTS)
     return " ".join(words)
 
 
 def _moments(results: Results) -> list[str]:
     titles = {"segments": "every segment", "episodes": "first step, k = 0"}
     parts = [
-        _retitled(table, titles[table.key]).to_markdown()
+        replace(table, corner=titles[table.key]).to_markdown()
         for table in verdict_tables(results)
         if table.key in titles
     ]
     ahead = [
-        f"{_written(results.figures[key], _SHARE)} {place}"
+        f"{_SHARE.text(results.figures[key])} {place}"
         for kind, place in (("segments", "per segment"), ("episodes", "at k = 0"))
         if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.figures
     ]
@@ -139,9 +151,9 @@ def _throws(results: Results) -> list[str]:
     alone = results.figures["throws.falls_without_recovery"]
     remark = (
         f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
-        f"falls in {_written(alone, _PERCENT)}."
+        f"falls in {_PERCENT.text(alone)}."
     )
-    return [remark, _retitled(table, "trigger").to_markdown(), _ahead(table), _broken(results)]
+    return [remark, replace(table, corner="trigger").to_markdown(), _ahead(table), _broken(results)]
 
 
 def _broken(results: Results) -> str:
@@ -171,27 +183,44 @@ def _targets(results: Results) -> list[str]:
         rows = [
             Row(key=row.key, label=row.label, figures=row.figures[:columns]) for row in table.rows
         ]
-        text = _retitled(table, set_title("plans"), table.columns[:columns], rows).to_markdown()
+        narrow = replace(
+            table, corner=set_title("plans"), columns=table.columns[:columns], rows=rows
+        )
+        text = narrow.to_markdown()
         printed = " | ".join(
             f"*{_PRINTED[column.key]:.3f}*" if column.key in _PRINTED else ""
             for column in table.columns[:columns]
         )
         parts.append(f"{text}\n| *the paper's own* | {printed} |".replace("|  |", "| |"))
-        parts.append(_ahead(_retitled(table, "", table.columns[:columns], rows)))
-    sets = one_judge_on_sets(results)
-    if len(sets.rows) > 1:
-        parts.append(sets.to_markdown())
+        parts.append(_ahead(narrow))
+    prefixes = plan_sets(results)
+    if len(prefixes) > 1:
+        names = {f"{prefix}.sharpened": set_title(prefix) for prefix in prefixes}
+        parts.append(_rows(results, "`sharpened` on", names))
     parts.append(_differences(results))
     right = results.figures.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
-            f"The right cause is named for {_written(right, _PERCENT)} of the {right.n} rightly "
+            f"The right cause is named for {_PERCENT.text(right)} of the {right.n} rightly "
             "refused targets."
         )
-    for table in tables:
-        if table.key == "learning_curve" and table.rows:
-            parts.append(_retitled(table, "training episodes").to_markdown())
+    pattern = re.compile(r"(plans\.learning_curve\.(\d+))\.safe_recall")
+    found = (pattern.fullmatch(key) for key in results.figures)
+    sizes = {match[1]: match[2] for match in found if match}
+    if sizes:
+        ordered = sorted(sizes, key=lambda prefix: int(sizes[prefix]))
+        names = {prefix: sizes[prefix] for prefix in ordered}
+        parts.append(_rows(results, "training episodes", names))
     return parts
+
+
+def _rows(results: Results, corner: str, prefixes: Mapping[str, str]) -> str:
+    """Recalls and AUC of figures by prefix, as Markdown."""
+    columns = columns_of("targets")[:3]
+    rows = figure_rows(results, prefixes, columns)
+    return Table(
+        key="", title="", meaning="", corner=corner, columns=columns, rows=rows
+    ).to_markdown()
 
 
 def _points(loss: float) -> str:
@@ -222,23 +251,3 @@ def _differences(results: Results) -> str:
 def _ahead(table: Table) -> str:
     ahead = table.rivals_ahead()
     return f"Ahead of `sharpened`: {'; '.join(ahead)}." if ahead else ""
-
-
-def _retitled(
-    table: Table,
-    corner: str,
-    columns: Sequence[Column] | None = None,
-    rows: Sequence[Row] | None = None,
-) -> Table:
-    return Table(
-        key=table.key,
-        title=table.title,
-        meaning=table.meaning,
-        corner=corner,
-        columns=table.columns if columns is None else columns,
-        rows=table.rows if rows is None else rows,
-    )
-
-
-def _written(figure: Figure, column: Column) -> str:
-    return f"{column.value_text(figure)} {column.interval_text(figure)}".strip()

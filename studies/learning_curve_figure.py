@@ -31,7 +31,7 @@ def learning_curve_figure(figures: Mapping[str, Figure]) -> Picture:
     """Both recalls with their intervals, whole target box and fair set, and the paper's figures.
 
     Args:
-        figures: What :func:`~drake_safety.evaluation.learning_curve.learning_curve` found.
+        figures: What :func:`~studies.learning_curve.learning_curve` found.
     """
     from matplotlib.ticker import NullLocator
 

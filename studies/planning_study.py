@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import PathLike
@@ -170,10 +170,6 @@ def run_trials(
     ]
 
 
-def _judging_options(scenario: Scenario) -> dict[str, Any]:
-    return dict(scenario.task_class().judging_options)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Motion:
     """What a study takes from an executed plan: its first instant, and how it ended."""
@@ -216,7 +212,7 @@ def _motion_batch(
     scenario: Scenario, seed: int, num_plans: int, index: int, candidates: list[int]
 ) -> tuple[int, list[tuple[int, Episode]]]:
     """Executes some candidates of a start, as far as it has so many; and how many were asked."""
-    loop = worker_loop(scenario, "nominal", _judging_options(scenario))
+    loop = worker_loop(scenario, "nominal", judging_options(scenario.task_class()))
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     there = [i for i in candidates if i < len(plans)]
     return len(candidates), [(i, run_episode(loop, index, seed=seed, plan=plans[i])) for i in there]
@@ -276,3 +272,34 @@ def planning_study(
         safety_probability=gamma,
         trials=trials,
     )
+
+
+def planning_verdict(figures: Mapping[str, Figure]) -> str:
+    """Who wins, in a sentence.
+
+    Args:
+        figures: Those of a `PlanningStudy`.
+    """
+    default, chosen, gain = (figures.get(key) for key in ("default", "chosen", "gain"))
+    if default is None or chosen is None or gain is None:
+        return "The study's figures are incomplete: make it again."
+    shares = (
+        f"{_percent(chosen)} of the starts stay safe with the plan that Γ chooses and "
+        f"{_percent(default)} with the default plan"
+    )
+    if not math.isfinite(gain.value):
+        return (
+            f"Nobody wins: {shares}, and no other candidate would have saved a start that the "
+            "default plan loses."
+        )
+    way = f"{_percent(gain, 0)} of the way to the best plan in hindsight"
+    if gain.low > 0.0:
+        return f"Γ wins: {shares}, which is {way}."
+    if gain.high < 0.0:
+        return f"The default plan wins: {shares}; choosing by Γ leads away from the best plan."
+    return f"Nobody wins beyond chance: {shares}, {way}, an interval that includes zero."
+
+
+def _percent(figure: Figure, digits: int = 1) -> str:
+    value, low, high = (100.0 * x for x in (figure.value, figure.low, figure.high))
+    return f"{value:.{digits}f} % ({low:.{digits}f}–{high:.{digits}f})"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.report.results import Results, read_results, store_results
+from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -24,6 +24,7 @@ from drake_safety.learning.segments import split
 from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
+from studies.stored_results import read_results, store_results
 
 EVALUATION_FILE = "evaluation.json"
 NUM_EPISODES = 6

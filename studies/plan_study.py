@@ -1,4 +1,4 @@
-"""``drake-safety plan-study``: what choosing plans by Γ is worth."""
+"""``python -m studies plan-study``: what choosing plans by Γ is worth."""
 
 from __future__ import annotations
 
@@ -9,24 +9,26 @@ from typing import Annotated
 
 import typer
 
-from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    WorkersOption,
     console,
     interval,
     new_table,
     open_stages,
     print_path,
     print_shipped,
+    versions,
 )
-from drake_safety.cli.provenance import command_line, versions
 from drake_safety.cli.training_folder import (
     assessment_folder,
     check_fresh,
     goal_threshold,
     load_assessment,
-    planning_folder,
 )
 from drake_safety.learning.seeds import PLANNING
+from studies import command_line
 
 
 def plan_study(
@@ -52,9 +54,14 @@ def plan_study(
     in ASSESSMENT as they finish: a study that was stopped goes on when it is called again.
     """
     from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.planning_figure import planning_figure
-    from drake_safety.evaluation.planning_study import PLANS, planning_study, run_trials
     from drake_safety.simulation.scenario import load_scenario
+    from studies.planning_figure import planning_figure
+    from studies.planning_study import (
+        PLANS,
+        planning_study,
+        planning_verdict,
+        run_trials,
+    )
 
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
@@ -99,10 +106,21 @@ def plan_study(
     file = folder / "planning.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(table)
-    gain = study.figures["gain"]
-    console.print(f"from default to hindsight: {interval(gain, 100, 0)} % of the way by Γ")
+    console.print(planning_verdict(study.figures), highlight=False, soft_wrap=True)
     if rule.remark:
         console.print(rule.remark, highlight=False, soft_wrap=True)
     print_path("figures", file)
     for picture in save(planning_figure(study.figures), folder / "planning"):
         print_path("picture", picture)
+
+
+def planning_folder(folder: Path, scenario_hash: str, seed: int, num_plans: int) -> Path:
+    """Where the study keeps the motions it executed, so that it can go on with them.
+
+    Args:
+        folder: The folder of the training.
+        scenario_hash: Of what was simulated: another simulation is another set.
+        seed: Of the starts.
+        num_plans: Candidates of each start.
+    """
+    return folder / "planning" / f"{scenario_hash[:12]}-{seed}-of-{num_plans}"

@@ -14,7 +14,7 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
 )
 from drake_safety.evaluation.metrics import Figure as Merit
-from drake_safety.evaluation.planning_study import PLANS
+from studies.planning_study import PLANS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +24,7 @@ def planning_figure(figures: Mapping[str, Merit]) -> Figure:
     """A dot with its interval for each way to take a plan; a line marks the default plan.
 
     Args:
-        figures: Those of a :class:`~drake_safety.evaluation.planning_study.PlanningStudy`; what is
+        figures: Those of a :class:`~studies.planning_study.PlanningStudy`; what is
             missing, or was never seen, is left out.
     """
     rows = [

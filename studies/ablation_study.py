@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.ablation import (
+from drake_safety.evaluation.figure_style import spoken
+from drake_safety.evaluation.metrics import Bootstrap, Figure
+from drake_safety.evaluation.report.results import as_figure
+from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.simulation.rollouts import parallel_map
+from studies.ablation import (
     BASELINE,
     AblationSets,
     Variant,
@@ -23,9 +27,6 @@ from drake_safety.evaluation.ablation import (
     unsafe_scores,
     variant_figures,
 )
-from drake_safety.evaluation.metrics import Bootstrap, Figure
-from drake_safety.learning.assessment import AssessmentParameters
-from drake_safety.simulation.rollouts import parallel_map
 
 _SCHEMA = "drake_safety.ablation"
 
@@ -89,7 +90,7 @@ class AblationFile:
                 raise ValueError(f"its schema is not '{_SCHEMA}'")
             rows = {}
             for row in content.pop("rows"):
-                figures = {key: _figure(value) for key, value in row.pop("figures").items()}
+                figures = {key: as_figure(value) for key, value in row.pop("figures").items()}
                 rows[row["name"]] = AblationRow(**row, figures=figures)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} holds no ablation: {error!r}") from error
@@ -115,14 +116,6 @@ class AblationFile:
         temporary = self.path.with_name(f".{self.path.name}.tmp")
         temporary.write_text(text + "\n", encoding="utf-8")
         temporary.replace(self.path)
-
-
-def _figure(fields: Mapping[str, Any]) -> Figure:
-    value, low, high = (
-        math.nan if fields[name] is None else float(fields[name])
-        for name in ("value", "low", "high")
-    )
-    return Figure(value, low, high, int(fields["n"]))
 
 
 def rows_to_csv(rows: Sequence[AblationRow]) -> str:
@@ -262,3 +255,43 @@ def _scores_or_why_not(
         return variant.name, unsafe_scores(variant, base, sets), ""
     except ValueError as error:
         return variant.name, None, str(error)
+
+
+def ablation_verdict(rows: Sequence[AblationRow]) -> str:
+    """Which variants the baseline beats, and which beat it, in a sentence.
+
+    Args:
+        rows: Of an ablation; the baseline's own is left out.
+    """
+    ahead, behind, num_open = [], [], 0
+    for row in rows:
+        gain = row.figures.get("auc_gain")
+        if row.name == BASELINE or gain is None:
+            continue
+        if gain.low > 0.0:
+            ahead.append(row)
+        elif gain.high < 0.0:
+            behind.append(row)
+        else:
+            num_open += 1
+    total = len(ahead) + len(behind) + num_open
+    if not total:
+        return "There is nothing yet to compare the baseline with."
+
+    def named(which: list[AblationRow]) -> str:
+        best_first = sorted(which, key=lambda row: -row.figures["auc_gain"].value)
+        return ", ".join(
+            f"{_spoken_name(row)} ({row.figures['auc_gain'].value:+.3f})" for row in best_first
+        )
+
+    winner = f"No variant beats the baseline's AUC beyond chance ({total} tried)"
+    if ahead:
+        winner = f"{len(ahead)} of {total} variants beat the baseline's AUC: {named(ahead)}"
+    loser = "it beats none of them"
+    if behind:
+        loser = f"it beats {len(behind)}: {named(behind)}"
+    return f"{winner}; {loser}; for {num_open} the interval of the difference includes zero."
+
+
+def _spoken_name(row: AblationRow) -> str:
+    return spoken(row.name).replace("=", " = ")

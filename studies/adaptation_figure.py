@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from drake_safety.evaluation.adaptation_study import AdaptationStudy
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.feedback import FeedbackSegments, FeedbackSet
+    from studies.adaptation_study import AdaptationStudy
 
 _NUM_MARKED = 3
 

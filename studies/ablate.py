@@ -1,4 +1,4 @@
-"""``drake-safety ablate``: what each choice in learning Γ is worth."""
+"""``python -m studies ablate``: what each choice in learning Γ is worth."""
 
 from __future__ import annotations
 
@@ -11,9 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from drake_safety.cli.arguments import ScenarioArgument, TrainingOption, WorkersOption
-from drake_safety.cli.console import Stages, console, interval, new_table, open_stages, print_path
-from drake_safety.cli.provenance import command_line, versions
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    Stages,
+    TrainingOption,
+    WorkersOption,
+    console,
+    interval,
+    new_table,
+    open_stages,
+    print_path,
+    versions,
+)
 from drake_safety.cli.training_folder import (
     MODES,
     check_fresh,
@@ -22,13 +31,14 @@ from drake_safety.cli.training_folder import (
     load_assessment,
 )
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
+from studies import command_line
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
-    from drake_safety.evaluation.ablation_study import AblationRow
     from drake_safety.evaluation.metrics import Figure
     from drake_safety.learning.assessment import AssessmentParameters
     from drake_safety.simulation.scenario import Scenario
+    from studies.ablation import AblationSets, EpisodeSet
+    from studies.ablation_study import AblationRow
 
 _COLUMNS = {
     "auc": "AUC",
@@ -67,16 +77,21 @@ def ablate(
     """Learn Γ anew with one choice made otherwise at a time, and judge it on the same episodes.
 
     Every variant learns from the training episodes in ASSESSMENT. A row is written as soon as it is
-    finished: an ablation that was stopped goes on when it is called again. Feedback that `adapt`
-    has left in ASSESSMENT serves to compare what n_f may count.
+    finished: an ablation that was stopped goes on when it is called again. Feedback
+    that `adaptation` has left in ASSESSMENT serves to compare what n_f may count.
     """
-    from drake_safety.evaluation.ablation import list_variants
-    from drake_safety.evaluation.ablation_figure import ablation_figure
-    from drake_safety.evaluation.ablation_study import AblationFile, rows_to_csv, run_ablation
     from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.capabilities import rate_names
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.scenario import load_scenario
+    from studies.ablation import list_variants
+    from studies.ablation_figure import ablation_figure
+    from studies.ablation_study import (
+        AblationFile,
+        ablation_verdict,
+        rows_to_csv,
+        run_ablation,
+    )
 
     loaded = load_scenario(scenario)
     gamma = load_assessment(assessment, MODES[0])
@@ -135,7 +150,7 @@ def ablate(
             for who, figures in found.items()
         }
     else:
-        left_out["n_f"] = "there are no pairs with fresh episodes: `drake-safety adapt --evaluate`"
+        left_out["n_f"] = "there are no pairs with fresh episodes: `python -m studies adaptation`"
     left_out |= failed
     file.entries["left_out"] = left_out
     file.write()
@@ -143,6 +158,7 @@ def ablate(
     table.write_text(rows_to_csv(rows), encoding="utf-8")
     pictures = save(ablation_figure(rows), file.path)
     console.print(_table(rows, base))
+    console.print(ablation_verdict(rows), highlight=False, soft_wrap=True)
     for (variation, mode), found in counting.items():
         console.print(_counting_table(found, variation, mode))
     for what, why in left_out.items():
@@ -162,9 +178,9 @@ def _sets(
     stages: Stages,
 ) -> AblationSets:
     """The training episodes, and fresh ones: what is not there yet is simulated and kept."""
-    from drake_safety.evaluation.ablation import AblationSets, EpisodeSet
     from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
+    from studies.ablation import AblationSets, EpisodeSet
 
     judging = judging_options(scenario.task_class())
 
@@ -192,11 +208,11 @@ def _counting(
     scenario: Scenario, folder: Path
 ) -> dict[tuple[str, str], dict[str, dict[str, Figure]]]:
     """What n_f counts, for each plant that `adapt` has left pairs and fresh episodes of."""
-    from drake_safety.evaluation.ablation_adaptation import counting_figures
-    from drake_safety.evaluation.adaptation_study import TestSet
     from drake_safety.learning.feedback import feedback_sets
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.dataset import load_episodes
+    from studies.ablation_adaptation import counting_figures
+    from studies.adaptation_study import TestSet
 
     found = {}
     for variation in scenario.variations:

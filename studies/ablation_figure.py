@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from drake_safety.evaluation.ablation import BASELINE
-from drake_safety.evaluation.ablation_study import AblationRow
 from drake_safety.evaluation.figure_style import (
     FAINT_INK,
     INK,
@@ -15,6 +13,8 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
     spoken,
 )
+from studies.ablation import BASELINE
+from studies.ablation_study import AblationRow
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

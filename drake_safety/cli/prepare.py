@@ -1,0 +1,105 @@
+"""What comes before a training: ``drake-safety scenarios``, ``new`` and ``check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_safety.cli.console import ScenarioArgument, console, new_table, print_path
+
+
+def scenarios() -> None:
+    """List the scenarios that come with the package."""
+    from drake_safety.robots.model_files import MissingExtraError
+    from drake_safety.simulation.scenario import load_scenario, scenario_names
+
+    table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")
+    for name in scenario_names():
+        try:
+            scenario = load_scenario(name)
+            scenario.task_class().model_files(scenario)
+        except MissingExtraError:
+            table.add_row(name, *4 * ["–"], "drake_safety[robots]")
+            continue
+        horizon_s = scenario.assessment.horizon * scenario.step_s
+        table.add_row(
+            name,
+            scenario.task.rpartition(":")[2],
+            scenario.robot,
+            ", ".join(scenario.variations),
+            f"{scenario.assessment.horizon} steps, {horizon_s:g} s",
+            "",
+        )
+    console.print(table)
+
+
+def new(
+    name: Annotated[str, typer.Argument(help="Name of the robot, and of its folder.")],
+    urdf: Annotated[Path, typer.Option(help="Its URDF.", dir_okay=False)],
+    task: Annotated[str, typer.Option(help="'balancing' or 'reaching'.")] = "balancing",
+    feet: Annotated[
+        str | None,
+        typer.Option(help="Links that touch the ground, with commas; the lowest by default."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write; NAME by default.")] = None,
+) -> None:
+    """Write a robot's folder and its first scenario from a URDF, to be looked over.
+
+    What a URDF does not tell is marked ASK in the files, with its unit.
+    """
+    from drake_safety.robots.robot_template import write_robot
+
+    written = write_robot(
+        name,
+        urdf,
+        task,
+        Path(name) if out is None else out,
+        feet=None if feet is None else [link.strip() for link in feet.split(",")],
+    )
+    sizes = written.sizes
+    console.print(
+        f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m "
+        "high",
+        highlight=False,
+        soft_wrap=True,
+    )
+    for path in written.files:
+        print_path("wrote", path)
+    for what in written.left_out:
+        console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    for what in written.asked:
+        console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    print_path("next: drake-safety check", written.files[-1])
+
+
+def check(
+    scenario: ScenarioArgument,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes simulated for the share of unsafe ones.", min=0)
+    ] = 16,
+    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = 0,
+) -> None:
+    """Say what a scenario and its robot lack, item by item, and how to mend it.
+
+    The exit code is 1 when there is a problem.
+    """
+    from drake_safety.simulation.scenario_check import check_scenario
+
+    num_problems = 0
+    for finding in check_scenario(scenario, num_episodes=episodes, seed=seed):
+        num_problems += not finding.is_ok
+        word, style = ("OK     ", "green") if finding.is_ok else ("problem", "red")
+        console.print(f"{word}  ", style=style, end="")
+        console.print(
+            f"{finding.item}: {finding.message}", markup=False, highlight=False, soft_wrap=True
+        )
+        if not finding.is_ok:
+            console.print(
+                f"         mend: {finding.remedy}", markup=False, highlight=False, soft_wrap=True
+            )
+    if num_problems:
+        console.print(f"{num_problems} problems", style="red", highlight=False)
+        raise typer.Exit(1)
+    console.print("ready: drake-safety train", scenario, "--out FOLDER", highlight=False)

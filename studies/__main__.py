@@ -1,0 +1,38 @@
+"""The studies' commands: ``python -m studies --help``."""
+
+from __future__ import annotations
+
+import typer
+
+from drake_safety.cli import run_app
+from studies.ablate import ablate
+from studies.adaptation import adaptation
+from studies.learning_curve import train_fewer
+from studies.plan_study import plan_study
+from studies.publish import readme, ship, store
+from studies.truth import truth
+
+app = typer.Typer(
+    help="Make what the tables of README and docs are made of, from a checkout.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(ablate)
+app.command()(plan_study)
+app.command("learning-curve")(train_fewer)
+app.command()(adaptation)
+app.command()(truth)
+app.command()(store)
+app.command()(readme)
+app.command()(ship)
+
+
+def main() -> None:
+    """Runs the command."""
+    run_app(app, "python -m studies")
+
+
+if __name__ == "__main__":
+    main()

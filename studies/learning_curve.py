@@ -1,0 +1,230 @@
+"""``python -m studies learning-curve``: how much better Γ judges the more it has learned from."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Annotated
+
+import typer
+
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    console,
+    figures_table,
+    open_stages,
+    print_path,
+    versions,
+)
+from drake_safety.cli.training_folder import (
+    MODES,
+    assessment_file,
+    check_fresh,
+    episodes_folder,
+    load_assessment,
+    run_fresh_episodes,
+)
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.plan_study import (
+    Plans,
+    plans_of,
+    promised_miss_rate,
+    scorer_rule,
+    verdict_figures,
+)
+from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.report.tables import Table
+from drake_safety.evaluation.report.verdicts import columns_of, figure_rows
+from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.calibration import score_threshold
+from drake_safety.learning.seeds import EVALUATION
+from drake_safety.simulation.capabilities import HasGoals, require
+from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.rollouts import parallel_map
+from drake_safety.simulation.scenario import load_scenario
+from studies import command_line
+from studies.learning_curve_figure import learning_curve_figure
+
+CURVE_FILE = "learning_curve.json"
+
+
+def train_fewer(
+    scenario: ScenarioArgument,
+    assessment: TrainingOption,
+    sizes: Annotated[str, typer.Option(help="Numbers of training episodes, such as '512,1024'.")],
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other ones, to choose thresholds.", min=20)
+    ] = 300,
+    seed: Annotated[
+        int, typer.Option(help="First seed of the fresh ones: those of `evaluate` by default.")
+    ] = EVALUATION.first,
+    workers: WorkersOption = None,
+) -> None:
+    """Learn Γ of plans with a goal from fewer episodes, too, and judge it on the same fresh ones.
+
+    Writes ASSESSMENT/learning_curve.json, which `store` takes in, and its picture.
+    """
+    wanted = parse_sizes(sizes)
+    loaded = load_scenario(scenario)
+    loop = loaded.make_loop()
+    require(loop, HasGoals, "learning curve")
+    sharpened = load_assessment(assessment, MODES[0])
+    info = load_episodes(episodes_folder(assessment)).info
+    seeds = EVALUATION.seeds(seed)
+    check_fresh(sharpened, loaded, (seeds["evaluation"], seeds["thresholds"]))
+    check_sizes(len(completed(episodes_folder(assessment))), wanted)
+    with open_stages() as stages:
+        test, calibration = (
+            plans_of(
+                loop,
+                run_fresh_episodes(
+                    loaded, assessment, count, own_seed, partial(stages, what), workers
+                ),
+            )
+            for what, count, own_seed in (
+                ("fresh nominal episodes", episodes, seeds["evaluation"]),
+                ("calibration episodes", calibration_episodes, seeds["thresholds"]),
+            )
+        )
+        curve = learning_curve(
+            episodes_folder(assessment),
+            wanted,
+            sharpened.parameters,
+            calibration,
+            test,
+            known={len(completed(episodes_folder(assessment))): sharpened},
+            num_workers=workers,
+            progress=stages,
+        )
+    figures = {f"plans.learning_curve.{key}": figure for key, figure in curve.items()}
+    report = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "scenario_hash": info.scenario_hash,
+        "seed": seed,
+        "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
+        "versions": versions(),
+        **{key: figure.to_json() for key, figure in figures.items()},
+    }
+    file = assessment / CURVE_FILE
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    columns = columns_of("targets")
+    prefixes = {f"plans.learning_curve.{size}": f"{size}" for size in sorted(set(wanted))}
+    prefixes |= {f"{key}.fair": f"{name}, fair targets" for key, name in list(prefixes.items())}
+    table = Table(
+        key="learning_curve",
+        title="Learning curve",
+        meaning="The same test, after learning from fewer simulated episodes.",
+        corner="training episodes",
+        columns=columns,
+        rows=figure_rows(Results(figures=figures), prefixes, columns),
+    )
+    console.print(figures_table(table))
+    print_path("figures", file)
+    for path in save(learning_curve_figure(curve), assessment / "learning_curve"):
+        print_path("picture", path)
+
+
+def parse_sizes(text: str) -> tuple[int, ...]:
+    """The numbers of episodes in '512,1024'.
+
+    Raises:
+        ValueError: Something else stands there.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        raise ValueError(
+            f"--sizes '{text}': give numbers of episodes, such as 512,1024,2048"
+        ) from None
+
+
+def check_sizes(num_episodes: int, sizes: Sequence[int]) -> None:
+    """Refuses sizes of training sets that cannot be.
+
+    Args:
+        num_episodes: How many training episodes there are.
+        sizes: How many of them to learn from.
+
+    Raises:
+        ValueError: A size is not positive, or more than there are.
+    """
+    misfits = [size for size in sizes if not 1 <= size <= num_episodes]
+    if misfits:
+        raise ValueError(
+            f"learning curve: there are {num_episodes} training episodes; got sizes {misfits}"
+        )
+
+
+def learning_curve(
+    path: str | os.PathLike[str],
+    sizes: Sequence[int],
+    parameters: AssessmentParameters,
+    calibration: Plans,
+    test: Plans,
+    *,
+    known: Mapping[int, SafetyAssessment] | None = None,
+    num_workers: int | None = None,
+    progress: StageProgress | None = None,
+) -> dict[str, Figure]:
+    """Trains on the first n episodes, for several n, and judges the same plans each time.
+
+    Args:
+        path: Folder of the training episodes.
+        sizes: The n.
+        parameters: How Γ is learned.
+        calibration: Plans on which each Γ's threshold is chosen.
+        test: Fresh plans.
+        known: What was learned already, by n.
+        num_workers: Processes.
+        progress: Called with a stage, the number done and the number wanted.
+
+    Returns:
+        By "N.auc", "N.safe_recall", "N.unsafe_recall", "N.brier" and "N.threshold" (Γ_thre), the
+        same by "N.fair.…" for the fair set.
+
+    Raises:
+        ValueError: A size is not positive, or more than there are.
+    """
+    check_sizes(len(completed(path)), sizes)
+    learned, wanted = dict(known or {}), sorted(set(sizes))
+    missing = [size for size in wanted if size not in learned]
+    done = len(wanted) - len(missing)
+    if progress is not None:
+        progress("learning curve", done, len(wanted))
+    # The largest first: nobody waits for it at the end.
+    arguments = [(os.fspath(path), size, parameters) for size in reversed(missing)]
+    for size, assessment in parallel_map(_learn, arguments, num_workers):
+        learned[size] = assessment
+        done += 1
+        if progress is not None:
+            progress("learning curve", done, len(wanted))
+    figures: dict[str, Figure] = {}
+    miss_rate = promised_miss_rate(calibration)
+    for size in wanted:
+        rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
+        threshold = score_threshold(
+            rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate
+        )
+        score = rule.unsafe_score(test)
+        for key, plans, chosen in (
+            (f"{size}", test, score),
+            (f"{size}.fair", test.fair(), score[test.is_fair]),
+        ):
+            found = verdict_figures(plans, chosen, threshold)
+            limit = 1.0 - threshold
+            found["threshold"] = Figure(limit, limit, limit, len(calibration))
+            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
+    return figures
+
+
+def _learn(path: str, size: int, parameters: AssessmentParameters) -> tuple[int, SafetyAssessment]:
+    return size, SafetyAssessment(parameters).fit(load_episodes(path)[:size])

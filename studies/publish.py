@@ -1,0 +1,92 @@
+"""``python -m studies store``, ``readme`` and ``ship``: what a run hands on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from drake_safety.cli.console import TrainingOption, open_stages, print_path
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.evaluation.report.results import Results, read_evaluation
+from drake_safety.simulation.dataset import read_info
+from drake_safety.simulation.scenario import load_scenario
+from studies.learning_curve import CURVE_FILE
+from studies.readme import rewrite_readme
+from studies.shipping import ship as ship_assessments
+from studies.stored_results import store_results
+
+
+def store(
+    assessment: TrainingOption,
+    out: Annotated[Path, typer.Option(help="File to write: docs/results/NAME.json.")],
+) -> None:
+    """Keep the evaluation in ASSESSMENT compactly, with its learning curve if there is one."""
+    results, extra = _evaluated(assessment)
+    store_results(results, out, train_command=extra.get("command"))
+    print_path("stored", out)
+
+
+def readme(
+    path: Annotated[Path, typer.Argument(help="The README.", exists=True)] = Path("README.md"),
+) -> None:
+    """Rewrite a README's tables from docs/results/NAME.json beside it.
+
+    They stand between <!-- results: NAME --> and <!-- end -->.
+    """
+    for name in rewrite_readme(path):
+        print_path(f"results of {name} in", path)
+
+
+def ship(
+    assessment: TrainingOption,
+    into: Annotated[
+        Path, typer.Option(help="Where it goes, in a folder named after the scenario.")
+    ] = Path("assessments"),
+) -> None:
+    """Put trained assessments where the package takes its own from, with what is known of them."""
+    results, extra = _evaluated(assessment)
+    if "command" not in extra:
+        raise ValueError(
+            f"ship: {assessment} does not tell what its assessments were trained with: there is no "
+            f"command in {episodes_folder(assessment)}"
+        )
+    with open_stages() as stages:
+        folder = ship_assessments(
+            results,
+            {mode: assessment_file(assessment, mode) for mode in MODES},
+            into,
+            load_scenario(str(results.entries["scenario"])),
+            train_command=str(extra["command"]),
+            progress=partial(stages, "first fresh episodes"),
+        )
+    print_path("shipped", folder)
+
+
+def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
+    """What an evaluation found, and what was stored with the training episodes."""
+    file = folder / "evaluation.json"
+    if not file.is_file():
+        raise ValueError(
+            f"{folder} holds no evaluation to store: `drake-safety evaluate` makes one"
+        )
+    results = read_evaluation(file)
+    try:
+        _, extra = read_info(episodes_folder(folder))
+    except (ValueError, OSError):
+        extra = {}  # The figures need no training episodes beside them.
+    curve = folder / CURVE_FILE
+    if curve.is_file():
+        drawn = read_evaluation(curve)
+        keys = ("scenario_hash", "assessment_sha256", "seed")
+        if any(drawn.entries.get(key) != results.entries.get(key) for key in keys):
+            raise ValueError(f"{curve} is of another training or other seeds than {file}")
+        results = replace(
+            results,
+            figures=results.figures | drawn.figures,
+            entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
+        )
+    return results, extra
