@@ -8,6 +8,7 @@ import typer
 
 from drake_safety.cli.arguments import ScenarioArgument
 from drake_safety.cli.console import console
+from drake_safety.learning.seeds import DEMONSTRATION
 
 
 def check(
@@ -15,7 +16,7 @@ def check(
     episodes: Annotated[
         int, typer.Option(help="Episodes simulated for the share of unsafe ones.", min=0)
     ] = 16,
-    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
 ) -> None:
     """Say what a scenario and its robot lack, item by item, and how to mend it.
 

@@ -10,6 +10,7 @@ from drake_safety.cli.arguments import AssessmentOption, ScenarioArgument
 from drake_safety.cli.console import console, print_shipped
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:
     from drake_safety.live.session import LiveSession
@@ -24,7 +25,7 @@ def play(
         bool | None,
         typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     port: Annotated[
         int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")
