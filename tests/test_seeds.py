@@ -9,7 +9,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from drake_safety.cli import adapt, calibrate, evaluate, train
+from drake_safety.cli import adapt, calibrate, evaluate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
@@ -19,6 +19,7 @@ from drake_safety.learning.seeds import (
     ADAPTATION,
     BLOCKS,
     CALIBRATION,
+    DEMONSTRATION,
     NOT_DRAWN,
     TRAINING,
     UsedEpisodes,
@@ -76,6 +77,8 @@ def test_every_command_takes_its_default_seed_from_the_table():
     commands = (train.train, evaluate.evaluate, calibrate.calibrate, plan_study, adapt.adapt)
     assert [default_seed(command) for command in commands] == [block.first for block in BLOCKS[:5]]
     assert default_seed(ablate) == default_seed(evaluate.evaluate)
+    shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]
+    assert shown == [DEMONSTRATION.first] * 3
     assert default_seed(run_pairs) == ADAPTATION.first
 
 

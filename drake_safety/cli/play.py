@@ -9,6 +9,7 @@ import typer
 from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:
     from drake_safety.live.session import LiveSession
@@ -23,7 +24,7 @@ def play(
         bool | None,
         typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     port: Annotated[
         int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")

@@ -79,7 +79,7 @@ def check(
     episodes: Annotated[
         int, typer.Option(help="Episodes simulated for the share of unsafe ones.", min=0)
     ] = 16,
-    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
 ) -> None:
     """Say what a scenario and its robot lack, item by item, and how to mend it.
 

@@ -25,6 +25,7 @@ from drake_safety.cli.run_settings import (
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +86,9 @@ def run(
             help="Seconds to simulate; 5, or to a target one more than an episode.", min=0.1
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = (
+        DEMONSTRATION.first
+    ),
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
         Path | None,

@@ -118,7 +118,7 @@ class AssessmentParameters:
     batch_size: int = 512
     epochs: int = 18
     ensemble_size: int = 3
-    held_out: float = 0.2
+    held_out: float = 0.3
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
     dropout: float = 0.2
     target_weight: float = 0.1

@@ -45,7 +45,8 @@ CALIBRATION = SeedBlock(2_000_000, ("calibration",))
 PLANNING = SeedBlock(3_000_000, ("planning",))
 ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation", "oracle"))
 """Nominal twins have the seed of the actual episodes beside them."""
-DEMONSTRATION = SeedBlock(5_000_000, ("demonstration",))
+DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
+"""What `run`, `play` and `check` show."""
 BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION)
 
 
