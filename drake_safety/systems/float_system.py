@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NoReturn, Self
 
 
@@ -19,6 +20,8 @@ class FloatSystem:
     """
 
     _constructed_with: tuple[tuple[Any, ...], dict[str, Any]]
+    get_name: Callable[[], str]  # Drake's.
+    set_name: Callable[[str], None]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keeps the arguments, whatever the constructor makes of them."""
