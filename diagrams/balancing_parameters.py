@@ -67,8 +67,8 @@ _QUANTITIES: dict[str, Any] = {
             "yaw_damping_s": "duration",
             "max_reach_m": "height",
             "min_lateral_m": "width",
-            "settle_speed_m_s": "speed_y",
             "settle_margin_m": "width",
+            "resume_margin_m": "width",
             "return_duration_s": "duration",
         }
     },

@@ -168,3 +168,8 @@ def test_a_parameter_that_must_be_positive_is_named(change):
 def test_contradictory_numbers_of_steps_are_refused():
     with pytest.raises(ValueError, match="min_steps <= max_steps is required; got 5, 3"):
         RecoveryStepParameters(min_steps=5, max_steps=3)
+
+
+def test_a_robot_that_would_step_on_as_soon_as_it_stands_is_refused():
+    with pytest.raises(ValueError, match="resume_margin_m must not exceed settle_margin_m"):
+        RecoveryStepParameters(resume_margin_m=0.06, settle_margin_m=0.05)

@@ -248,7 +248,7 @@ def test_a_fast_robot_goes_on_stepping_until_its_last_step():
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_a_robot_at_rest_settles_after_the_fewest_steps_and_hands_over(name):
-    bench = Bench(name, min_steps=2, settle_margin_m=0.01)
+    bench = Bench(name, min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0)
     bench.fix("recovery_active", [1.0])
     bench.advance(2 * bench.parameters.step_duration_s + 2 * PERIOD_S)
     assert not bench.lifted()
@@ -289,7 +289,9 @@ def test_the_base_set_point_never_jumps_during_the_return():
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
-    bench = Bench(name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01)
+    bench = Bench(
+        name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0
+    )
     bench.fix("recovery_active", [1.0])
     bench.advance(PERIOD_S)
     bench.see(bench.base + [0.04, 0.02, 0.0])  # Feet and all: the posture has not changed.

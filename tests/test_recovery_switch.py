@@ -19,7 +19,7 @@ class Bench:
 
     def __init__(self, name="laikago"):
         self.kinematics = robot_kinematics(name)
-        self.parameters = RecoveryStepParameters(settle_margin_m=0.01)
+        self.parameters = RecoveryStepParameters(settle_margin_m=0.01, resume_margin_m=0.0)
         self.switch = RecoverySwitch(
             self.kinematics,
             self.parameters,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from drake_safety.cli.console import ScenarioArgument, console, new_table, print_path
+from drake_safety.learning.seeds import DEMONSTRATION
 
 
 def scenarios() -> None:

@@ -16,7 +16,7 @@ class RecoveryStepParameters:
     """Duration of a swing; the other feet carry the robot meanwhile [s]."""
     lift_m: float = 0.06
     """Height of the swing curve's top [m]."""
-    velocity_gain_s: float = 0.12
+    velocity_gain_s: float = 0.11
     """Raibert's gain: how much further than the neutral point per speed [s]."""
     max_reach_m: float = 0.18
     """A foothold is at most this far from its hip's ground projection [m]."""
@@ -30,12 +30,12 @@ class RecoveryStepParameters:
     """Swings before the robot may stop."""
     max_steps: int = 20
     """Swings after which it stops in any case."""
-    settle_speed_m_s: float = 0.7
-    """Base speed under which it may stop [m/s]."""
     settle_heading_rad: float = 0.35
     """Angle between the base's yaw and the heading under which it may stop [rad]."""
-    settle_margin_m: float = 0.05
+    settle_margin_m: float = 0.08
     """Distance of the capture point inside the support polygon at which it may stop [m]."""
+    resume_margin_m: float = 0.02
+    """Distance under which it steps again, after it has stopped [m]."""
     return_duration_s: float = 0.5
     """Time in which the base returns over its feet before balancing goes on [s]."""
 
@@ -45,6 +45,11 @@ class RecoveryStepParameters:
                 raise ValueError(
                     f"recovery step: {name} must be positive; got {getattr(self, name)}"
                 )
+        if not self.resume_margin_m <= self.settle_margin_m:
+            raise ValueError(
+                f"recovery step: resume_margin_m must not exceed settle_margin_m; got "
+                f"{self.resume_margin_m}, {self.settle_margin_m}"
+            )
         if not 1 <= self.min_steps <= self.max_steps:
             raise ValueError(
                 f"recovery step: 1 <= min_steps <= max_steps is required; got "

@@ -20,7 +20,7 @@ class FloatSystem:
     """
 
     _constructed_with: tuple[tuple[Any, ...], dict[str, Any]]
-    get_name: Callable[[], str]
+    get_name: Callable[[], str]  # Drake's.
     set_name: Callable[[str], None]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:

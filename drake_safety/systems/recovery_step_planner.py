@@ -54,7 +54,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
     alternate until the robot can stand: its capture point is well inside the support polygon, and
     it is about at the heading. The base then comes to rest as an inverted pendulum does over its
     capture point, and is led to the nominal planner's set point, which stands in the stance pose of
-    the new footholds; should the capture point leave the support polygon meanwhile, the robot
+    the new footholds; should the capture point come near the polygon's edge meanwhile, the robot
     steps on. After that ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
     Preview and outlook are the base set point, held, in the frame of the stance as it is to be
@@ -145,8 +145,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         time = context.get_time()
         q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
         if mode == _RETURNING:
-            num_steps = discrete_state.get_value(self._num_steps)[0]
-            if self._margin(discrete_state, q, v) >= 0 or num_steps >= self._parameters.max_steps:
+            if self._stays_standing(discrete_state, q, v):
                 self._return(discrete_state, self._nominal_port.Eval(context), time)
                 return
             self._begin(discrete_state, q, v, time)
@@ -209,9 +208,16 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
             return num_steps >= parameters.max_steps
         yaw = yaw_of(RotationMatrix(quaternion_of(q)))
         return (
-            np.hypot(*v[3:5]) <= parameters.settle_speed_m_s
-            and abs(self._heading_error(discrete_state, yaw)) <= parameters.settle_heading_rad
+            abs(self._heading_error(discrete_state, yaw)) <= parameters.settle_heading_rad
             and self._margin(discrete_state, q, v) >= parameters.settle_margin_m
+        )
+
+    def _stays_standing(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> bool:
+        parameters = self._parameters
+        num_steps = discrete_state.get_value(self._num_steps)[0]
+        return (
+            num_steps >= parameters.max_steps
+            or self._margin(discrete_state, q, v) >= parameters.resume_margin_m
         )
 
     def _stand(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> None:
