@@ -170,10 +170,6 @@ def run_trials(
     ]
 
 
-def _judging_options(scenario: Scenario) -> dict[str, Any]:
-    return dict(scenario.task_class().judging_options)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Motion:
     """What a study takes from an executed plan: its first instant, and how it ended."""
@@ -216,7 +212,7 @@ def _motion_batch(
     scenario: Scenario, seed: int, num_plans: int, index: int, candidates: list[int]
 ) -> tuple[int, list[tuple[int, Episode]]]:
     """Executes some candidates of a start, as far as it has so many; and how many were asked."""
-    loop = worker_loop(scenario, "nominal", _judging_options(scenario))
+    loop = worker_loop(scenario, "nominal", judging_options(scenario.task_class()))
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     there = [i for i in candidates if i < len(plans)]
     return len(candidates), [(i, run_episode(loop, index, seed=seed, plan=plans[i])) for i in there]
