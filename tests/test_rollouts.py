@@ -1,6 +1,7 @@
 """Rollouts: the same bits for any number of workers, after any interruption, whatever diverges."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -238,6 +239,16 @@ def test_sixty_four_episodes_are_the_same_to_the_bit_with_one_and_two_workers():
 
 class Aimed(Gliding):
     """Glides from where it is told to."""
+
+    hand = None
+    named_targets: ClassVar[dict] = {}
+    target_box = np.array([[-0.4], [0.4]])
+
+    def reset_standing(self, context, goal, rng=None):
+        self.reset(context, rng, goal)
+
+    def goal_of(self, episode):
+        return episode.state[0, :1]
 
     def reset(self, context, rng, goal=None):
         super().reset(context, rng)
