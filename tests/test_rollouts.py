@@ -3,6 +3,7 @@
 import logging
 import re
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -331,6 +332,16 @@ def test_a_robot_whose_file_has_changed_is_simulated_anew(tmp_path):
 
 class Aimed(Gliding):
     """Glides from where it is told to."""
+
+    hand = None
+    named_targets: ClassVar[dict] = {}
+    target_box = np.array([[-0.4], [0.4]])
+
+    def reset_standing(self, context, goal, rng=None):
+        self.reset(context, rng, goal)
+
+    def goal_of(self, episode):
+        return episode.state[0, :1]
 
     def reset(self, context, rng, goal=None):
         super().reset(context, rng)
