@@ -16,8 +16,9 @@ demo: $(INSTALLED) ## Train on 1024 episodes, evaluate, and throw balls at the r
 		--episodes 200 --calibration-episodes 60 --throws 60 --calibration-throws 40
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
-test: $(INSTALLED) ## Run the tests
-	$(BIN)/python -m pytest
+test: $(INSTALLED) ## Run the tests, a process a core
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 \
+		--dist loadfile --no-loadscope-reorder
 
 lint: $(INSTALLED) ## Check style, format and types
 	$(BIN)/ruff check .

@@ -20,7 +20,7 @@ def run(tmp_path_factory):
     file = folder / "shuttling.yaml"
     file.write_text(SCENARIO)
     scenario = load_scenario(file)
-    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
+    episodes = run_episodes(scenario, 30, num_workers=1, path=episodes_folder(folder))
     for mode in MODES:
         scenario.assessment.mode = mode
         SafetyAssessment(scenario.assessment).fit(episodes).save(assessment_file(folder, mode))
@@ -32,8 +32,8 @@ def test_an_ablation_writes_a_row_a_variant_and_goes_on_where_it_was_stopped(
     monkeypatch, capsys, run
 ):
     file, folder = run
-    options = ("--assessment", folder, "--quick", "--workers", 1, "--episodes", 40)
-    options += ("--calibration-episodes", 30, "--seed", 100)
+    options = ("--assessment", folder, "--quick", "--workers", 1, "--episodes", 20)
+    options += ("--calibration-episodes", 20, "--seed", 100)
     assert call(monkeypatch, "ablate", file, *options) in (0, None)
     printed = capsys.readouterr().out
     report = json.loads((folder / "ablation_quick.json").read_text())
@@ -41,7 +41,7 @@ def test_an_ablation_writes_a_row_a_variant_and_goes_on_where_it_was_stopped(
     assert names[0] == "baseline"
     assert {"score_weight=0.1", "horizon=half", "episodes=half", "paper"} <= set(names)
     for row in report["rows"]:
-        assert row["name"] in printed and row["figures"]["k0.auc"]["n"] == 40
+        assert row["name"] in printed and row["figures"]["k0.auc"]["n"] == 20
     # The shuttle's states are not named after what they are, and nobody has adapted.
     assert report["left_out"].keys() >= {"horizon H", "velocities", "n_f"}
     assert "left out, n_f: there are no pairs" in printed
