@@ -18,8 +18,9 @@ demo: $(INSTALLED) ## Train on 640 episodes, evaluate, and throw balls at the ro
 		--episodes 160 --calibration-episodes 60 --throws 40 --no-baselines
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
-test: $(DEVELOPED) ## Run the tests
-	$(BIN)/python -m pytest
+test: $(DEVELOPED) ## Run the tests, a process a core
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 \
+		--dist loadfile --no-loadscope-reorder
 
 lint: $(DEVELOPED) ## Check style, format and types
 	$(BIN)/ruff check .

@@ -10,3 +10,10 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
     os.environ.setdefault(variable, "1")
 # What joblib counts where no number of workers is given; a number that is given stays as it is.
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
+
+
+def pytest_collection_modifyitems(items):
+    """Hands out files with slow tests first, so that no core waits for the last of them."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        slow = {item.path for item in items if item.get_closest_marker("slow")}
+        items.sort(key=lambda item: item.path not in slow)

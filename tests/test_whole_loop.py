@@ -12,6 +12,8 @@ from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.throws import run_throw
 
+pytestmark = pytest.mark.slow
+
 HARD = Throw(time_s=0.4, mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.2)
 
 
@@ -26,7 +28,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def episodes(scenario):
-    return run_episodes(scenario, 96, seed=3)
+    return run_episodes(scenario, 128, seed=3)
 
 
 @pytest.fixture(scope="module")
