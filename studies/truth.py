@@ -58,8 +58,8 @@ def truth(
     loop = loaded.make_loop()
     planes = require(loop, HasStatePlanes, "truth").state_planes
     assessments = {mode: load_assessment(assessment, mode) for mode in MODES}
-    for one in assessments.values():
-        check_fresh(one, loaded, (seed,))
+    for gamma in assessments.values():
+        check_fresh(gamma, loaded, (seed,))
     with open_stages() as stages:
         progress = partial(stages, "fresh nominal episodes")
         fresh = run_fresh_episodes(loaded, assessment, episodes, seed, progress, workers)
