@@ -7,7 +7,8 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.kinematic_preview import chain_joints
 from drake_safety.control.whole_body_qp import solve_qp
-from drake_safety.learning.segments import DIVERGED
+from drake_safety.learning.segments import DIVERGED, EpisodeError
+from drake_safety.plants.mujoco_dynamics import DivergenceError
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.reaching_sampling import PostureSampling
@@ -164,16 +165,26 @@ def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
     assert len(episode.time_s) == 1
 
 
-def test_an_episode_whose_simulation_fails_keeps_its_rows_and_says_so(monkeypatch):
+def fail_later(monkeypatch, error):
     ticks = []
 
     def fails_later(qp):
         ticks.append(qp)
         if len(ticks) > 30:
-            raise RuntimeError("no memory")
+            raise error
         return solve_qp(qp)
 
     monkeypatch.setattr(whole_body_controller, "solve_qp", fails_later)
+
+
+def test_a_controller_that_raises_is_an_error_and_no_diverged_simulation(monkeypatch):
+    fail_later(monkeypatch, RuntimeError("no memory"))
+    with pytest.raises(EpisodeError, match=r"episode 0 of .* RuntimeError: no memory"):
+        run_episode(porter(), 0, goal=EASY)
+
+
+def test_an_episode_whose_simulation_fails_keeps_its_rows_and_says_so(monkeypatch):
+    fail_later(monkeypatch, DivergenceError("the numbers ran away"))
     episode = run_episode(porter(), 0, goal=EASY)
     assert episode.cause == DIVERGED
     np.testing.assert_array_equal(episode.state, easy_episode().state[: len(episode.time_s)])

@@ -33,12 +33,15 @@ class Recorder:
         self._rows: list[dict[str, np.ndarray]] = []
         self._times: list[float] = []
 
-    def record(self, context: Context) -> dict[str, np.ndarray]:
-        """Appends a row, whole or, where a port raises, not at all; returns it."""
-        row = {name: port.Eval(context).copy() for name, port in self._ports.items()}
-        self._rows.append(row)
-        self._times.append(context.get_time())
-        return row
+    def record(self, context: Context, time_s: float | None = None) -> None:
+        """Appends a row, whole or, where a port raises, not at all.
+
+        Args:
+            context: The diagram's Context.
+            time_s: When it is, but for rounding; by default the Context's time [s].
+        """
+        self._rows.append({name: port.Eval(context).copy() for name, port in self._ports.items()})
+        self._times.append(context.get_time() if time_s is None else time_s)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What was recorded: ``time_s`` (N,) [s], and (N, size) for each port by its name."""
@@ -135,7 +138,7 @@ def record_episode(
     is_diverged = has_left = False
     try:
         simulator.Initialize()
-        recorder.record(context)
+        recorder.record(context, 0.0)
         has_left = not is_safe()
         for step in range(1, timing.num_steps + 1):
             if has_left:
@@ -144,7 +147,7 @@ def record_episode(
                 advance_to(simulator, time_s)
                 if has_left := not is_safe():
                     break
-            recorder.record(context)
+            recorder.record(context, time_s)
     except (Exception, SystemExit) as error:
         is_diverged = _is_divergence(error, context, is_finite_at_start)
         if not is_diverged or not recorder.arrays()["time_s"].size:

@@ -114,7 +114,7 @@ def run_to_goal(
     for row in range(round(duration_s / log_period_s) + 1):
         time = row * log_period_s
         advance_to(simulator, time)
-        recorder.record(context)
+        recorder.record(context, time)
         margins = margins_port.Eval(context)
         if margins.min() < 0 and not cause:
             leave_s, cause = time, loop.constraint_names[int(np.argmin(margins))]

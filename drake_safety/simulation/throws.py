@@ -237,7 +237,7 @@ def run_throw(
     for time in play_throws(
         loop, simulator, throws, duration_s=duration_s, log_period_s=log_period_s
     ):
-        recorder.record(context)
+        recorder.record(context, time)
         violations.count(context)
         margins = margins_port.Eval(context)
         if margins.min() < 0:
