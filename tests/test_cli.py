@@ -285,6 +285,16 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
     assert all(again[key] == first[key] for key in first if key.startswith("plans."))
 
 
+@pytest.mark.slow
+def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttle_run, tmp_path):
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    options = ("--plane-step", 0, "--other-hand", 0, "--no-baselines", "--out", tmp_path)
+    assert evaluate_shuttle(monkeypatch, shuttle_run, *options) in (0, None)
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    judged = {key.split(".")[1] for key in report if key.endswith(".brier")}
+    assert judged == {"sharpened", "paper", "fair"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
