@@ -128,7 +128,7 @@ def _reaching(sizes: Sizes) -> str:
     return f"""# Reaching: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high, arms of {reach:.2f} m.
 task: drake_safety.diagrams.reaching:Reaching
 robot: robot.yaml
-episode_duration_s: 3.0
+episode_duration_s: 4.0
 step_s: 0.1
 time_step_s: 0.002
 control_period_s: 0.004
