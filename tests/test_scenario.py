@@ -155,7 +155,7 @@ def test_task_names_are_modules_of_the_package_that_have_a_task():
             for value in vars(importlib.import_module(name)).values()
             if isinstance(value, type) and issubclass(value, ClosedLoop)
         ]
-        assert set(tasks) > {ClosedLoop}
+        assert any(hasattr(task, "Parameters") for task in tasks)
 
 
 def test_the_canonical_text_keeps_every_value(tmp_path):
