@@ -31,13 +31,6 @@ def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth():
     assert 1.1 * np.abs(scaled).max() == pytest.approx(70.0)
 
 
-def test_a_grid_made_from_points_holds_them_all():
-    points = np.random.default_rng(0).normal(size=(500, 2))
-    grid = Grid.from_points(points, resolution=20)
-    assert np.all(grid.locate(points) != OUTSIDE)
-    assert grid.half_width == pytest.approx(1.1 * np.abs(points).max())
-
-
 def test_interpolation_reproduces_a_linear_function_between_the_outermost_centres():
     values = GRID.centres @ [2.0, -3.0] + 5.0
     points = np.random.default_rng(1).uniform(-65.0, 65.0, size=(200, 2))

@@ -16,7 +16,6 @@ import numpy as np
 
 BACKENDS = ("dtaidistance", "tslearn")
 _BLOCK = 512
-_MAX_DENSE = 4000
 _SLACK = 1e-9
 
 
@@ -33,34 +32,6 @@ class NeighbourGraph:
     indices: np.ndarray
     distances: np.ndarray
     max_dtw: float
-
-
-def dtw_matrix(
-    error: np.ndarray, length: np.ndarray, *, backend: str = "dtaidistance"
-) -> np.ndarray:
-    """DTW distance, sqrt(sum ||.||^2) along the best path, of every pair of error sequences.
-
-    Args:
-        error: Error sequences, (N, H, n_z).
-        length: Samples of each that count, (N,).
-        backend: "dtaidistance", or "tslearn", which is slower and gives the same values.
-
-    Returns:
-        Symmetric matrix (N, N).
-
-    Raises:
-        ValueError: Unknown backend, or more than 4000 segments: use `neighbour_graph`.
-    """
-    num_segments = len(error)
-    if num_segments > _MAX_DENSE:
-        raise ValueError(
-            f"dtw_matrix: {num_segments} segments would need a dense matrix, expected at most "
-            f"{_MAX_DENSE}; neighbour_graph has no such limit"
-        )
-    _check_backend(backend)
-    series = _series(error, length)
-    every = slice(0, num_segments)
-    return _dtw_block(series, every, every, backend)
 
 
 def neighbour_graph(
@@ -91,7 +62,10 @@ def neighbour_graph(
     Raises:
         ValueError: Unknown backend, errors that are not finite, or too few segments.
     """
-    _check_backend(backend)
+    if backend not in BACKENDS:
+        raise ValueError(
+            f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}"
+        )
     error = np.asarray(error, dtype=float)
     score = np.asarray(score, dtype=float)
     num_segments = len(error)
@@ -142,13 +116,6 @@ def neighbour_graph(
     return NeighbourGraph(indices=result_indices, distances=result_distances, max_dtw=max_dtw)
 
 
-def _check_backend(backend: str) -> None:
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}"
-        )
-
-
 def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
     return [
         np.ascontiguousarray(sequence[:count], dtype=float)
@@ -165,7 +132,10 @@ def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
 def _dtw_block(
     series: list[np.ndarray], rows: slice, columns: slice, backend: str, limit: float = np.inf
 ) -> np.ndarray:
-    """DTW of `rows` against `columns`; where it exceeds `limit` it may be infinite."""
+    """DTW of `rows` against `columns`: sqrt(sum ||.||^2) along the best path.
+
+    Where it exceeds `limit` it may be infinite.
+    """
     if backend == "tslearn":
         from tslearn.metrics import cdist_dtw
         from tslearn.utils import to_time_series_dataset

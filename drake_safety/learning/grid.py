@@ -36,12 +36,6 @@ class Grid:
         if not self.cell_length > 0.0:
             raise ValueError(f"Grid: cell_length is {self.cell_length}, expected > 0")
 
-    @classmethod
-    def from_points(cls, points: np.ndarray, resolution: int) -> Grid:
-        """The grid that holds centred points (N, 2), with a tenth of their extent to spare."""
-        extent = float(np.abs(points).max())
-        return cls(resolution=resolution, cell_length=2.0 * _FILL * extent / resolution)
-
     @property
     def num_cells(self) -> int:
         """R * R."""
