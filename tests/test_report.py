@@ -87,9 +87,18 @@ def whole(tmp_path_factory):
 
 
 @pytest.fixture
-def copy(whole, tmp_path):
+def copy(whole, tmp_path, monkeypatch):
+    """A copy of the whole run; the figures of its report are taken over, not drawn again."""
     folder = tmp_path / "lip"
     shutil.copytree(whole.folder, folder)
+
+    def drawn_before(fig, path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figures = whole.folder / "report/figures"
+        names = [path.with_suffix(suffix).name for suffix in (".png", ".svg")]
+        return [shutil.copy(figures / name, path.with_name(name)) for name in names]
+
+    monkeypatch.setattr("drake_safety.evaluation.report.page.save", drawn_before)
     return folder
 
 
