@@ -31,14 +31,15 @@ def store(
 
 
 def readme(
-    path: Annotated[Path, typer.Argument(help="The README.", exists=True)] = Path("README.md"),
+    paths: Annotated[list[Path] | None, typer.Argument(help="Markdown files.", exists=True)] = None,
 ) -> None:
-    """Rewrite a README's tables from docs/results/NAME.json beside it.
+    """Rewrite the tables of README.md and docs/results.md from docs/results/NAME.json.
 
-    They stand between <!-- results: NAME --> and <!-- end -->.
+    They stand between <!-- results: NAME -->, or <!-- summary: NAME -->, and <!-- end -->.
     """
-    for name in rewrite_readme(path):
-        print_path(f"results of {name} in", path)
+    for path in paths or [Path("README.md"), Path("docs/results.md")]:
+        for name in rewrite_readme(path):
+            print_path(f"results of {name} in", path)
 
 
 def ship(

@@ -1,7 +1,7 @@
-"""The README's tables of results, generated from stored evaluations, so that they cannot drift.
+"""Tables of results in README and docs, generated from stored evaluations.
 
-What stands between ``<!-- results: NAME -->`` and ``<!-- end -->`` is made from
-``docs/results/NAME.json`` beside the README, and from nothing else.
+What stands between ``<!-- results: NAME -->``, or ``<!-- summary: NAME -->``, and ``<!-- end -->``
+is made from ``docs/results/NAME.json``, and from nothing else.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Column, Row, Table
@@ -18,6 +19,7 @@ from drake_safety.evaluation.report.verdicts import (
     INPUTS,
     columns_of,
     figure_rows,
+    label_of,
     plan_sets,
     set_title,
     verdict_tables,
@@ -26,20 +28,22 @@ from studies.stored_results import read_results
 
 RESULTS_FOLDER = Path("docs/results")
 _BLOCK = re.compile(
-    r"(?P<start><!-- results: (?P<name>[\w-]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
+    r"(?P<start><!-- (?P<kind>results|summary): (?P<name>[\w-]+) -->\n).*?(?P<end><!-- end -->)",
+    re.DOTALL,
 )
-_OPEN = re.compile(r"<!-- results: ([\w-]+) -->")
+_OPEN = re.compile(r"<!-- (?:results|summary): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
 """Of 1000 random targets, in the paper."""
 
 
-def rewrite_readme(path: Path) -> list[str]:
-    """Rewrites every block of results in a README.
+def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
+    """Rewrites every block of results in a Markdown file.
 
     Args:
-        path: The README.
+        path: The file.
+        folder: Where the stored results are.
 
     Returns:
         The names of the results it shows.
@@ -54,17 +58,17 @@ def rewrite_readme(path: Path) -> list[str]:
             f"{path} has no block of results: put <!-- results: NAME --> and <!-- end --> where "
             f"those of {RESULTS_FOLDER}/NAME.json belong"
         )
-    generated = generate(text, path.parent / RESULTS_FOLDER)
+    generated = generate(text, folder)
     if generated != text:
         path.write_text(generated, encoding="utf-8")
     return names
 
 
 def generate(text: str, folder: Path) -> str:
-    """A README's text with every block of results as the stored ones make it.
+    """A text with every block of results as the stored ones make it.
 
     Args:
-        text: The README.
+        text: The Markdown.
         folder: Where the stored results are.
 
     Raises:
@@ -84,7 +88,8 @@ def generate(text: str, folder: Path) -> str:
                 f"README: there are no results '{match['name']}' in {folder}; there are {there}: "
                 "`python -m studies store RUN` writes them"
             )
-        return f"{match['start']}{results_text(read_results(file))}\n{match['end']}"
+        make = results_text if match["kind"] == "results" else summary_text
+        return f"{match['start']}{make(read_results(file))}\n{match['end']}"
 
     return _BLOCK.sub(block, text)
 
@@ -99,6 +104,45 @@ def results_text(results: Results) -> str:
     if results.has("throws."):
         parts += _throws(results)
     return "\n\n".join(part for part in parts if part)
+
+
+def summary_text(results: Results) -> str:
+    """Counts and the one table of an evaluation that a reader needs first, as Markdown."""
+    if results.has("plans."):
+        sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
+        judges = ("paper", "gradient_boosting", "mlp", "reachability")
+        names = {
+            "plans.sharpened": "`sharpened`",
+            **{prefix: f"`sharpened`, {title}" for prefix, title in sets.items()},
+            **{f"plans.{judge}": _named(judge) for judge in judges},
+        }
+        table = _rows(results, "all targets", names)
+        printed = f"*{SAFE_RECALL:.3f}* | *{UNSAFE_RECALL:.3f}*"
+        return f"{_counts(results)}\n\n{table}\n| *the paper's own* | {printed} | |"
+    columns = {
+        "every segment, AUC": ("segments.{}.auc", _SHARE),
+        "first step, AUC": ("episodes.{}.auc", _SHARE),
+        "falls with recovery": ("throws.{}.falls_with_recovery", _PERCENT),
+        "false triggers": ("throws.{}.false_triggers", _PERCENT),
+    }
+    lines = [f"| | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    for judge in ("sharpened", "paper", "gradient_boosting", "mlp"):
+        cells = []
+        for key, column in columns.values():
+            wanted = (key.format(judge), key.format(f"{judge}_literal_0.6"))
+            found = next((results.figures[one] for one in wanted if one in results.figures), None)
+            cells.append("" if found is None else column.text(found))
+        if any(cells):
+            lines.append(f"| {_named(judge)} | {' | '.join(cells)} |")
+    parts = [_counts(results), "\n".join(lines)]
+    if "throws.falls_without_recovery" in results.figures:
+        alone = results.figures["throws.falls_without_recovery"]
+        parts.insert(1, f"Of {alone.n} fresh throws {_PERCENT.text(alone)} fall without recovery.")
+    return "\n\n".join(parts)
+
+
+def _named(judge: str) -> str:
+    return f"`{judge}`" if judge in MODES else label_of(judge)
 
 
 def _commands(results: Results) -> str:

@@ -33,12 +33,27 @@ def write_readme(folder, figures, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
     return readme
 
 
-def test_the_committed_readme_is_what_the_stored_evaluations_generate():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["README.md", "docs/results.md"])
+def test_the_committed_tables_are_what_the_stored_evaluations_generate(name):
+    text = (ROOT / name).read_text(encoding="utf-8")
     assert generate(text, ROOT / "docs/results") == text
-    shown = set(re.findall(r"<!-- results: ([\w-]+) -->", text))
-    # A stored evaluation that the README does not show is as stale as one that it shows wrongly.
+    shown = set(re.findall(r"<!-- (?:results|summary): ([\w-]+) -->", text))
+    # A stored evaluation that is not shown is as stale as one that is shown wrongly.
     assert shown == {path.stem for path in STORED}
+
+
+def test_a_summary_is_one_table_with_and_without_targets(tmp_path):
+    summary = BLOCK.replace("results:", "summary:")
+    readme = write_readme(tmp_path, make_figures(), summary)
+    rewrite_readme(readme, tmp_path / "docs/results")
+    assert "| `sharpened` | 0.900 (0.795–0.962) |" in readme.read_text()
+    assert "```sh" not in readme.read_text()
+    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    for column in ("safe_recall", "unsafe_recall", "auc"):
+        figures[f"plans.sharpened.{column}"] = proportion(19, 20)
+    readme = write_readme(tmp_path, figures, summary)
+    rewrite_readme(readme, tmp_path / "docs/results")
+    assert "| *the paper's own* | *0.952* | *0.987* | |" in readme.read_text()
 
 
 def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
@@ -58,7 +73,7 @@ def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
 
 def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     readme = write_readme(tmp_path, make_figures())
-    assert rewrite_readme(readme) == ["lip"]
+    assert rewrite_readme(readme, tmp_path / "docs/results") == ["lip"]
     text = readme.read_text()
     assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety train lip")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
@@ -67,7 +82,7 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
     again = text
-    rewrite_readme(readme)
+    rewrite_readme(readme, tmp_path / "docs/results")
     assert readme.read_text() == again
 
 
@@ -78,7 +93,7 @@ def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
             figures[f"plans.{name}.{column}"] = proportion(count, 20)
     figures["plans.causes.right_cause"] = proportion(9, 10)
     readme = write_readme(tmp_path, figures)
-    rewrite_readme(readme)
+    rewrite_readme(readme, tmp_path / "docs/results")
     text = readme.read_text()
     assert "| all targets | safe recall | unsafe recall | AUC |" in text
     assert "| *the paper's own* | *0.952* | *0.987* | |" in text
@@ -92,7 +107,7 @@ def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path
         for column in ("safe_recall", "unsafe_recall", "auc"):
             figures[f"{prefix}.{column}"] = proportion(19, 20)
     readme = write_readme(tmp_path, figures)
-    rewrite_readme(readme)
+    rewrite_readme(readme, tmp_path / "docs/results")
     text = readme.read_text()
     assert "mirrored" not in text
     assert "| training episodes | safe recall | unsafe recall | AUC |" in text
@@ -100,7 +115,7 @@ def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path
     lost = {"safe": Figure(0.011, -0.002, 0.024, 40), "unsafe": Figure(0.0, 0.0, 0.0, 40)}
     for what, figure in lost.items():
         figures[f"plans.other_hand.sharpened.{what}_recall_loss"] = figure
-    rewrite_readme(write_readme(tmp_path, figures))
+    rewrite_readme(write_readme(tmp_path, figures), tmp_path / "docs/results")
     assert (
         "On the same 40 targets, mirrored, the other hand minus the trained one: -1.1 (-2.4 to "
         "+0.2) points of safe recall, +0.0 (+0.0 to +0.0) points of unsafe recall."
@@ -109,7 +124,7 @@ def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path
 
 def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):
     readme = write_readme(tmp_path, make_figures())
-    rewrite_readme(readme)
+    rewrite_readme(readme, tmp_path / "docs/results")
     forged = readme.read_text().replace("0.900 (0.795–0.962)", "0.990 (0.795–0.962)", 1)
     assert generate(forged, tmp_path / "docs/results") != forged
 
@@ -126,7 +141,7 @@ def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):
 def test_a_readme_that_cannot_be_filled_in_is_refused_and_left_alone(tmp_path, text, message):
     readme = write_readme(tmp_path, make_figures(), text)
     with pytest.raises(ValueError, match=message):
-        rewrite_readme(readme)
+        rewrite_readme(readme, tmp_path / "docs/results")
     assert readme.read_text() == text
 
 
