@@ -16,7 +16,7 @@ class RecoveryStepParameters:
     """Duration of a swing; the other feet carry the robot meanwhile [s]."""
     lift_m: float = 0.06
     """Height of the swing curve's top [m]."""
-    velocity_gain_s: float = 0.11
+    velocity_gain_s: float = 0.07
     """Raibert's gain: how much further than the neutral point per speed [s]."""
     max_reach_m: float = 0.18
     """A foothold is at most this far from its hip's ground projection [m]."""
