@@ -34,9 +34,9 @@ def blocks(language, text=README):
 def shell_commands(program, text=README):
     """The arguments of every line that calls a program, inline ones too."""
     lines = [line for block in blocks("sh", text) for line in block.splitlines()]
-    lines += re.findall(r"`([^`\n]+)`", text)
-    # Inline, a command may be only named.
-    called = [line for line in lines if re.match(rf"{program} [\w-]+ ?\S", line)]
+    # In a sentence a command may be only named.
+    lines += re.findall(r"`([^`\n]+ [^`\n]+ [^`\n]+)`", text)
+    called = [line for line in lines if line.startswith(f"{program} ")]
     return [shlex.split(line, comments=True)[len(program.split()) :] for line in called]
 
 
