@@ -43,16 +43,6 @@ _PACKAGE = Path(__file__).resolve().parent
 _BESIDE = ("assessments", "diagrams", "models")
 
 
-def package_folder(name: str) -> Path:
-    """Where `models`, `diagrams` or `assessments` stands: in this package, or else beside it.
-
-    Args:
-        name: One of the three.
-    """
-    inside = _PACKAGE / name
-    return inside if inside.is_dir() else _PACKAGE.parent / name
-
-
 class _CheckoutFinder:
     """Finds in a checkout what stands beside this package, by the name that it is installed as.
 
@@ -66,7 +56,7 @@ class _CheckoutFinder:
         parent, _, child = name.rpartition(".")
         if parent != __name__ or child not in _BESIDE:
             return None
-        folder = package_folder(child)
+        folder = _PACKAGE.parent / child
         return spec_from_file_location(
             name, folder / "__init__.py", submodule_search_locations=[str(folder)]
         )
@@ -98,7 +88,8 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     """Resolves a public name on first use."""
     if name == "__version__":
-        value: Any = _version()
+        segments = import_module("drake_safety.learning.segments")
+        value: Any = segments.installed_versions()["drake_safety"]
     elif name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
     else:
@@ -110,13 +101,3 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Lists the names not resolved yet beside the resolved ones."""
     return sorted({*globals(), *__all__})
-
-
-def _version() -> str:
-    """Returns the installed version, or one that says the code runs uninstalled."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("drake_safety")
-    except PackageNotFoundError:
-        return "0+uninstalled"

@@ -148,13 +148,9 @@ def command_line(program: str = "drake-safety") -> str:
 
 def versions() -> dict[str, str]:
     """Versions of the library and of what its figures depend on."""
-    import importlib.metadata
+    from drake_safety.learning.segments import installed_versions
 
-    import drake_safety
-
-    names = ("drake", "numpy", "scipy", "scikit-learn", "torch")
-    installed = {name: importlib.metadata.version(name) for name in names}
-    return {"drake_safety": drake_safety.__version__, **installed}
+    return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
 class Stages:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import overload
@@ -24,6 +25,19 @@ DIVERGED = "diverged"
 
 class EpisodeError(RuntimeError):
     """An error that a diagram raised during an episode, and that is no diverged simulation."""
+
+
+def installed_versions(*packages: str) -> dict[str, str]:
+    """Versions of this package and of others, by name.
+
+    Args:
+        packages: Names of installed distributions.
+    """
+    try:
+        own = importlib.metadata.version("drake_safety")
+    except importlib.metadata.PackageNotFoundError:
+        own = "0+uninstalled"
+    return {"drake_safety": own, **{name: importlib.metadata.version(name) for name in packages}}
 
 
 @dataclass(kw_only=True)

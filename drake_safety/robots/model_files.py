@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import urlparse
 
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
-
-import drake_safety
 
 _EXTRAS = {"example-robot-data": "robots"}
 """Packages of models that an extra installs."""
@@ -23,7 +22,7 @@ class MissingExtraError(ValueError):
 
 def models_package_xml() -> Path:
     """The ``package.xml`` behind ``package://drake_safety_models/``."""
-    return drake_safety.package_folder("models") / "package.xml"
+    return Path(str(files("drake_safety.models"))) / "package.xml"
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:

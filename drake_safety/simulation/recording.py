@@ -14,14 +14,19 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from drake_safety.learning.segments import Episode, EpisodeError, Episodes, EpisodesInfo
+from drake_safety.learning.segments import (
+    Episode,
+    EpisodeError,
+    Episodes,
+    EpisodesInfo,
+    installed_versions,
+)
 from drake_safety.simulation.contract import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.rollouts import (
     Progress,
     collect_episodes,
     episode_rng,
-    package_versions,
 )
 from drake_safety.simulation.scenario import source_digest
 
@@ -139,7 +144,7 @@ def record_episodes(
         output_names=_names("output", output_names, sizes["output"]),
         feature_names=_names("feature", feature_names, sizes.get("features", 0)),
         constraint_names=_names("constraint", constraint_names, sizes["margins"]),
-        versions=package_versions("numpy"),
+        versions=installed_versions("drake", "numpy"),
         num_steps=timing.num_steps,
         code=source_digest(),
     )

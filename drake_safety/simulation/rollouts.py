@@ -5,7 +5,6 @@ from __future__ import annotations
 import copyreg
 import hashlib
 import importlib
-import importlib.metadata
 import logging
 import sys
 import warnings
@@ -18,8 +17,13 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-import drake_safety
-from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
+from drake_safety.learning.segments import (
+    DIVERGED,
+    Episode,
+    Episodes,
+    EpisodesInfo,
+    installed_versions,
+)
 from drake_safety.simulation.capabilities import (
     CanStartAnywhere,
     CountsFailures,
@@ -78,16 +82,10 @@ def episodes_info(
         state_names=list(loop.state_names),
         output_names=list(loop.output_names),
         feature_names=list(loop.feature_names),
-        versions=package_versions("numpy", loop.variation.engine),
+        versions=installed_versions("drake", "numpy", loop.variation.engine),
         num_steps=scenario.num_steps,
         code=scenario.code_digest(),
     )
-
-
-def package_versions(*names: str) -> dict[str, str]:
-    """Versions of the packages that simulate: this one, Drake, and others by name."""
-    versions = {name: importlib.metadata.version(name) for name in ("drake", *names)}
-    return {"drake_safety": drake_safety.__version__, **versions}
 
 
 def run_episode(

@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
@@ -15,7 +16,6 @@ from typing import TYPE_CHECKING, Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
-import drake_safety
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
@@ -244,17 +244,18 @@ def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
     return known[class_name]
 
 
+def _scenario_folder() -> Path:
+    return Path(str(files("drake_safety.diagrams")))
+
+
 def scenario_names() -> list[str]:
     """Names of the scenarios that come with the package."""
-    return sorted(path.stem for path in drake_safety.package_folder("diagrams").glob("*.yaml"))
+    return sorted(path.stem for path in _scenario_folder().glob("*.yaml"))
 
 
 def task_names() -> list[str]:
     """Import paths of the modules of tasks that come with the package: those of its scenarios."""
-    texts = (
-        path.read_text(encoding="utf-8")
-        for path in drake_safety.package_folder("diagrams").glob("*.yaml")
-    )
+    texts = (path.read_text(encoding="utf-8") for path in _scenario_folder().glob("*.yaml"))
     return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
 
 
@@ -271,7 +272,7 @@ def load_scenario(name: str | Path) -> Scenario:
     """
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        path = drake_safety.package_folder("diagrams") / f"{name}.yaml"
+        path = _scenario_folder() / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(
                 f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give "
