@@ -116,7 +116,7 @@ def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
 
 
 def test_a_run_that_is_stopped_says_that_episodes_are_kept(monkeypatch, capsys):
-    def stopped(**options):
+    def stopped(arguments, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.cli.app", stopped)
@@ -299,7 +299,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     ("arguments", "message"),
     [
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
-        (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
+        (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
         (["--seed", "-3"], "seed 0 would give episodes that begin as the 60 'nominal'"),
     ],
 )
@@ -362,4 +362,6 @@ def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, s
     _, folder = shuttle_run
     arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
     assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
-    assert "have no goal to be pushed on the way to" in " ".join(capsys.readouterr().out.split())
+    assert "leave out --pushes; thrown balls are watched, too" in " ".join(
+        capsys.readouterr().out.split()
+    )

@@ -185,7 +185,7 @@ def test_without_the_extra_it_is_named(kind, few_rows, tmp_path, monkeypatch):
         return found(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ValueError, match=r"pip install drake_safety\[logs\]"):
+    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[logs\]'"):
         read_log(path, map_of(kind, tmp_path), ROBOT)
 
 

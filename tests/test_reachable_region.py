@@ -5,6 +5,7 @@ from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachable_region import plane_of, reachable_region
 from drake_safety.evaluation.region_figure import region_figure
+from drake_safety.evaluation.scorers import assessment_scorer
 from shuttle_task import BOX, FAIR_X_M, shuttling
 
 
@@ -55,9 +56,10 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
     row, column = 2, 3
     loop.reset_standing(context, np.array([0.9, region.y_m[column], region.z_m[row]]))
     inputs = (
-        loop.GetOutputPort(name).Eval(context) for name in ("state", "desired_preview", "features")
+        loop.GetOutputPort(name).Eval(context)[None]
+        for name in ("state", "desired_preview", "features")
     )
-    expected = assessment.predict_one(*inputs).calibrated
+    (expected,) = assessment_scorer("sharpened", assessment, "calibrated").probability(*inputs)
     assert region.safety_probability[row, column] == pytest.approx(expected, abs=1e-6)
 
 

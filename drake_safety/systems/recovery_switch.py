@@ -88,12 +88,11 @@ class RecoverySwitch(FloatSystem, Diagram):
         builder.Connect(
             planner.GetOutputPort("recovery_done"), trigger.GetInputPort("recovery_done")
         )
-        sizes = {
-            "desired_output": 3,
-            "desired_preview": 3 * horizon,
-            "desired_outlook": 3 * num_outlook,
-        }
-        for name, size in sizes.items():
+        for nominal_name, name, size in (
+            ("nominal_desired_output", "desired_output", 3),
+            ("nominal_desired_preview", "desired_preview", 3 * horizon),
+            ("nominal_desired_outlook", "desired_outlook", 3 * num_outlook),
+        ):
             switch = builder.AddNamedSystem(f"{name}_switch", PortSwitch(size))
             builder.Connect(
                 trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
@@ -101,9 +100,9 @@ class RecoverySwitch(FloatSystem, Diagram):
             nominal = switch.DeclareInputPort("nominal")
             recovery = switch.DeclareInputPort("recovery")
             if name == "desired_output":
-                builder.ConnectInput("nominal_desired_output", nominal)
+                builder.ConnectInput(nominal_name, nominal)
             else:
-                builder.ExportInput(nominal, f"nominal_{name}")
+                builder.ExportInput(nominal, nominal_name)
             builder.Connect(planner.GetOutputPort(name), recovery)
             builder.ExportOutput(switch.GetOutputPort("value"), name)
         for name in ("desired_foot_positions", "desired_yaw", "stance_pose"):
