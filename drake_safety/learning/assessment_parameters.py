@@ -1,4 +1,4 @@
-"""What a safety assessment is learned and adapted with: the schema of a scenario's `assessment`."""
+"""The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
 from dataclasses import dataclass, field
 
@@ -9,23 +9,22 @@ MODES = ("paper", "sharpened")
 
 @dataclass(kw_only=True)
 class AdaptationParameters:
-    """How feedback of the actual robot changes an assessment.
+    """Parameters of the adaptation to feedback from the actual robot.
 
-    The first five default to the paper's Table I, update_interval to its text.
+    The first four default to the paper's Table I, update_interval to its text.
 
     Attributes:
-        gate: sigma_thre, standard deviation of the discrepancy up to which it is believed (paper).
-        least_uncertainty: mu_min of nominal beliefs where nothing differs (paper).
-        decay_rate: alpha, how fast feedback beliefs lose their uncertainty (paper).
+        gate: sigma_thre, largest standard deviation at which the discrepancy is used (paper).
+        least_uncertainty: mu_min of nominal beliefs without discrepancy (paper).
+        decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
-        update_interval: k_u, feedback sets from one update to the next.
+        update_interval: k_u, number of feedback sets between two updates.
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
-            its own cell, or literally the number of all feedback sets (paper).
-        offset_std: Standard deviation of the prior of what changes in the base logit's
-            offset (sharpened).
-        slope_std: The same of either of its slopes (sharpened).
-        hidden_std: The same of what the maps' last hidden layer adds to it, where its activations
-            are as far from their mean as they are in feedback (sharpened).
+            its cell, or literally the number of all feedback sets (paper).
+        offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
+        slope_std: The same for each of its slopes (sharpened).
+        hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
+            mean distance of activations from their mean (sharpened).
     """
 
     gate: float = 0.3
@@ -56,13 +55,13 @@ class AdaptationParameters:
 
 @dataclass(kw_only=True)
 class AssessmentParameters:
-    """What a safety assessment is trained with.
+    """Parameters of a safety assessment.
 
     discount, horizon, score_weight, initial_uncertainty and min_count default to the paper's
     Table I, resolution and cell_length to its text; the other defaults are our own.
 
-    The paper's mode is fixed beyond Table I: one plain map with two layers of 128, trained on
-    segments that do not overlap. What is marked "sharpened" has no meaning there.
+    The paper's mode has one plain map with two layers of 128, trained on segments that do not
+    overlap; it ignores the attributes marked "sharpened".
 
     Attributes:
         mode: "sharpened" or "paper".
@@ -71,36 +70,35 @@ class AssessmentParameters:
         score_weight: delta, the weight of score differences in Omega.
         initial_uncertainty: mu_ini of nominal beliefs.
         min_count: k_min, beliefs below which a cell stays empty.
-        resolution: Cells a side of the grid.
+        resolution: Number of cells per side of the grid.
         cell_length: Side of a cell.
-        distance_backend: What computes dynamic time warping: "dtaidistance", or "tslearn", which
-            takes some twenty times as long and gives the same values.
+        distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
+            which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
-        seed: Seeds t-SNE and the maps.
+        seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
-        batch_size: Segments a training step.
-        epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
+        batch_size: Segments per training step.
+        epochs: Passes over the segments (sharpened; 40 in the paper's mode).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of the episodes that maps are tried on, before others of their kind learn
-            from all: what they say of these makes Gamma a probability (sharpened).
+        held_out: Share of held-out episodes. The base logit is fitted to maps trained without
+            them; the final maps are trained on all episodes (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
-        dropout: Share of activations dropped in training (sharpened).
-        target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
-            decide where neighbours in t-SNE part.
+        dropout: Dropout rate (sharpened).
+        target_weight: Weight of the distance to t-SNE's points (sharpened). With a small weight,
+            safety separates segments that are neighbours in t-SNE.
         safety_weight: Weight of the safety head's loss (sharpened).
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
-        raw_input_scale: Spread of state and preview as a map sees them, beside features of spread
-            one (sharpened). Where the features say nearly all, a small one keeps the maps from
-            learning the rest by heart.
-        feature_unit: Features enter a second time as asinh(f / feature_unit), which spreads out
-            what lies near a margin's zero [unit of the features]; 0 leaves that out (sharpened).
-        shortest_segment: Steps that a safe episode's segment has at least; 0 stands for the whole
+        raw_input_scale: Spread of state and preview as a map's inputs, where features have spread
+            one (sharpened). A small scale prevents overfitting to them if the features suffice.
+        feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
+            margins near zero [unit of the features]; 0 disables it (sharpened).
+        shortest_segment: Least number of steps of a safe episode's segment; 0 means the whole
             horizon (sharpened). For episodes that end at rest.
-        first_row_weight: Weight of the segment an episode starts with, relative to the others: they
-            are few, and verdicts at planning time rest on them (sharpened).
-        adaptation: How feedback of the actual robot changes it.
+        first_row_weight: Weight of an episode's first segment relative to the others (sharpened).
+            First segments are few, but verdicts at planning time depend on them.
+        adaptation: Parameters of the adaptation.
     """
 
     mode: str = "sharpened"
@@ -169,7 +167,7 @@ class AssessmentParameters:
         self._expect(
             "hidden_sizes",
             bool(self.hidden_sizes) and all(size >= 1 for size in self.hidden_sizes),
-            "one width >= 1 a layer",
+            "one width >= 1 per layer",
         )
         self._expect(
             "margin_range",
@@ -195,10 +193,10 @@ class AssessmentParameters:
 
     @property
     def stride(self) -> int:
-        """Rows between the starts of two segments: one, or H in the paper's mode."""
+        """Rows between the starts of segments: one, or H in the paper's mode."""
         return 1 if self.is_sharpened else self.horizon
 
     @property
     def shortest(self) -> int:
-        """Steps that a safe episode's segment has at least."""
+        """Least number of steps of a safe episode's segment."""
         return (self.shortest_segment or self.horizon) if self.is_sharpened else self.horizon

@@ -1,4 +1,4 @@
-"""The low-dimensional embedding: its t-SNE target, and the map Psi that torch trains after it."""
+"""Training of the low-dimensional embedding: the t-SNE target and the map Psi."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def tsne(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> np.ndarray:
-    """The t-SNE embedding of a neighbour graph, (N, 2); the same seed gives the same bits.
+    """Computes the t-SNE embedding of a neighbour graph, (N, 2), deterministically for a seed.
 
-    The distances enter as they are: openTSNE squares them itself. It runs on one thread:
-    several gain nothing with the FFT of large sets, and on a busy machine they mostly wait.
+    Distances are not squared here: openTSNE squares them. It runs on one thread, as more threads
+    do not speed up the FFT of large sets.
 
     Raises:
-        ValueError: The graph has fewer than three times `perplexity` neighbours a segment.
+        ValueError: The graph has fewer than three times `perplexity` neighbours per segment.
     """
     num_neighbours = graph.indices.shape[1]
     if num_neighbours < int(3 * perplexity):
         raise ValueError(
-            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours a segment, "
+            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours per segment, "
             f"the graph has {num_neighbours}"
         )
     import openTSNE
@@ -70,19 +70,19 @@ def tsne(
 
 @dataclass(frozen=True, kw_only=True)
 class MapSettings:
-    """How a map Psi is built and trained.
+    """Hyperparameters of a map Psi.
 
     Attributes:
         hidden_sizes: Widths of the trunk's layers.
-        dropout: Share of trunk activations dropped while training.
+        dropout: Dropout rate of the trunk.
         epochs: Passes over the inputs.
-        batch_size: Inputs a step.
+        batch_size: Inputs per step.
         learning_rate: Peak of the one-cycle schedule.
         target_weight: Weight of the squared distance to t-SNE's point.
-        safety_weight: Weight of the safety head's cross entropy; 0 leaves the head out.
-        margin_weight: Weight of the margin head's Huber loss; 0 leaves the head out.
+        safety_weight: Weight of the safety head's cross entropy; 0 omits the head.
+        margin_weight: Weight of the margin head's Huber loss; 0 omits the head.
         margin_unit: Margin that counts as one in the Huber loss [unit of the margins].
-        margin_range: Margins are clipped to this range [unit of the margins].
+        margin_range: Range that margins are clipped to [unit of the margins].
     """
 
     hidden_sizes: tuple[int, ...]
@@ -99,16 +99,16 @@ class MapSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapData:
-    """What a map Psi learns from.
+    """Training data of a map Psi.
 
     Attributes:
         x: Inputs, (N, n_x).
-        has_target: Inputs that t-SNE saw, (N,).
-        target: Their points, in the order of x, (M, 2).
+        has_target: Whether the input has a point in t-SNE, (N,).
+        target: Points of these inputs, in the order of x, (M, 2).
         is_unsafe: Whether the input's episode ended unsafely, (N,).
         margins: Smallest future margins, (N, n_c).
         sample_weight: Weight of each input in all losses, (N,).
-        input_scale: Spread of each column of x as the map sees it, (n_x,).
+        input_scale: Spread of each column of x after standardisation, (n_x,).
     """
 
     x: np.ndarray
@@ -120,7 +120,7 @@ class MapData:
     input_scale: np.ndarray
 
     def take(self, rows: np.ndarray) -> MapData:
-        """Some of the inputs, chosen by a mask (N,)."""
+        """Selects inputs by a mask (N,)."""
         return MapData(
             x=self.x[rows],
             has_target=self.has_target[rows],
@@ -139,26 +139,26 @@ def train_map(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Trains one map Psi; the same seed on the same machine gives the same weights.
+    """Trains one map Psi, deterministically for a seed and a machine.
 
-    Departure: the paper trains Psi on ||y - Psi(x)|| alone and leaves safety out. With a safety
-    head on y and a margin head on the trunk, the map separates what t-SNE places together but ends
-    differently; held-out accuracy on the robots rises from weak to that of a direct classifier.
+    Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
+    head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
+    on the robots rises to that of a direct classifier.
 
     Args:
-        data: Inputs and targets; x is standardised here, with a floor under the spread so that a
-            column that hardly moves is not amplified.
-        settings: Shape of the network and of the training.
-        seed: Seeds the initial weights, the batches and the dropout.
+        data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
+            nearly constant columns are not amplified.
+        settings: Hyperparameters.
+        seed: Seed of the initial weights, the batches and the dropout.
         progress: Called with the fraction done.
 
     Returns:
-        The weights of one member, as `Embedding` names them, without the leading member axis.
+        The weights of one member, named as in `Embedding`, without the leading member axis.
     """
     import torch
 
     num_threads = torch.get_num_threads()
-    # Layers this small gain nothing from threads; one is also the quickest on the wall clock.
+    # One thread is fastest for layers of this size.
     torch.set_num_threads(1)
     try:
         return _train(torch, data, settings, seed, progress)
@@ -204,7 +204,7 @@ def _train(
             total_steps=settings.epochs * num_batches + 1,
         )
         functional = torch.nn.functional
-        # The targets' share of a batch varies by chance, so its mean over the whole set divides.
+        # The share of targets varies between batches, so the mean over the whole set normalises.
         mean_target_weight = float(target_weight.mean())
         for epoch in range(settings.epochs):
             for batch in torch.randperm(len(x)).split(settings.batch_size):
@@ -236,7 +236,7 @@ def _train(
 
 
 def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:
-    """One `Embedding` of the members that `train_map` returned."""
+    """Stacks members returned by `train_map` into one `Embedding`."""
     weights = {name: np.stack([member[name] for member in members]) for name in members[0]}
     return Embedding(weights, num_margins=num_margins)
 
