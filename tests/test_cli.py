@@ -256,7 +256,7 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
     assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
     printed = " ".join(capsys.readouterr().out.split())
-    assert "begin as the 120 'nominal' episodes of its calibration did" in printed
+    assert "start as the 120 'nominal' episodes of its calibration" in printed
     assert "choose another seed, such as 2000001" in printed
 
 
@@ -300,7 +300,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     [
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
-        (["--seed", "-3"], "seed 0 gives episodes that begin as the 60 'nominal'"),
+        (["--seed", "-3"], "seed 0 gives episodes that start as the 60 'nominal'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
