@@ -282,7 +282,7 @@ def test_a_file_with_two_models_is_refused(tmp_path):
         ("/nowhere/shelf.urdf", "obstacle '/nowhere/shelf.urdf': .* of an existing file"),
         ("package://drake_safety_models/scenes/shelf.urdf", "of an existing file"),
         ("package://drake_safety_models/scenes", "of an existing file"),
-        ("package://shelves/shelf.urdf", "no package 'shelves'; add its files by path"),
+        ("package://shelves/shelf.urdf", "no package 'shelves'; use a path instead"),
     ],
 )
 def test_a_model_that_is_not_there_is_refused_by_name(name, message):

@@ -106,9 +106,7 @@ def test_base_and_unactuated_joints_are_the_equalities_of_the_equations_of_motio
 def test_an_unknown_hand_is_answered_with_the_hands_there_are():
     with pytest.raises(ValueError, match=r"robot 'biped' has no reaching frame 'tail'.*'head'"):
         WholeBodyModel(robot_kinematics("biped"), "tail")
-    with pytest.raises(
-        ValueError, match=r"robot 'biped': the model has no hand, expected one of \['head'\]"
-    ):
+    with pytest.raises(ValueError, match=r"the model has no hand, expected one of \[.head.\]"):
         WholeBodyModel(robot_kinematics("biped")).reaching_position(np.zeros(19))
 
 
