@@ -109,15 +109,16 @@ class SafetyAssessment:
                 f"SafetyAssessment: horizon is {parameters.horizon}, but that of the episodes of "
                 f"'{info.scenario}' is {info.horizon}"
             )
-        training = segments_for(episodes, parameters)
-        segments = training.segments
+        segments, has_target = segments_for(episodes, parameters)
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
         x = self._inputs(
             segments.state if parameters.is_sharpened else segments.true_state,
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, base_logit = learned_maps(training, x, self.grid_, parameters, progress)
+        self.embedding_, base_logit = learned_maps(
+            segments, has_target, x, self.grid_, parameters, progress
+        )
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)

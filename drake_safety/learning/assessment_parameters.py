@@ -7,6 +7,12 @@ from drake_safety.learning.distance import BACKENDS
 MODES = ("paper", "sharpened")
 
 
+def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
+    if not holds:
+        who, value = type(parameters).__name__, getattr(parameters, name)
+        raise ValueError(f"{who}: {name} is {value}, expected {expected}")
+
+
 @dataclass(kw_only=True)
 class AdaptationParameters:
     """Parameters of the adaptation to feedback from the actual robot.
@@ -39,18 +45,12 @@ class AdaptationParameters:
 
     def __post_init__(self) -> None:
         for name in ("least_uncertainty", "first_uncertainty"):
-            self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
+            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in ("offset_std", "slope_std", "hidden_std"):
-            self._expect(name, getattr(self, name) > 0.0, "> 0")
+            _expect(self, name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
-            self._expect(name, getattr(self, name) >= 0.0, ">= 0")
-        self._expect("update_interval", self.update_interval >= 1, ">= 1")
-
-    def _expect(self, name: str, holds: bool, expected: str) -> None:
-        if not holds:
-            raise ValueError(
-                f"AdaptationParameters: {name} is {getattr(self, name)}, expected {expected}"
-            )
+            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
+        _expect(self, "update_interval", self.update_interval >= 1, ">= 1")
 
 
 @dataclass(kw_only=True)
@@ -135,11 +135,11 @@ class AssessmentParameters:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
             )
-        self._expect(
-            "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
+        _expect(
+            self, "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
         )
         for name in ("discount", "initial_uncertainty"):
-            self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
+            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in (
             "score_weight",
             "target_weight",
@@ -147,9 +147,9 @@ class AssessmentParameters:
             "margin_weight",
             "feature_unit",
         ):
-            self._expect(name, getattr(self, name) >= 0.0, ">= 0")
+            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
         for name in ("horizon", "min_count", "resolution", "batch_size", "epochs", "ensemble_size"):
-            self._expect(name, getattr(self, name) >= 1, ">= 1")
+            _expect(self, name, getattr(self, name) >= 1, ">= 1")
         for name in (
             "cell_length",
             "learning_rate",
@@ -157,29 +157,28 @@ class AssessmentParameters:
             "first_row_weight",
             "raw_input_scale",
         ):
-            self._expect(name, getattr(self, name) > 0.0, "> 0")
-        self._expect(
-            "shortest_segment", 0 <= self.shortest_segment <= self.horizon, "a value in 0..horizon"
+            _expect(self, name, getattr(self, name) > 0.0, "> 0")
+        _expect(
+            self,
+            "shortest_segment",
+            0 <= self.shortest_segment <= self.horizon,
+            "a value in 0..horizon",
         )
-        self._expect("perplexity", self.perplexity >= 1.0, ">= 1")
+        _expect(self, "perplexity", self.perplexity >= 1.0, ">= 1")
         for name in ("dropout", "held_out"):
-            self._expect(name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
-        self._expect(
+            _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
+        _expect(
+            self,
             "hidden_sizes",
             bool(self.hidden_sizes) and all(size >= 1 for size in self.hidden_sizes),
             "one width >= 1 per layer",
         )
-        self._expect(
+        _expect(
+            self,
             "margin_range",
             len(self.margin_range) == 2 and self.margin_range[0] < self.margin_range[1],
             "[lowest, highest]",
         )
-
-    def _expect(self, name: str, holds: bool, expected: str) -> None:
-        if not holds:
-            raise ValueError(
-                f"AssessmentParameters: {name} is {getattr(self, name)}, expected {expected}"
-            )
 
     @property
     def is_sharpened(self) -> bool:

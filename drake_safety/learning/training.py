@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
     MapData,
-    MapSettings,
     stack_members,
     train_map,
     tsne,
@@ -30,21 +29,13 @@ StageProgress = Callable[[str, float], None]
 """Called with a stage and the fraction done."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainingSegments:
-    """The segments of training episodes.
-
-    Attributes:
-        segments: The N segments.
-        has_target: Whether the segment is embedded by t-SNE, (N,).
-    """
-
-    segments: Segments
-    has_target: np.ndarray
-
-
-def segments_for(episodes: Episodes, parameters: AssessmentParameters) -> TrainingSegments:
+def segments_for(
+    episodes: Episodes, parameters: AssessmentParameters
+) -> tuple[Segments, np.ndarray]:
     """Splits training episodes into segments according to the mode.
+
+    Returns:
+        The segments, and whether each is embedded by t-SNE, (N,).
 
     Raises:
         ValueError: The episodes give too few segments for t-SNE.
@@ -73,11 +64,12 @@ def segments_for(episodes: Episodes, parameters: AssessmentParameters) -> Traini
         episodes.num_diverged,
         num_targeted,
     )
-    return TrainingSegments(segments=segments, has_target=has_target)
+    return segments, has_target
 
 
 def learned_maps(
-    training: TrainingSegments,
+    segments: Segments,
+    has_target: np.ndarray,
     x: np.ndarray,
     grid: Grid,
     parameters: AssessmentParameters,
@@ -86,7 +78,8 @@ def learned_maps(
     """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
-        training: The training segments.
+        segments: The training segments.
+        has_target: Whether each is embedded by t-SNE, (N,).
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
         parameters: The assessment's parameters.
@@ -99,8 +92,7 @@ def learned_maps(
     def stage(name: str) -> Callable[[float], None] | None:
         return None if progress is None else lambda fraction: progress(name, fraction)
 
-    segments = training.segments
-    targeted = segments.take(training.has_target)
+    targeted = segments.take(has_target)
     graph = neighbour_graph(
         targeted.error,
         targeted.length,
@@ -118,7 +110,7 @@ def learned_maps(
     )
     data = MapData(
         x=x,
-        has_target=training.has_target,
+        has_target=has_target,
         target=grid.scale(points),
         is_unsafe=segments.is_unsafe,
         margins=segments.future_margins,
@@ -188,19 +180,16 @@ def _train(
     parameters: AssessmentParameters,
     progress: Callable[[float], None] | None,
 ) -> Embedding:
-    is_sharpened = parameters.is_sharpened
-    settings = MapSettings(
-        hidden_sizes=tuple(parameters.hidden_sizes) if is_sharpened else (128, 128),
-        dropout=parameters.dropout if is_sharpened else 0.0,
-        epochs=parameters.epochs if is_sharpened else 40,
-        batch_size=parameters.batch_size,
-        learning_rate=parameters.learning_rate,
-        target_weight=parameters.target_weight if is_sharpened else 1.0,
-        safety_weight=parameters.safety_weight if is_sharpened else 0.0,
-        margin_weight=parameters.margin_weight if is_sharpened else 0.0,
-        margin_unit=parameters.margin_unit,
-        margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
-    )
+    if not parameters.is_sharpened:
+        parameters = replace(
+            parameters,
+            hidden_sizes=[128, 128],
+            dropout=0.0,
+            epochs=40,
+            target_weight=1.0,
+            safety_weight=0.0,
+            margin_weight=0.0,
+        )
     num_members = parameters.num_members
     members = []
     for member in range(num_members):
@@ -212,10 +201,10 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        members.append(train_map(data, settings, seed=seed, progress=report))
-    num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
+        members.append(train_map(data, parameters, seed=seed, progress=report))
+    num_margins = data.margins.shape[1] if parameters.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
-    return _fill_grid(embedding, data) if is_sharpened else embedding
+    return _fill_grid(embedding, data) if parameters.is_sharpened else embedding
 
 
 def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
