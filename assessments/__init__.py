@@ -1,7 +1,7 @@
-"""Trained assessments that come with the package, a folder a scenario, and their loader.
+"""Trained assessments shipped with the package, one folder per scenario, and their loader.
 
-A folder holds `MODE.safetensors`, and in `evaluation.json` what is known of them: the figures of an
-evaluation on fresh episodes, the files' hashes, and the verdicts on the first of these episodes.
+A folder contains `MODE.safetensors` and `evaluation.json`: results on fresh episodes, the files'
+hashes, and the verdicts on the first of these episodes.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ _FOLDER = Path(__file__).parent
 
 
 def assessed_scenarios() -> list[str]:
-    """Names of the scenarios whose trained assessments come with the package."""
+    """Returns the names of scenarios with shipped assessments."""
     return sorted({path.parent.name for path in _FOLDER.glob("*/*.safetensors")})
 
 
 def shipped_folder(scenario: str) -> Path:
-    """The folder with the trained assessments of a scenario.
+    """Returns the folder of a scenario's shipped assessments.
 
     Args:
         scenario: The scenario's name.
 
     Raises:
-        ValueError: None come with the package; says for which scenarios there are some.
+        ValueError: The scenario has none; the message lists those that do.
     """
     if scenario not in assessed_scenarios():
         raise ValueError(
@@ -40,14 +40,14 @@ def shipped_folder(scenario: str) -> Path:
 
 
 def load_assessment(scenario: str, mode: str = "sharpened") -> SafetyAssessment:
-    """Loads a trained assessment that comes with the package.
+    """Loads a shipped assessment.
 
     Args:
         scenario: The scenario's name.
         mode: "sharpened" or "paper".
 
     Raises:
-        ValueError: There is none of this scenario or mode; says which there are.
+        ValueError: The scenario or mode has none; the message lists those that exist.
     """
     from drake_safety.learning.assessment import SafetyAssessment
 

@@ -3,11 +3,18 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.control.robot_size import RobotSize, overlaid, scaled_defaults
 from drake_safety.control.safe_sets import BalanceLimits
 from drake_safety.plants.balls import Throw
+from drake_safety.robots.robot_size import (
+    BALANCING_REFERENCE,
+    RobotSize,
+    overlaid,
+    scaled_defaults,
+)
 from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 
@@ -39,8 +46,6 @@ class BalancingParameters:
     """The balls of ``drake-safety run --push ball``."""
 
 
-_DEFAULT_SIZE = RobotSize(height_m=0.4245, half_length_m=0.2194, half_width_m=0.1245, mass_kg=25.43)
-"""Of a robot that the parameters' defaults fit."""
 _QUANTITIES: dict[str, Any] = {
     "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
     "start": {
@@ -83,5 +88,12 @@ def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict
         stated: The task's part of the scenario file.
         kinematics: The robot.
     """
-    factors = RobotSize.of(kinematics).factors(_DEFAULT_SIZE)
+    half_length_m, half_width_m = np.abs(kinematics.nominal_contacts).max(axis=0).tolist()
+    size = RobotSize(
+        height_m=kinematics.standing_height,
+        half_length_m=half_length_m,
+        half_width_m=half_width_m,
+        mass_kg=kinematics.total_mass,
+    )
+    factors = size.factors(BALANCING_REFERENCE)
     return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)

@@ -20,7 +20,7 @@ from drake_safety.learning.segments import Episode
 from drake_safety.plants.obstacles import Clearance
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.robot import model_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop

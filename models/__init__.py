@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drake_safety.robots.robot import add_to_package_map, model_file
+from drake_safety.robots.model_files import add_to_package_map, model_file
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
 __all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]
@@ -11,31 +11,31 @@ _FOLDER = Path(__file__).parent
 
 
 def robot_names() -> list[str]:
-    """Names of the robots that come with the package."""
+    """Returns the names of the package's robots."""
     return sorted(path.parent.name for path in _FOLDER.glob("*/robot.yaml"))
 
 
 def load_robot(name: str) -> RobotModel:
-    """Loads a robot by name, or by the path of a ``robot.yaml`` of your own.
+    """Loads a robot by name, or by the path of a ``robot.yaml``.
 
     Raises:
-        ValueError: No such robot, or the file does not fit the schema.
+        ValueError: The robot does not exist, or the file does not fit the schema.
     """
     if name in robot_names():
         return load_robot_file(_FOLDER / name / "robot.yaml")
     if Path(name).suffix in (".yaml", ".yml"):
         return load_robot_file(name)
     raise ValueError(
-        f"robot '{name}' does not exist; robots are {robot_names()}, or give the path of a "
+        f"robot '{name}' does not exist; robots are {robot_names()}, or pass the path of a "
         "robot.yaml"
     )
 
 
 def robot_files(name: str) -> list[Path]:
-    """The files that decide what a robot is: its ``robot.yaml`` and its model file.
+    """Returns the files that define a robot: its ``robot.yaml`` and its model file.
 
     Args:
-        name: As :func:`load_robot` takes it.
+        name: See :func:`load_robot`.
 
     Raises:
         ValueError: As :func:`load_robot`.

@@ -285,14 +285,14 @@ def test_feedback_of_another_scenario_is_refused(sharpened, change, message):
     other = [dataclasses.replace(one, nominal_hash="elsewhere") for one in feedback]
     with pytest.raises(ValueError, match="nominal twin's scenario hash"):
         sharpened.adapt(other)
-    with pytest.raises(ValueError, match="there is none"):
+    with pytest.raises(ValueError, match="got none, expected at least one set"):
         sharpened.adapt([])
 
 
 def test_a_method_that_does_not_exist_or_does_not_fit_is_refused(sharpened, paper):
     with pytest.raises(ValueError, match="cannot adapt by 'luck'"):
         sharpened.adapt(worse(), method="luck")
-    with pytest.raises(ValueError, match="'recalibration' takes maps with heads"):
+    with pytest.raises(ValueError, match="'recalibration' needs maps with heads"):
         paper.adapt(worse(), method="recalibration")
 
 
@@ -310,7 +310,7 @@ def test_a_twin_is_missing_or_begins_elsewhere():
     shifted = [
         dataclasses.replace(e, true_state=e.true_state + 0.1 * (e.index == 1)) for e in episodes
     ]
-    with pytest.raises(ValueError, match="twin of episode 1 begins elsewhere"):
+    with pytest.raises(ValueError, match="twin of episode 1 starts in another state"):
         feedback_sets(episodes, Episodes(episodes.info, shifted))
 
 

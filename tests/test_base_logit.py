@@ -20,7 +20,7 @@ def parameters(**changed):
 
 @pytest.fixture(scope="module")
 def segments():
-    return segments_for(make_episodes(200), parameters()).segments
+    return segments_for(make_episodes(200), parameters())[0]
 
 
 def test_all_maps_leave_out_the_same_episodes_and_whole_ones(segments):
@@ -53,7 +53,7 @@ def test_the_logit_is_fitted_on_an_ensemble_that_knows_none_of_the_episodes(monk
 
     monkeypatch.setattr(training, "train_map", train_map)
     learned = SafetyAssessment(settings).fit(episodes)
-    segments = segments_for(episodes, settings).segments
+    segments = segments_for(episodes, settings)[0]
     held_out = held_out_segments(segments, settings)
     # Three maps are tried on what they have not learned; three others learn from all.
     assert sizes == [np.sum(~held_out)] * 3 + [len(segments)] * 3

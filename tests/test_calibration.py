@@ -137,7 +137,7 @@ def test_unsafe_samples_that_nobody_knows_stay_above_every_threshold():
         ([np.nan, np.nan], [True, False], {}, "none of the 2 scores is finite"),
         ([0.1], [True], {"confidence": 1.0}, "confidence is 1.0, expected a value in"),
         ([0.1], [1], {}, "labels must be boolean"),
-        ([0.1, 0.2], [True], {}, "must be as many"),
+        ([0.1, 0.2], [True], {}, "must be of equal length"),
     ],
 )
 def test_a_promise_that_cannot_be_kept_is_refused(score, is_unsafe, options, message):
@@ -187,7 +187,7 @@ def test_the_verdict_changes_at_the_thresholds_and_nan_is_not_known():
 
 def test_too_few_safe_episodes_are_refused_as_well():
     score = np.linspace(0, 1, 30)
-    with pytest.raises(ValueError, match="takes at least 19 safe episodes; of 30 episodes 5 are"):
+    with pytest.raises(ValueError, match="needs at least 19 safe episodes; of 30 episodes 5 are"):
         calibrate(score, score > 0.16, kind=PLAN, miss_rate=0.05)
 
 

@@ -243,7 +243,7 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     # The episodes are kept: another promise simulates nothing.
     monkeypatch.setattr(rollouts, "run_episode", None)
     assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.01) == 2
-    assert "takes at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
+    assert "needs at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
     assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
     monkeypatch.undo()
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
@@ -256,7 +256,7 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
     assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
     printed = " ".join(capsys.readouterr().out.split())
-    assert "begin as the 120 'nominal' episodes of its calibration did" in printed
+    assert "start as the 120 'nominal' episodes of its calibration" in printed
     assert "choose another seed, such as 2000001" in printed
 
 
@@ -300,7 +300,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     [
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
-        (["--seed", "-3"], "seed 0 would give episodes that begin as the 60 'nominal'"),
+        (["--seed", "-3"], "seed 0 gives episodes that start as the 60 'nominal'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(

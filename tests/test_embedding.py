@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
     MapData,
-    MapSettings,
     stack_members,
     train_map,
     tsne,
@@ -13,8 +13,8 @@ from drake_safety.learning.segments import split
 from drake_safety.learning.trained_maps import Embedding
 from lip_episodes import make_episodes
 
-SETTINGS = MapSettings(
-    hidden_sizes=(32, 32),
+SETTINGS = AssessmentParameters(
+    hidden_sizes=[32, 32],
     dropout=0.0,
     epochs=30,
     batch_size=64,
@@ -23,7 +23,7 @@ SETTINGS = MapSettings(
     safety_weight=1.0,
     margin_weight=1.0,
     margin_unit=0.02,
-    margin_range=(-0.03, 0.10),
+    margin_range=[-0.03, 0.10],
 )
 
 
@@ -127,7 +127,7 @@ def test_a_sample_weight_draws_the_map_towards_its_samples(data):
     x[contrary, 2] += 2.0
     shared = {"x": x, "has_target": data.has_target, "target": data.target, "is_unsafe": is_unsafe}
     shared["margins"] = data.margins
-    settings = MapSettings(**{**vars(SETTINGS), "epochs": 4})
+    settings = AssessmentParameters(**{**vars(SETTINGS), "epochs": 4})
     agreement = []
     for weight in (0.01, 20.0):
         sample_weight = np.where(contrary, weight, 1.0)
@@ -163,7 +163,7 @@ def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, em
 
 
 def test_a_plain_map_has_no_safety_head_and_no_margins(data):
-    settings = MapSettings(
+    settings = AssessmentParameters(
         **{**vars(SETTINGS), "safety_weight": 0.0, "margin_weight": 0.0, "epochs": 1}
     )
     embedding = stack_members([train_map(data, settings, seed=0)], num_margins=0)

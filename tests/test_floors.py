@@ -135,9 +135,6 @@ def upward_imports(source, name):
                 offences.append(f"{name}:{line} imports {dotted}: import it from its own room")
         elif target not in {None, room} | ALLOWED.get(room, set()):
             offences.append(f"{name}:{line} in {room} imports {dotted}")
-        elif room == "models" and target == "control":
-            if not dotted.startswith("drake_safety.robots.robot"):
-                offences.append(f"{name}:{line} in models imports {dotted}")
     return offences
 
 

@@ -104,11 +104,11 @@ SPOILT = {
     "a missing column": (lambda f: f.drop(columns=["base_y"]), [],
                          r"no columns \['base_y'\]; it has .*'base_x', 'base_z'"),
     "an empty cell": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7)), [],
-                      "line 9, column 'gyro_x': '' is no number"),
+                      "line 9, column 'gyro_x': '' is not a number"),
     "a NaN": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7, np.inf)), [],
               "line 9, column 'gyro_x': the value is inf"),
     "a word": (lambda f: f.assign(goal_x=["stop", *f.goal_x[1:]]), [],
-               "line 2, column 'goal_x': 'stop' is no number"),
+               "line 2, column 'goal_x': 'stop' is not a number"),
     "no unit quaternion": (lambda f: f.assign(quat_x=f.quat_x + (f.index == 4)), [],
                            "line 6, columns .*norm of 1.4"),
     "quaternion order": (
@@ -152,7 +152,7 @@ def test_messages_that_lack_something_say_what_there_is(few_rows, tmp_path):
         ("point.x", "point.q", "message 0 of topic '/goal': cannot read 'point.q': .*'x', 'y'"),
         ("position[{joint}]", "position[l_{joint}]", f"no entry is named 'l_{JOINTS[0]}'"),
         ("position[{joint}]", "position[99]{joint}", "cannot read"),
-        ("position[0]", "position[0", "is no field of a message"),
+        ("position[0]", "position[0", "is not a field path"),
         ("{topic: /goal, ", "{", "must name the topic of .*point.x"),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -170,7 +170,7 @@ def test_a_file_that_was_cut_off_is_refused(kind, few_rows, tmp_path):
 def test_a_line_that_was_cut_off_is_refused(few_rows, tmp_path):
     path = write(few_rows, JOINTS, "csv", tmp_path)
     path.write_text(path.read_text().rsplit(",", 30)[0])
-    with pytest.raises(ValueError, match=r"line 41, column .* is no number"):
+    with pytest.raises(ValueError, match=r"line 41, column .* is not a number"):
         read_log(path, map_of("csv", tmp_path), ROBOT)
 
 
@@ -211,7 +211,7 @@ def test_what_is_no_log_or_no_table_with_topics_is_refused(few_rows, tmp_path):
         ("base_position: {columns: [a, b, c], unit: cm}", r"one of \['m', 'mm'\]; got 'cm'"),
         ("base_orientation: {order: zyxw}", "'order' must be one of"),
         ("time: {column: t, unit: h}", "'time.unit' must be one of"),
-        ("joint_positions: {template: q_}", "template must hold"),
+        ("joint_positions: {template: q_}", "template must contain"),
         ("joints: {}", "unknown key 'joints'; keys there are"),
         ("max_gap_s: 1.0", "'base_position.columns' is missing"),
     ],

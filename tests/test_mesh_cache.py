@@ -104,7 +104,7 @@ def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path):
     with pytest.raises(ValueError, match=r"text\.dae' cannot be read"):
         shown_mesh(tmp_path / "text.dae")
     (tmp_path / "nothing.dae").write_text(NOTHING)
-    with pytest.raises(ValueError, match=r"nothing\.dae' is empty, or holds no surface"):
+    with pytest.raises(ValueError, match=r"nothing\.dae' is empty, or has no surface"):
         shown_mesh(tmp_path / "nothing.dae")
     assert list(cache.rglob("*.gltf")) == []
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.learning.gradients import logit_gradient
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from goal_field import BOX, FieldAssessment, GoalTask
@@ -30,21 +30,21 @@ def test_the_gradient_is_that_of_finite_differences():
     rng = np.random.default_rng(0)
     embedding = random_maps(rng)
     x = rng.normal(size=(4, 6))
-    logit, gradient = logit_gradient(embedding, x)
+    logit, gradient = embedding.logit_gradient(x)
     np.testing.assert_allclose(
         logit, embedding.evaluate(x).unsafe_logit.mean(axis=0), rtol=1e-4, atol=1e-4
     )
     for i in range(6):
         step = 1e-6 * np.eye(6)[i]
-        change = logit_gradient(embedding, x + step)[0] - logit_gradient(embedding, x - step)[0]
+        change = embedding.logit_gradient(x + step)[0] - embedding.logit_gradient(x - step)[0]
         np.testing.assert_allclose(gradient[:, i], change / 2e-6, rtol=1e-5, atol=1e-6)
 
 
 def test_maps_without_a_safety_head_have_no_gradient():
     embedding = random_maps(np.random.default_rng(0))
     weights = {k: v for k, v in embedding.weights.items() if not k.startswith("safety")}
-    with pytest.raises(ValueError, match="maps without a safety head"):
-        logit_gradient(Embedding(weights, num_margins=0), np.zeros((1, 6)))
+    with pytest.raises(ValueError, match="have no safety head"):
+        Embedding(weights, num_margins=0).logit_gradient(np.zeros((1, 6)))
 
 
 class PlaneAssessment(FieldAssessment):
@@ -70,6 +70,8 @@ class PlaneAssessment(FieldAssessment):
             },
             num_margins=0,
         )
+
+    unsafe_logits = SafetyAssessment.unsafe_logits
 
     def _inputs(self, *parts):
         return np.concatenate(parts, axis=1)

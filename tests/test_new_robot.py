@@ -9,6 +9,9 @@ import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import app
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.diagrams.balancing_parameters import fitted_to_robot
+from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
@@ -55,6 +58,20 @@ def test_numbers_scale_with_the_robot(spider):
     start = scenario["parameters"]["start"]["base_height_m"]
     assert low < start[0] < spider.sizes.height_m < start[1] < high
     assert spider.sizes.mass_kg == pytest.approx(6.0 + 6 * 0.7)
+
+
+def assert_alike(written, scaled, path=""):
+    for name, value in scaled.items():
+        if isinstance(value, dict):
+            assert_alike(written[name], value, f"{path}.{name}")
+        elif name != "min_lateral_m":  # By the nearest foot, not by the widest.
+            assert written[name] == pytest.approx(value, rel=0.02), f"{path}.{name}"
+
+
+def test_new_and_scale_to_robot_scale_alike(spider):
+    written = yaml.safe_load((spider.folder / "balancing.yaml").read_text())["parameters"]
+    kinematics = RobotKinematics(load_robot_file(spider.folder / "robot.yaml"))
+    assert_alike(written, fitted_to_robot({}, kinematics))
 
 
 def test_the_balls_of_a_demonstration_are_as_heavy_as_those_it_learns_from(spider):

@@ -173,7 +173,7 @@ def test_arms_that_nothing_can_touch_are_refused_where_there_is_something_to_tou
     bare = [p.split(end, 1)[1] if 'radius="0.01"' in p else start + p for p in pieces[1:]]
     urdf.write_text("".join([pieces[0], *bare]))
     robot = load_robot_file(path)
-    with pytest.raises(ValueError, match=r"robot 'porter': none of the bodies .* has collision"):
+    with pytest.raises(ValueError, match=r"robot 'porter': no body moved by .* has collision"):
         Clearance(robot, [obstacle], range_m=0.1)
     assert Clearance(robot, [], range_m=0.1).of_arms(postures(1)[0]) == 0.1
 
@@ -270,7 +270,7 @@ def test_a_file_with_two_models_is_refused(tmp_path):
     path = tmp_path / "pair.sdf"
     models = "".join(f'<model name="{n}"><link name="l"/></model>' for n in "ab")
     path.write_text(f'<sdf version="1.9"><world name="w">{models}</world></sdf>')
-    with pytest.raises(ValueError, match="one model is expected; the file has 2"):
+    with pytest.raises(ValueError, match="expected one model; the file has 2"):
         add_obstacles(MultibodyPlant(0.001), [Obstacle(model=str(path))])
 
 
@@ -279,10 +279,10 @@ def test_a_file_with_two_models_is_refused(tmp_path):
     [
         ("", "must be a package:// URL or the absolute path"),
         ("bookshelf.urdf", "must be a package:// URL or the absolute path"),
-        ("/nowhere/shelf.urdf", "obstacle '/nowhere/shelf.urdf': .* of a file that exists"),
-        ("package://drake_safety_models/scenes/shelf.urdf", "of a file that exists"),
-        ("package://drake_safety_models/scenes", "of a file that exists"),
-        ("package://shelves/shelf.urdf", "no package 'shelves'; add its files by path"),
+        ("/nowhere/shelf.urdf", "obstacle '/nowhere/shelf.urdf': .* of an existing file"),
+        ("package://drake_safety_models/scenes/shelf.urdf", "of an existing file"),
+        ("package://drake_safety_models/scenes", "of an existing file"),
+        ("package://shelves/shelf.urdf", "no package 'shelves'; use a path instead"),
     ],
 )
 def test_a_model_that_is_not_there_is_refused_by_name(name, message):

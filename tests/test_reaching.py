@@ -293,7 +293,7 @@ def test_a_robot_without_a_mirror_has_one_hand_to_reach_with(tmp_path):
     ("write", "message"),
     [
         (write_hexapod, "robot 'hexapod' has no reaching frames, so it cannot reach"),
-        (write_biped, "'biped': none of the bodies that the joints of its reaching frames"),
+        (write_biped, "'biped': no body moved by joints of its reaching frames"),
         (
             lambda folder: edited(write_porter(folder), feet={}, mirror={}),
             "robot 'porter' has no feet to stand on",

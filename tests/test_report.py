@@ -263,7 +263,7 @@ def test_damaged_files_and_a_stopped_training_are_named_and_the_rest_shown(copy)
     (copy / "episodes/info.json").write_text(json.dumps(info))
     page = Page(page_of(copy).read_text(encoding="utf-8"))
     assert "evaluation.json is not JSON" in page.words
-    assert "is no safety assessment, or is truncated" in page.words
+    assert "is not a safety assessment or truncated" in page.words
     assert "60 are here, 2048 were asked for" in page.words
     assert len(page.all("article", **{"data-mode": "paper"})) == 1
     assert not page.all("article", **{"data-mode": "sharpened"})

@@ -1,5 +1,7 @@
 """A robot is data: what its YAML says enters a plant, and names it lacks are refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -8,14 +10,14 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+import drake_safety.models
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import (
     Payload,
     PlantVariation,
     actuation_matrix,
     add_robot,
     apply_masses,
-    model_file,
-    models_package_xml,
     posture_positions,
     require_motors,
     servo_joints,
@@ -51,7 +53,7 @@ def test_legs_without_motors_are_refused_with_what_to_write(tmp_path):
     without = plant_of(robot := load_robot_file(edited(path, effort_limits={".*knee": 40.0})))
     message = (
         r"robot 'biped': joints \['left_hip_z', .*\] have no motor: 'biped.urdf' has no "
-        r"transmission .* effort_limits in robot.yaml is {'\.\*knee': 40.0}; write there the "
+        r"transmission .* effort_limits in robot.yaml is {'\.\*knee': 40.0}; add the "
         r"largest torque of each \[N·m\]"
     )
     with pytest.raises(ValueError, match=message) as refused:
@@ -309,7 +311,7 @@ def test_actuation_of_joints_that_are_not_given_is_refused():
 
 def test_a_file_of_the_package_is_found_by_its_url():
     path = model_file("package://drake_safety_models/scenes/bookshelf.urdf", "/elsewhere")
-    assert path == models_package_xml().parent / "scenes" / "bookshelf.urdf"
+    assert path == Path(drake_safety.models.__file__).parent / "scenes" / "bookshelf.urdf"
     assert path.is_file()
 
 

@@ -80,7 +80,7 @@ def test_a_fixed_joint_that_mimics_another_is_no_reason_to_refuse_a_robot(tmp_pa
 def test_a_file_is_named_when_it_is_no_urdf(tmp_path):
     robot = write(tmp_path)
     (tmp_path / "stool.urdf").write_text("<sdf/>")
-    with pytest.raises(ValueError, match="its outermost element is <sdf>"):
+    with pytest.raises(ValueError, match="its root element is <sdf>"):
         built(robot)
 
 

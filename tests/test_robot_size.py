@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from drake_safety.control.robot_size import RobotSize, overlaid, scaled_defaults
+from drake_safety.robots.robot_size import RobotSize, overlaid, scaled_defaults
 
 SMALL = RobotSize(height_m=0.4, half_length_m=0.2, half_width_m=0.1, mass_kg=20.0)
 

@@ -81,7 +81,7 @@ def test_feet_can_be_named_and_a_wrong_name_is_answered_with_those_that_exist(tm
     assert {leg.body for leg in legs} == {"tibia_0", "tibia_2", "tibia_4"}
     with pytest.raises(ValueError, match=r"no limb ends in link 'paw'; limbs end in \['tibia_0'"):
         survey.legs(["paw"])
-    with pytest.raises(ValueError, match="found 1 feet, of at least 2"):
+    with pytest.raises(ValueError, match="found 1 feet, expected at least 2"):
         survey.legs(["tibia_0"])
 
 
@@ -91,5 +91,5 @@ def test_a_robot_that_is_fastened_to_the_world_is_refused(tmp_path):
         '<robot name="arm"><link name="world"/><link name="a"/>'
         '<joint name="j" type="fixed"><parent link="world"/><child link="a"/></joint></robot>'
     )
-    with pytest.raises(ValueError, match="must have one body that nothing holds"):
+    with pytest.raises(ValueError, match="must have exactly one floating body"):
         Survey(path)

@@ -106,7 +106,7 @@ def test_base_and_unactuated_joints_are_the_equalities_of_the_equations_of_motio
 def test_an_unknown_hand_is_answered_with_the_hands_there_are():
     with pytest.raises(ValueError, match=r"robot 'biped' has no reaching frame 'tail'.*'head'"):
         WholeBodyModel(robot_kinematics("biped"), "tail")
-    with pytest.raises(ValueError, match=r"robot 'biped': no hand was chosen of \['head'\]"):
+    with pytest.raises(ValueError, match=r"the model has no hand, expected one of \[.head.\]"):
         WholeBodyModel(robot_kinematics("biped")).reaching_position(np.zeros(19))
 
 
@@ -116,7 +116,7 @@ def test_an_unknown_hand_is_answered_with_the_hands_there_are():
         ({"posture": np.zeros(3)}, "must have posture for .*left_knee.*got 3 entries"),
         ({"is_stance": np.ones(4)}, r"must have is_stance for \['left', 'right'\]; got 4 entries"),
         ({"orientations": []}, r"must have orientations for \['pelvis'\]; got 0 entries"),
-        ({"reaching": None}, "must say where the hand goes"),
+        ({"reaching": None}, "must have reaching for the hand; got none"),
         ({"posture": np.full(12, np.nan)}, "posture must be finite"),
         (
             {"center_of_mass": PointReference(position=np.array([0.0, np.inf, 0.0]))},

@@ -115,7 +115,7 @@ def cause_words(
         masses: b_unsafe split by constraint, (n_c,).
         margins: Predicted margins, (n_c,) [m, rad].
     """
-    from drake_safety.learning.causes import NO_CAUSE, likely_causes
+    from drake_safety.learning.prediction import NO_CAUSE, likely_causes
     from drake_safety.simulation.capabilities import angular_constraints
 
     (cause,) = likely_causes(masses[None], margins[None], assessment.parameters.margin_unit)

@@ -1,1 +1,1 @@
-"""Robot mathematics on arrays: kinematics, footholds and safe sets; no ports, no learning."""
+"""Robot mathematics on arrays: kinematics, whole-body control, footholds and safe sets."""

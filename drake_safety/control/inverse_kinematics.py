@@ -1,4 +1,4 @@
-"""From a base pose and foot positions to joint positions, for legs of any shape."""
+"""Inverse kinematics: from a base pose and foot positions to joint positions."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drake_safety.control.kinematics import (
     dposv,
 )
 
-_TOLERANCE_M = 1e-4  # Error of a contact point's coordinate at which the search ends.
-_DAMPING = 1e-8  # [m²/rad²]: keeps a stretched leg's step finite.
-_MAX_STEP_RAD = 0.5  # in one iteration.
-# What a Newton step leaves is of second order: with a leg of 1 m, some 1e-5 m after this step.
+_TOLERANCE_M = 1e-4  # Tolerance of a contact point's coordinates.
+_DAMPING = 1e-8  # [m²/rad²]: limits the step of a stretched leg.
+_MAX_STEP_RAD = 0.5  # Per iteration.
+# The error after a Newton step is of second order: about 1e-5 m for a leg of 1 m.
 _LAST_STEP_RAD = 0.004
 
 
@@ -27,18 +27,18 @@ def solve_inverse_kinematics(
     *,
     max_iterations: int = 20,
 ) -> np.ndarray:
-    """Joint positions that put every contact point where it is wanted, base pose given.
+    """Solves for joint positions with desired contact points at a given base pose.
 
-    Damped Gauss-Newton, started from ``guess``: from the last tick's
-    answer one step suffices. A target out of reach ends at the nearest reachable point. Joints
-    that belong to no leg keep the guess, and every joint stays inside its limits.
+    Damped Gauss-Newton from ``guess``; one step suffices from the previous tick's solution. An
+    unreachable target ends at the nearest reachable point. Joints outside the legs keep the guess,
+    and every joint stays inside its limits.
 
     Args:
         kinematics: The robot.
         X_WB: Base pose.
-        p_WC: Wanted positions of the contact spheres' centres, (n_c, 3) [m].
-        guess: Joint positions to start from, (n_j,) [rad].
-        max_iterations: Bound on the Newton steps.
+        p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
+        guess: Initial joint positions, (n_j,) [rad].
+        max_iterations: Largest number of Newton steps.
 
     Returns:
         Joint positions (n_j,) [rad].
@@ -54,17 +54,17 @@ def solve_from(
     *,
     max_iterations: int = 20,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`solve_inverse_kinematics` for a controller's tick, which goes on to use a Jacobian.
+    """As :func:`solve_inverse_kinematics`, and returns the contact Jacobian too.
 
     Args:
         kinematics: The robot.
-        q: Base pose and joint positions to start from, (n_q,); the joints are overwritten.
-        p_WC: Wanted positions of the contact spheres' centres, (n_c, 3) [m].
-        max_iterations: Bound on the Newton steps.
+        q: Base pose and initial joint positions, (n_q,); the joints are overwritten.
+        p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
+        max_iterations: Largest number of Newton steps.
 
     Returns:
-        Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last point of
-        the search that was looked at, at most one small step away.
+        Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last iterate, at
+        most one small step away.
     """
     lowest, highest = kinematics.position_limits.T
     joints = np.minimum(np.maximum(q[NUM_BASE_POSITIONS:], lowest), highest)
@@ -75,13 +75,13 @@ def solve_from(
         error = (p_WC - reached).ravel()
         if max(error.max(), -error.min()) < _TOLERANCE_M:
             break
-        # Columns of joints that move no foot are zero: the damping leaves those joints alone.
+        # Joints that move no foot have zero columns, so the damping gives them zero steps.
         J_joints = J[:, NUM_BASE_VELOCITIES:]
         step = _damped_step(J_joints, error)
         wanted = joints + step
         moved = np.minimum(np.maximum(wanted, lowest), highest)
         if (moved != wanted).any():
-            # Joints pushed against a limit give no help: the others must do without them.
+            # Solves again without the joints at their limits.
             J_joints = J_joints.copy()
             J_joints[:, (moved == joints) & (step != 0)] = 0.0
             step = _damped_step(J_joints, error)

@@ -1,4 +1,4 @@
-"""Where the whole body will be when the hand follows a plan: the controller without dynamics."""
+"""Kinematic preview of the whole body while the hand follows a plan."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from drake_safety.control.kinematics import (
 from drake_safety.control.whole_body_model import Hand, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
 
-_FOOT_WEIGHT = 1e4  # Against task weights of at most some hundreds: feet move by micrometres.
+_FOOT_WEIGHT = 1e4  # Task weights are at most some hundreds, so feet move by micrometres.
 _MAX_ITERATIONS = 4
-_LAST_ITERATIONS = (3, 6)  # At least, at most.
-_NEAR_M = 0.005  # Of the plan: near enough for the sample.
+_LAST_ITERATIONS = (3, 6)  # Least and most iterations at the last sample.
+_NEAR_M = 0.005  # Tolerance of the hand's position.
 
 
 class KinematicPreview:
-    """Positions of the whole body along a plan of its hand, feet where they are.
+    """Positions of the whole body along a plan of its hand, with fixed feet.
 
-    The whole-body controller asks every task for K_p e - K_d ė. Where the gains of all tasks
-    agree and no torque or friction limit is met, the robot moves along the minimisers of
+    The whole-body controller commands K_p e - K_d ė for every task. With equal gains of all tasks
+    and no active torque or friction limit, the robot follows the minimisers of
 
-        Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²,  feet still,
+        Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²  with fixed feet.
 
-    which are found here by Gauss-Newton steps: one a sample, more where the hand is still off the
-    plan, and a few at the last one.
+    These are computed by Gauss-Newton steps: one per sample, more while the hand is off the plan,
+    and a few at the last sample.
 
     Args:
         model: Tasks and weights of the controller, with a hand.
@@ -50,7 +50,7 @@ class KinematicPreview:
         """Follows a path of the hand.
 
         Args:
-            q: Positions to start from (n_q,).
+            q: Initial positions (n_q,).
             path: Positions of the hand in the world, (M, 3) [m].
 
         Returns:
@@ -77,7 +77,7 @@ class KinematicPreview:
                     reference.posture - q[NUM_BASE_POSITIONS:]
                 )
                 _, step, _ = dposv(H, g)
-                # Positions are still those of q: the map of the step into them is exact.
+                # The Context still has the positions q.
                 q += kinematics.plant.MapVelocityToQDot(kinematics.context, step)
                 q[:4] /= np.linalg.norm(q[:4])
             positions[sample] = q
@@ -89,7 +89,7 @@ class KinematicPreview:
 
 
 def chain_joints(kinematics: RobotKinematics, hand: Hand) -> list[int]:
-    """Joints between base and hand, as indices into the robot's joints, (n_chain,)."""
+    """Returns the joints between base and hand, as indices into the robot's joints, (n_chain,)."""
     plant = kinematics.plant
     instance = plant.GetModelInstanceByName(kinematics.robot.name)
     return [

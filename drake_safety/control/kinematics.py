@@ -20,10 +20,10 @@ from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
 try:
     from scipy.linalg.lapack import dposv
-except ImportError:  # On a robot's computer scipy need not be installed: see docs/online.md.
+except ImportError:  # Online environments do not need scipy: see docs/online.md.
 
     def dposv(a: np.ndarray, b: np.ndarray) -> tuple[None, np.ndarray, int]:
-        """Solves a positive definite system as LAPACK's routine does, a few microseconds slower."""
+        """Replaces LAPACK's routine, a few microseconds slower."""
         return None, np.linalg.solve(a, b), 0
 
 
@@ -32,19 +32,19 @@ NUM_BASE_VELOCITIES = 6
 
 
 class RobotKinematics:
-    """A robot without ground or scene, for the mathematics of controllers and observers.
+    """Kinematics of a robot without ground or scene.
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
-    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context; every method sets
-    what it needs first, so no call depends on an earlier one.
+    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context, which every method
+    overwrites.
 
     Args:
         robot: The robot.
-        variation: Mass that the controller believes in.
+        variation: Plant variation of the controller's model; only masses are used.
 
     Raises:
-        ValueError: The robot has no feet, its base is not the only floating body, or a foot names
-            an unknown body or joint.
+        ValueError: The robot has no feet, its base is not the only floating body, or a foot's body
+            or joint does not exist.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -102,36 +102,36 @@ class RobotKinematics:
         p_WC = self.contact_positions(q)
         lowest = np.min(p_WC[:, 2] - self.foot_radii)
         self.standing_height = -float(lowest)
-        """Height of the base over the ground in the standing posture [m]."""
+        """Height of the base in the standing posture [m]."""
         centroid = p_WC.mean(axis=0)
         self.nominal_contacts = p_WC[:, :2] - centroid[:2]
-        """Contact points of the standing posture about their centroid, (n_c, 2) [m]."""
+        """Contact points of the standing posture relative to their centroid, (n_c, 2) [m]."""
         self.nominal_base_offset = -centroid[:2]
-        """Base over the contact points' centroid in the standing posture, (2,) [m]."""
+        """Base relative to the contact points' centroid in the standing posture, (2,) [m]."""
 
     def positions_at(self, X_WB: RigidTransform, joints: np.ndarray) -> np.ndarray:
-        """Position vector (n_q,) of a base pose and joint positions (n_j,) [rad]."""
+        """Returns positions (n_q,) from a base pose and joint positions (n_j,) [rad]."""
         quaternion = X_WB.rotation().ToQuaternion().wxyz()
         return np.concatenate([quaternion, X_WB.translation(), joints])
 
     def standing_positions(self) -> np.ndarray:
-        """Position vector (n_q,) of the standing posture, upright at the world's origin."""
+        """Returns positions (n_q,) of the standing posture, upright at the world's origin."""
         return self.positions_at(RigidTransform([0.0, 0.0, self.standing_height]), self.posture)
 
     def set_positions(self, q: np.ndarray) -> None:
-        """Sets the scratch Context, for what this class does not offer.
+        """Sets the positions of the scratch Context.
 
         Raises:
             ValueError: The positions (n_q,) are not finite.
         """
-        # A position that is not finite would end the process inside the plant.
+        # Drake's plant aborts the process for positions that are not finite.
         if not q.dot(q) < math.inf:
             raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
         self.plant.SetPositions(self.context, q)
 
     def contact_positions(self, q: np.ndarray) -> np.ndarray:
-        """World positions of the contact spheres' centres, (n_c, 3) [m], read-only."""
-        # Margins, observed state and features of one instant ask for the same positions.
+        """Returns the contact spheres' centres in the world, (n_c, 3) [m], read-only."""
+        # Margins, state and features of one instant need the same positions.
         key = q.tobytes()
         if key == self._last_contacts[0]:
             return self._last_contacts[1]
@@ -142,12 +142,12 @@ class RobotKinematics:
         return p_WC
 
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
-        """Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
+        """Returns the Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
         self.set_positions(q)
         return self._jacobian()
 
     def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """:meth:`contact_positions` and :meth:`contact_jacobian` for the price of one pose."""
+        """Returns :meth:`contact_positions` and :meth:`contact_jacobian` together."""
         self.set_positions(q)
         return self._contacts(), self._jacobian()
 
@@ -169,21 +169,21 @@ class RobotKinematics:
         )
 
     def stance_pose(self, q: np.ndarray) -> np.ndarray:
-        """``[x, y, yaw]`` of the stance frame S of the feet in the world, (3,)."""
+        """Returns ``[x, y, yaw]`` of the stance frame S of the feet in the world, (3,)."""
         return fit_stance(self.contact_positions(q), self.nominal_contacts)
 
     def gravity_torques(
         self, q: np.ndarray, is_stance: np.ndarray, J: np.ndarray | None = None
     ) -> np.ndarray:
-        """Joint torques that hold the robot still on its stance points.
+        """Computes joint torques for static equilibrium on the stance points.
 
-        The ground forces are the least-squares split of the weight: minimise the sum of squared
-        point forces subject to the six floating-base rows ``0 = g_b + J_bᵀ f``.
+        The ground forces minimise the sum of squared point forces subject to the six floating-base
+        rows ``0 = g_b + J_bᵀ f``.
 
         Args:
             q: Positions (n_q,).
-            is_stance: Per contact point, whether it carries weight, (n_c,).
-            J: The contact Jacobian at ``q``, if it is at hand.
+            is_stance: Whether each contact point carries weight, (n_c,).
+            J: The contact Jacobian at ``q``, if known.
 
         Returns:
             Torques (n_j,) [N·m].
@@ -198,51 +198,50 @@ class RobotKinematics:
                 return -g[NUM_BASE_VELOCITIES:]
             J = J[np.repeat(is_stance, 3)]
         A = J[:, :NUM_BASE_VELOCITIES].T
-        # Two stance points leave one base direction without force: the small diagonal lets the
-        # others be balanced in the least-squares sense.
+        # With two stance points the Gram matrix is singular; the diagonal regularises it.
         gram = A @ A.T
         gram.flat[:: NUM_BASE_VELOCITIES + 1] += 1e-4
-        # LAPACK itself: for six unknowns numpy's checks cost more than the solution.
+        # For six unknowns numpy's checks cost more than the solution.
         _, weights, _ = dposv(gram, -g[:NUM_BASE_VELOCITIES])
         forces = A.T @ weights
         return -g[NUM_BASE_VELOCITIES:] - J[:, NUM_BASE_VELOCITIES:].T @ forces
 
     def reaching_position(self, q: np.ndarray, frame: ReachingFrame) -> np.ndarray:
-        """World position of the point that reaches, (3,) [m]."""
+        """Returns the reaching point in the world, (3,) [m]."""
         self.set_positions(q)
         body = self.plant.GetBodyByName(frame.body)
         return body.EvalPoseInWorld(self.context) @ np.array(frame.point)
 
     def center_of_mass(self, q: np.ndarray) -> np.ndarray:
-        """Centre of mass in the world, (3,) [m]."""
+        """Returns the centre of mass in the world, (3,) [m]."""
         self.set_positions(q)
         return self.plant.CalcCenterOfMassPositionInWorld(self.context)
 
 
 def planar_pose(stance_pose: np.ndarray) -> RigidTransform:
-    """The transform X_WS of a stance pose ``[x, y, yaw]`` on the ground."""
+    """Returns X_WS of a stance pose ``[x, y, yaw]`` on the ground."""
     x, y, yaw = stance_pose
     return RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0])
 
 
 def yaw_of(R_WB: RotationMatrix) -> float:
-    """Yaw of a rotation, roll-pitch-yaw convention [rad]."""
+    """Returns the yaw of a rotation in the roll-pitch-yaw convention [rad]."""
     return float(RollPitchYaw(R_WB).yaw_angle())
 
 
 def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
-    """The planar pose that best carries the nominal contact points onto the given ones.
+    """Fits the planar pose that maps the nominal contact points to the given ones.
 
     Least squares in closed form (planar Procrustes).
 
     Args:
         p_WC: Contact points in the world, (n_c, 3) [m].
-        nominal_contacts: The standing posture's points about their centroid, (n_c, 2) [m].
+        nominal_contacts: The standing posture's points relative to their centroid, (n_c, 2) [m].
 
     Returns:
         ``[x, y, yaw]`` of the stance frame S in the world (3,).
     """
-    # Plain floats: for a handful of points they are several times faster than arrays.
+    # Floats are several times faster than arrays for a few points.
     points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()
     n = len(points)
     x = sum(px for px, _ in points) / n

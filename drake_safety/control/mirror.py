@@ -1,4 +1,4 @@
-"""Mirror: a robot's state seen in a mirror that stands along its stance, left for right."""
+"""Mirror: the reflection of a robot's state through the sagittal plane of its stance."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from drake_safety.control.kinematics import (
     RobotKinematics,
 )
 
-_POLAR = np.array([1.0, -1.0, 1.0])  # What the mirror does to a position or a velocity,
-_AXIAL = -_POLAR  # and to an angular velocity, a torque or a rotation vector.
-_SAME_AXIS = 1e-3  # Directions agree to this many radians, axes to this many metres.
+_POLAR = np.array([1.0, -1.0, 1.0])  # Reflection of positions and velocities.
+_AXIAL = -_POLAR  # Reflection of angular velocities, torques and rotation vectors.
+_SAME_AXIS = 1e-3  # Tolerance of axes' directions [rad] and positions [m].
 
 
 class Mirror:
     """The reflection of a symmetric robot through the x-z plane of its stance.
 
-    Each joint goes over to its partner of robot.yaml's ``mirror``; its sign follows from the
-    joints' axes with all joints at zero, where a pseudovector along an axis turns about as
-    (-x, y, -z). The base lies in its own x-z plane. Reflecting twice changes nothing.
+    Each joint is exchanged with its partner in robot.yaml's ``mirror``. Its sign follows from the
+    joints' axes with all joints at zero, as pseudovectors are reflected to (-x, y, -z). The base's
+    x-z plane is its plane of symmetry. Reflecting twice is the identity.
 
     Args:
         kinematics: The robot.
 
     Raises:
-        ValueError: ``mirror`` pairs joints that are not each other's reflection, or a joint
-            neither turns nor slides along an axis.
+        ValueError: ``mirror`` pairs joints that are not reflections of each other, or a joint is
+            neither revolute nor prismatic.
     """
 
     def __init__(self, kinematics: RobotKinematics):
@@ -63,8 +63,8 @@ class Mirror:
                 axes.append((X_WJ.rotation() @ joint.translation_axis(), X_WJ.translation(), False))
             else:
                 raise ValueError(
-                    f"robot '{kinematics.robot.name}': joint '{name}' neither turns nor slides "
-                    f"along an axis; it is {joint.type_name()}"
+                    f"robot '{kinematics.robot.name}': joint '{name}' must be revolute or "
+                    f"prismatic; it is {joint.type_name()}"
                 )
         signs = np.zeros(kinematics.num_joints)
         for i, (axis, point, turns) in enumerate(axes):
@@ -111,7 +111,7 @@ class Mirror:
         Args:
             q: Positions (n_q,).
             v: Velocities (n_v,).
-            stance_pose: ``[x, y, yaw]`` of the stance; by default that of the feet of ``q``.
+            stance_pose: ``[x, y, yaw]`` of the stance; that of ``q`` by default.
 
         Returns:
             Mirrored positions (n_q,) and velocities (n_v,).
@@ -124,7 +124,7 @@ class Mirror:
         across = (R_WS.matrix() * _POLAR) @ R_WS.matrix().T  # Reflection in the world.
         origin = np.array([x, y, 0.0])
         half = 0.5 * yaw
-        # With S at an angle, the base's orientation there turns back, is reflected, and turns on.
+        # The base's orientation is reflected in the stance frame.
         turn = Quaternion([np.cos(half), 0.0, 0.0, np.sin(half)])
         w, a, b, c = turn.inverse().multiply(Quaternion(q[:4] / np.linalg.norm(q[:4]))).wxyz()
         quaternion = turn.multiply(Quaternion([w, -a, b, -c])).wxyz()
@@ -145,10 +145,10 @@ class Mirror:
         return mirrored_q, mirrored_v
 
     def hand(self, name: str) -> str:
-        """The reaching frame on the other side.
+        """Returns the name of the mirrored reaching frame.
 
         Raises:
-            ValueError: There is no such hand, or none has the partners of its joints.
+            ValueError: The hand does not exist, or no reaching frame has its joints' partners.
         """
         robot, names = self._kinematics.robot, self._kinematics.joint_names
         partners = robot.mirror_partners(names)

@@ -1,4 +1,4 @@
-"""What the assessor sees of a robot: its state in the stance frame, free of world position."""
+"""The assessor's state of a robot, in the stance frame and independent of world position."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from drake_safety.robots.robot import ObservationNoise
 
 
 def quaternion_of(q: np.ndarray) -> Quaternion:
-    """The base's orientation in a position vector, normalised."""
+    """Returns the normalised quaternion of the base in a position vector."""
     return Quaternion(q[:4] / math.sqrt(q[:4] @ q[:4]))
 
 
 def rotation_vector(R: RotationMatrix) -> np.ndarray:
-    """Rotation vector (3,) of a rotation, angle in [0, π] [rad]: one hemisphere only."""
+    """Returns the rotation vector (3,) with an angle in [0, π] [rad]."""
     angle_axis = R.ToAngleAxis()
     angle, axis = angle_axis.angle(), angle_axis.axis()
     if angle > math.pi:
@@ -27,7 +27,7 @@ def rotation_vector(R: RotationMatrix) -> np.ndarray:
 
 
 def state_names(kinematics: RobotKinematics) -> list[str]:
-    """Names of the entries of :func:`stance_state`."""
+    """Returns the names of the entries of :func:`stance_state`."""
     names = [f"base_{axis}" for axis in "xyz"] + [f"rotation_{axis}" for axis in "xyz"]
     names += [f"angular_velocity_{axis}" for axis in "xyz"]
     names += [f"velocity_{axis}" for axis in "xyz"]
@@ -36,17 +36,17 @@ def state_names(kinematics: RobotKinematics) -> list[str]:
 
 
 def is_rate(name: str) -> bool:
-    """Whether an entry of :func:`stance_state` is a velocity, by its name."""
+    """Whether the name of an entry of :func:`stance_state` is that of a velocity."""
     return name.endswith("_rate") or "velocity" in name
 
 
 def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The state s_k: base pose and velocity in the stance frame S, joints and their rates.
+    """Returns the state s_k: base pose and velocity in the stance frame S, joints and their rates.
 
-    S lies on the ground at the centroid of the contact points, turned as the planar fit of the
-    standing posture's points to the measured ones, so that s_k is the same wherever the robot
-    stands. Departure: the paper's s_k holds configurations only; without velocities the recall
-    of unsafe states collapses, since a pushed robot is told from a still one by nothing else.
+    S lies on the ground at the centroid of the contact points, with the yaw of the planar fit of
+    the standing posture's points to the measured ones, so that s_k does not depend on where the
+    robot stands. Departure: the paper's s_k has configurations only; without velocities a pushed
+    robot cannot be distinguished from one at rest, and the recall of unsafe states collapses.
 
     Args:
         kinematics: The robot.
@@ -54,8 +54,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
         v: Velocities (n_v,).
 
     Returns:
-        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; NaN throughout
-        when a position or velocity is not finite.
+        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; all NaN if a
+        position or velocity is not finite.
     """
     if not q.dot(q) + v.dot(v) < math.inf:
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
@@ -78,12 +78,12 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
 def add_noise(
     q: np.ndarray, v: np.ndarray, unit_noise: np.ndarray, noise: ObservationNoise
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A measured state: orientation noise is a small rotation, the rest is added.
+    """Adds measurement noise to a state; noise of the orientation is a small rotation.
 
     Args:
         q: Positions (n_q,).
         v: Velocities (n_v,).
-        unit_noise: Standard normal draws (2 n_v,): for positions, then for velocities.
+        unit_noise: Standard normal samples (2 n_v,) for positions and velocities.
         noise: Standard deviations.
 
     Returns:

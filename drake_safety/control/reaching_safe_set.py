@@ -1,4 +1,4 @@
-"""The safe set of a robot that reaches: standing, clear of obstacles, off its joint stops."""
+"""The safe set of a reaching robot: standing, clear of obstacles, off its joint stops."""
 
 import math
 from dataclasses import dataclass
@@ -24,23 +24,23 @@ from drake_safety.control.safe_sets import (
 from drake_safety.control.whole_body_model import WholeBodyModel
 from drake_safety.plants.obstacles import Clearance
 
-_NUM_PREVIEWED = 8  # Samples of the plan for which the whole body is previewed.
+_NUM_PREVIEWED = 8  # Samples of the plan in the whole-body preview.
 _GRAVITY = 9.81
-_SOON_S = 0.1  # How far ahead a velocity is trusted to go on.
+_SOON_S = 0.1  # Horizon of the extrapolation at constant velocity.
 
 
 @dataclass(kw_only=True)
 class ReachingLimits:
-    """The numbers of :class:`ReachingSafeSet`."""
+    """Limits of :class:`ReachingSafeSet`."""
 
     joint_margin_rad: float = 0.03
-    """A joint nearer than this to a stop has left the safe set [rad]."""
+    """Least safe distance of a joint from a stop [rad]."""
     support_clearance_m: float = 0.03
-    """A contact point carries the support polygon while it is lower than this [m]."""
+    """Height below which a contact point is part of the support polygon [m]."""
     fall_height_share: float = 0.7
-    """Below this share of the base's standing height the robot has fallen."""
+    """Share of the base's standing height below which the robot has fallen."""
     fall_tilt_rad: float = 0.6
-    """Beyond this angle between the base's z axis and the vertical it has fallen [rad]."""
+    """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
         for name in ("joint_margin_rad", "support_clearance_m"):
@@ -59,7 +59,7 @@ class ReachingLimits:
 
 
 class ReachingSafeSet:
-    """A robot reaches: base over its feet, arms clear of obstacles, joints off their stops.
+    """Safe set of a reaching robot: base over its feet, arms clear, joints off their stops.
 
     The constraints, in the order of :attr:`names`:
 
@@ -69,17 +69,16 @@ class ReachingSafeSet:
       [m];
     - ``joint_limits``: distance of the joint nearest to a stop, at most half a turn, less
       ``joint_margin_rad`` [rad];
-    - ``fall``: the smaller of the height over the lowest one and of the height that a rigid
-      pendulum of the standing height has left before ``fall_tilt_rad`` [m].
+    - ``fall``: the smaller of the height over the lowest height and the height that a rigid
+      pendulum of the standing height loses before ``fall_tilt_rad`` [m].
 
-    Features are told from the side of the reaching hand: with ``is_mirrored``, left is right. A
-    hand's features are then those of the other hand in the mirror image of the scene.
+    With ``is_mirrored``, the features of a hand are those of the other hand in the mirrored scene.
 
     Args:
         model: Tasks and weights of the controller, with the reaching hand.
-        clearance: The obstacles.
-        limits: The numbers.
-        is_mirrored: Whether features are those of the mirror image.
+        clearance: Distances to the obstacles.
+        limits: The limits.
+        is_mirrored: Whether features are mirrored.
 
     Raises:
         ValueError: The model has no hand, or the hand no joints.
@@ -94,7 +93,7 @@ class ReachingSafeSet:
             "support_margin": "now_support_polygon",
         }
     )
-    """What one would set an alarm on by hand, by what it measures."""
+    """Features for baseline monitors, by name of the monitor."""
 
     def __init__(
         self,
@@ -153,15 +152,12 @@ class ReachingSafeSet:
         """Distance of every joint to its nearer stop, less the margin, (n_j,) [rad]."""
         lowest, highest = self.kinematics.position_limits.T
         joints = q[NUM_BASE_POSITIONS:]
-        # A joint that turns without stops has a margin too, a finite one.
+        # Finite for joints without stops.
         distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
         return distance - self.limits.joint_margin_rad
 
     def _velocities(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities of centre of mass and hand in the world, (3,) each [m/s].
-
-        The positions must have been set.
-        """
+        """Velocities of centre of mass and hand at the Context's positions, (3,) each [m/s]."""
         plant, context = self.kinematics.plant, self.kinematics.context
         plant.SetVelocities(context, v)
         V_WB = self._hand.body.EvalSpatialVelocityInWorld(context)
@@ -170,7 +166,7 @@ class ReachingSafeSet:
         return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Signed margins (4,) of a state; minus infinity never occurs.
+        """Returns the signed margins (4,) of a state, always finite.
 
         Args:
             q: Positions (n_q,).
@@ -187,7 +183,7 @@ class ReachingSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins now, along the plan, and along a preview of the whole body.
+        """Returns the margins now, along the plan, and along a preview of the whole body.
 
         Args:
             q: Positions (n_q,), measured.
@@ -196,8 +192,8 @@ class ReachingSafeSet:
                 (M, 3) [m].
 
         Returns:
-            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; NaN throughout when
-            an argument is not finite.
+            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; all NaN if an argument
+            is not finite.
         """
         if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
             return np.full(len(self.feature_names), np.nan)

@@ -10,34 +10,34 @@ _GRAVITY = 9.81
 
 @dataclass(kw_only=True)
 class RecoveryStepParameters:
-    """The numbers of a recovery step."""
+    """Parameters of a recovery step."""
 
     step_duration_s: float = 0.09
-    """Duration of a swing; the other feet carry the robot meanwhile [s]."""
+    """Duration of a swing [s]."""
     lift_m: float = 0.06
-    """Height of the swing curve's top [m]."""
+    """Height of the swing trajectory [m]."""
     velocity_gain_s: float = 0.07
-    """Raibert's gain: how much further than the neutral point per speed [s]."""
+    """Raibert's gain: distance beyond the neutral point per speed [s]."""
     max_reach_m: float = 0.18
-    """A foothold is at most this far from its hip's ground projection [m]."""
+    """Largest distance of a foothold from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
-    """A foothold is at least this far from the base's midline, on its own side [m]."""
+    """Smallest distance of a foothold from the base's midline, on its own side [m]."""
     max_twist_rad: float = 0.3
-    """Stance legs are told a base yaw that is at most this far from the measured one [rad]."""
+    """Largest difference of the desired base yaw of stance legs from the measured yaw [rad]."""
     yaw_damping_s: float = 0.1
-    """How far it lies on the other side of the heading to be held, per yaw rate [s]."""
+    """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: int = 2
-    """Swings before the robot may stop."""
+    """Least number of swings."""
     max_steps: int = 20
-    """Swings after which it stops in any case."""
+    """Largest number of swings."""
     settle_heading_rad: float = 0.35
-    """Angle between the base's yaw and the heading under which it may stop [rad]."""
+    """Largest angle between the base's yaw and the heading for stopping [rad]."""
     settle_margin_m: float = 0.08
-    """Distance of the capture point inside the support polygon at which it may stop [m]."""
+    """Least distance of the capture point inside the support polygon for stopping [m]."""
     resume_margin_m: float = 0.02
-    """Distance under which it steps again, after it has stopped [m]."""
+    """Distance of the capture point below which a stopped robot steps again [m]."""
     return_duration_s: float = 0.5
-    """Time in which the base returns over its feet before balancing goes on [s]."""
+    """Duration of the base's return over its feet before balancing resumes [s]."""
 
     def __post_init__(self) -> None:
         for name in ("step_duration_s", "lift_m", "max_reach_m", "return_duration_s"):
@@ -58,12 +58,12 @@ class RecoveryStepParameters:
 
 
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
-    """Which feet swing together: every second foot around the body.
+    """Returns the groups of feet that swing together: every second foot around the body.
 
-    Two feet step one after the other, four in diagonal pairs, six in tripods.
+    Two feet step alternately, four in diagonal pairs, six in tripods.
 
     Args:
-        foot_positions: Feet about their centroid in the standing posture, (n_feet, 2) [m].
+        foot_positions: Feet in the standing posture relative to their centroid, (n_feet, 2) [m].
 
     Returns:
         Two groups of foot indices.
@@ -73,32 +73,32 @@ def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
 
 
 def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
-    """Where a linear inverted pendulum comes to rest: p + v √(z/g), (2,) [m]."""
+    """Returns the capture point of a linear inverted pendulum, p + v √(z/g), (2,) [m]."""
     return p_WB[:2] + v_WB[:2] * math.sqrt(max(float(p_WB[2]), 0.05) / _GRAVITY)
 
 
 def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.ndarray:
-    """Where a linear inverted pendulum is whose centre of pressure stays at its capture point.
+    """Position of a linear inverted pendulum with its centre of pressure at the capture point.
 
     Args:
-        p_WB: Where it began, at the height that it keeps, (3,) [m].
-        v_WB: Its horizontal velocity then, (3,) [m/s].
+        p_WB: Initial position, at the constant height, (3,) [m].
+        v_WB: Initial horizontal velocity, (3,) [m/s].
         elapsed_s: Time since then [s].
 
     Returns:
-        Its position, (3,) [m].
+        The position, (3,) [m].
     """
     time_constant_s = math.sqrt(p_WB[2] / _GRAVITY)
     return p_WB - v_WB * time_constant_s * math.expm1(-elapsed_s / time_constant_s)
 
 
 def minimum_jerk(s: float) -> float:
-    """Progress of the minimum-jerk law, from 0 to 1 as ``s`` goes from 0 to 1."""
+    """Returns the minimum-jerk profile, from 0 to 1 for ``s`` from 0 to 1."""
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
-    """Distance of a point to the segment between the first and last of some feet [m]."""
+    """Returns the distance of a point to the segment between the first and the last foot [m]."""
     a, b = feet[0], feet[-1]
     edge = b - a
     length_squared = edge @ edge
@@ -107,10 +107,10 @@ def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
 
 
 def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) -> int:
-    """The group to swing first: the others' stance line is then nearest the capture point.
+    """Returns the group to swing first, with the other's stance line nearest the capture point.
 
     Args:
-        groups: As :func:`gait_groups`.
+        groups: See :func:`gait_groups`.
         feet: Foot positions on the ground, (n_feet, 2) [m].
         point: The capture point, (2,) [m].
     """
@@ -126,19 +126,19 @@ def foothold(
     remaining_s: float,
     parameters: RecoveryStepParameters,
 ) -> np.ndarray:
-    """Where a swinging foot should land, on the ground (2,) [m].
+    """Returns the foothold of a swinging foot, on the ground (2,) [m].
 
-    Raibert's neutral point: the hip at touchdown plus half the distance travelled in the next
-    stance, ``p + v (t_rem + T/2)``, plus ``k v``. It stays within reach of where the hip is
-    at touchdown, and on its own side of the base, so that legs cannot cross.
+    Raibert's neutral point is the hip at touchdown plus half the distance travelled in the next
+    stance, ``p + v (t_rem + T/2)``; the foothold adds ``k v``. It is within reach of the hip at
+    touchdown, and on its own side of the base, so that legs do not cross.
 
     Args:
         p_WB: Base position (3,) [m].
         v_WB: Base velocity (3,) [m/s].
-        yaw: Of the heading frame [rad].
-        hip_offset: The foot's place in the standing posture, in the heading frame, (2,).
+        yaw: Yaw of the heading frame [rad].
+        hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
-        parameters: Numbers of the step.
+        parameters: Parameters of the step.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     R_WS = np.array([[c, -s], [s, c]])
@@ -157,16 +157,16 @@ def foothold(
 def swing_position(
     start: np.ndarray, target: np.ndarray, phase: float, lift_m: float
 ) -> np.ndarray:
-    """A point of the swing curve (3,) [m].
+    """Returns a point of the swing trajectory (3,) [m].
 
-    Horizontally it moves from start to target by the minimum-jerk law; vertically it rises by
-    ``lift_m`` at mid-swing and comes down to the target with zero speed.
+    Horizontally it follows a minimum-jerk profile from start to target; vertically it rises by
+    ``lift_m`` at mid-swing and reaches the target with zero speed.
 
     Args:
-        start: Where the foot left the ground (3,) [m].
-        target: Where it lands (3,) [m].
-        phase: Share of the swing's time, clipped to [0, 1].
-        lift_m: Height of the curve's top over the line from start to target [m].
+        start: Lift-off position (3,) [m].
+        target: Touchdown position (3,) [m].
+        phase: Phase of the swing, clipped to [0, 1].
+        lift_m: Largest height over the line from start to target [m].
     """
     s = min(max(phase, 0.0), 1.0)
     point = start + minimum_jerk(s) * (target - start)

@@ -13,18 +13,18 @@ _GRAVITY = 9.81
 _NUM_DIRECTIONS = 8
 _ANGLES = 2 * np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Unit vectors all around, (2, 8)."""
+"""Unit vectors in eight directions, (2, 8)."""
 DIRECTION_NAMES = [f"{round(math.degrees(angle))}deg" for angle in _ANGLES]
 
 
 def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
-    """Corners of the convex hull, counter-clockwise (Andrew's monotone chain).
+    """Computes the convex hull, counter-clockwise (Andrew's monotone chain).
 
     Args:
-        points: (n, 2) [m]. A dozen contact points is the usual size.
+        points: (n, 2) [m].
 
     Returns:
-        The corners; one or two of them when the points coincide or are collinear.
+        The corners; one or two if the points coincide or are collinear.
     """
     ordered = sorted(map(tuple, points.tolist()))
 
@@ -47,15 +47,12 @@ def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
 def signed_distance_to_polygon(
     point: Sequence[float] | np.ndarray, corners: list[tuple[float, float]]
 ) -> float:
-    """Signed distance of a point to a convex polygon's boundary, positive inside.
+    """Returns the signed distance of a point to a convex polygon's boundary, positive inside [m].
 
     Args:
         point: (2,) [m].
-        corners: Counter-clockwise corners. With two the polygon is a segment and with one a
-            point: the distance is then never positive. With none it is minus infinity.
-
-    Returns:
-        The distance [m].
+        corners: Counter-clockwise corners. For a segment or a point (two or one corners) the
+            distance is never positive, without corners it is minus infinity.
     """
     if not corners:
         return -math.inf
@@ -78,14 +75,14 @@ def signed_distance_to_polygon(
 
 
 def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: float) -> float:
-    """Signed distance of the base's ground projection to the edge of the feet's polygon [m].
+    """Returns the signed distance of the base's ground projection to the support polygon [m].
 
-    In the air it is negative: the distance to the middle of the feet.
+    In the air it is the negative distance to the centroid of the feet.
 
     Args:
         kinematics: The robot.
         q: Positions (n_q,).
-        clearance_m: A contact point on the ground is lower than this.
+        clearance_m: Height below which a contact point is on the ground [m].
     """
     p_WC = kinematics.contact_positions(q)
     is_support = p_WC[:, 2] - kinematics.foot_radii < clearance_m
@@ -98,15 +95,17 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
 def fall_margin(
     kinematics: RobotKinematics, q: np.ndarray, lowest_height_m: float, cos_fall_tilt: float
 ) -> float:
-    """Height over the lowest, or what a rigid pendulum has left before it tilts too far [m].
+    """Returns the smaller of the margins of height and tilt before a fall [m].
+
+    The margin of tilt is the height that a rigid pendulum loses before the largest tilt.
 
     Args:
         kinematics: The robot, whose standing height is the pendulum's length.
         q: Positions (n_q,).
-        lowest_height_m: Of the base.
+        lowest_height_m: Lowest height of the base.
         cos_fall_tilt: Cosine of the largest angle between the base's z axis and the vertical.
     """
-    # Plain floats: each operation on a short array costs more than all of them here.
+    # Floats are faster than short arrays.
     w, x, y, z, _, _, height = q[:7].tolist()
     cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
     return min(height - lowest_height_m, kinematics.standing_height * (cos_tilt - cos_fall_tilt))
@@ -114,16 +113,16 @@ def fall_margin(
 
 @dataclass(kw_only=True)
 class BalanceLimits:
-    """The numbers of :class:`BalanceSafeSet`."""
+    """Limits of :class:`BalanceSafeSet`."""
 
     support_clearance_m: float = 0.03
-    """A foot carries the support polygon while it is lower than this over the ground [m]."""
+    """Height below which a contact point is part of the support polygon [m]."""
     height_m: list[float] = field(default_factory=lambda: [0.3, 0.5])
     """Lowest and highest safe height of the base [m]."""
     fall_height_m: float = 0.2
-    """Below this height of the base the robot has fallen [m]."""
+    """Height of the base below which the robot has fallen [m]."""
     fall_tilt_rad: float = 0.8
-    """Beyond this angle between the base's z axis and the vertical it has fallen [rad]."""
+    """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
         if len(self.height_m) != 2 or not self.height_m[0] < self.height_m[1]:
@@ -139,19 +138,19 @@ class BalanceLimits:
 
 
 class BalanceSafeSet:
-    """A legged robot balances: base over its feet, at a safe height, not fallen.
+    """Safe set of a balancing robot: base over its feet, at a safe height, not fallen.
 
     The constraints, in the order of :attr:`names`:
 
     - ``support_polygon``: signed distance of the base's ground projection to the boundary of
       the polygon of the feet on the ground [m];
-    - ``height``: distance to the nearer end of the height band [m];
-    - ``fall``: the smaller of the height over ``fall_height_m`` and of the height that a rigid
-      pendulum of the standing height has left before ``fall_tilt_rad`` [m].
+    - ``height``: distance to the nearer limit of the height [m];
+    - ``fall``: the smaller of the height over ``fall_height_m`` and the height that a rigid
+      pendulum of the standing height loses before ``fall_tilt_rad`` [m].
 
     Args:
         kinematics: The robot.
-        limits: The numbers.
+        limits: The limits.
     """
 
     names = ("support_polygon", "height", "fall")
@@ -162,7 +161,7 @@ class BalanceSafeSet:
             "support_margin": "base_support_distance",
         }
     )
-    """What one would set an alarm on by hand, by what it measures."""
+    """Features for baseline monitors, by name of the monitor."""
 
     def __init__(self, kinematics: RobotKinematics, limits: BalanceLimits):
         self.kinematics = kinematics
@@ -178,7 +177,7 @@ class BalanceSafeSet:
         self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Signed margins (3,) [m] of a state; minus infinity never occurs.
+        """Returns the signed margins (3,) [m] of a state, always finite.
 
         Args:
             q: Positions (n_q,).
@@ -196,11 +195,11 @@ class BalanceSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins seen in eight directions, now, at the capture point and at the goal.
+        """Returns the margins in eight directions, now, at the capture point and at the goal.
 
-        Directional margins are the polygon's support function seen from a point: positive while
-        the polygon reaches past the point in that direction. Their number does not depend on
-        the number of feet.
+        Directional margins are the support function of the polygon relative to a point: positive if
+        the polygon extends beyond the point in that direction. Their number does not depend on the
+        number of feet.
 
         Args:
             q: Positions (n_q,), measured.
@@ -209,8 +208,8 @@ class BalanceSafeSet:
                 [m].
 
         Returns:
-            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; NaN throughout when
-            an argument is not finite.
+            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; all NaN if an argument
+            is not finite.
         """
         if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
             return np.full(len(self.feature_names), np.nan)

@@ -1,4 +1,4 @@
-"""What the whole-body programs of one robot have in common: its tasks, feet and limits."""
+"""Tasks, feet and limits of a robot's whole-body programs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.robots.robot_model import ReachingFrame
 
 EQUALITY = 5
-"""daqp's word, in ``sense``, for a row whose bounds are equal."""
+"""daqp's value in ``sense`` for rows with equal bounds."""
 
-_COINCIDENT_M = 1e-6  # Contact points nearer than this to a line, or to each other, lie on it.
+_COINCIDENT_M = 1e-6  # Tolerance of collinear and coincident contact points.
 
 
 _REST = np.zeros(3)
@@ -24,7 +24,7 @@ _REST.flags.writeable = False
 
 @dataclass(kw_only=True)
 class PointReference:
-    """Where a point goes, in the world frame."""
+    """Reference of a point in the world frame."""
 
     position: np.ndarray
     """(3,) [m]."""
@@ -36,7 +36,7 @@ class PointReference:
 
 @dataclass(kw_only=True)
 class WholeBodyReference:
-    """What the tasks follow."""
+    """References of all tasks."""
 
     center_of_mass: PointReference
     orientations: list[RotationMatrix]
@@ -46,11 +46,11 @@ class WholeBodyReference:
     is_stance: np.ndarray
     """Whether each foot stands, (n_feet,)."""
     reaching: PointReference | None = None
-    """Where the hand goes; a model with a hand needs it, one without never reads it."""
+    """Reference of the hand; required by models with a hand."""
 
 
 class Hand:
-    """The point that reaches, the sphere around it, and the joints of its arm."""
+    """A reaching point, its collision sphere and the joints of its arm."""
 
     def __init__(self, name: str, body: RigidBody, reaching_frame: ReachingFrame):
         self.name = name
@@ -62,11 +62,11 @@ class Hand:
 
 
 class StandingFoot:
-    """A foot's contact points, and the motions of the foot that standing still forbids.
+    """A foot's contact points and its contact constraint.
 
-    Rows for every point of a rigid foot would be redundant, and contradict each other as soon as
-    it turns: the motion of the points' centre and the turns that move any of them are enough,
-    six rows for a sole, five for an edge, three for a point.
+    Rows for every point of a rigid foot would be redundant, and inconsistent while it rotates. The
+    constraint has the velocity of the points' centre and the rotations that move any point: six
+    rows for a sole, five for an edge, three for a point.
     """
 
     def __init__(self, body: RigidBody, points: np.ndarray):
@@ -79,18 +79,18 @@ class StandingFoot:
         dimensions = int(np.sum(spread > _COINCIDENT_M))
         self.num_rows = {0: 3, 1: 5}.get(dimensions, 6)
         self.edge_turns: np.ndarray | None = directions[1:] if dimensions == 1 else None
-        """In the body's frame, (2, 3): the axes across an edge."""
+        """Axes across an edge in the body's frame, (2, 3)."""
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of one robot's program; which hand reaches is chosen here.
+    """Frames, gains and limits of a robot's whole-body program.
 
     Args:
-        kinematics: The robot as the controller believes it to be.
-        hand: Name of the reaching frame; None leaves the reaching task out.
+        kinematics: The controller's model of the robot.
+        hand: Name of the reaching frame; None omits the reaching task.
 
     Raises:
-        ValueError: The robot has no such hand.
+        ValueError: The hand does not exist.
     """
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
@@ -101,7 +101,7 @@ class WholeBodyModel:
         self.num_velocities = kinematics.num_velocities
         self.mass = kinematics.total_mass
         self.weight_W = self.mass * plant.gravity_field().gravity_vector()
-        # Of forces divided by this the cost is the plain square.
+        # The cost of forces divided by this is their squared norm.
         self.force_scale = self.mass / math.sqrt(parameters.force_regularization)
         self.hand: Hand | None = None
         if hand is not None:
@@ -116,7 +116,7 @@ class WholeBodyModel:
         tasks = [parameters.center_of_mass, *parameters.orientation.values()]
         if hand is not None:
             tasks.append(parameters.reaching)
-        # Three rows a task: the centre of mass, the bodies in their order, the hand.
+        # Three rows per task: the centre of mass, the bodies in order, the hand.
         self.num_task_rows = 3 * len(tasks)
         gains = np.array([[task.weight, task.stiffness, task.damping] for task in tasks])
         weights, self.stiffness, self.damping = np.repeat(gains, 3, axis=0).T.copy()
@@ -124,7 +124,7 @@ class WholeBodyModel:
         diagonal = np.full(self.num_velocities, parameters.regularization)
         diagonal[NUM_BASE_VELOCITIES:] += parameters.posture.weight
         self.H = np.diag(diagonal)
-        """What the regularisation and the posture add to the cost's matrix, (n_v, n_v)."""
+        """Part of the cost's matrix from regularisation and posture, (n_v, n_v)."""
         self.base_turns = np.eye(3, self.num_velocities)
         self.torque_limits = self._torque_limits()
         self._stances: dict[bytes, Stance] = {}
@@ -140,17 +140,17 @@ class WholeBodyModel:
         return limits
 
     def stance(self, is_stance: np.ndarray) -> Stance:
-        """What all programs with these feet standing have in common."""
+        """Returns the constant part of programs with these stance feet."""
         key = np.asarray(is_stance, dtype=bool).tobytes()
         if key not in self._stances:
             self._stances[key] = Stance(self, is_stance)
         return self._stances[key]
 
     def reference(self, q: np.ndarray, *, posture: np.ndarray | None = None) -> WholeBodyReference:
-        """To stand where the feet of ``q`` are: upright, the centre of mass over the stance.
+        """Returns the reference for standing on the feet of ``q``.
 
-        The centre of mass keeps the height it has at ``q``, the bodies take the orientations of
-        the standing posture turned to where the feet point, and a hand stays where it is.
+        The centre of mass is over the stance at its height in ``q``, the bodies have the
+        orientations of the standing posture with the yaw of the stance, and the hand is at rest.
 
         Args:
             q: Positions (n_q,).
@@ -176,10 +176,10 @@ class WholeBodyModel:
         return reference
 
     def check_reference(self, reference: WholeBodyReference) -> None:
-        """Refuses a reference that is not one of this robot.
+        """Checks a reference.
 
         Raises:
-            ValueError: A part is missing, not finite, or of another size than the robot.
+            ValueError: A part is missing, not finite, or of a wrong size.
         """
         who = f"robot '{self.kinematics.robot.name}': the whole-body reference"
         for name, entries in (
@@ -191,7 +191,7 @@ class WholeBodyModel:
             if size != len(entries):
                 raise ValueError(f"{who} must have {name} for {entries}; got {size} entries")
         if self.hand is not None and reference.reaching is None:
-            raise ValueError(f"{who} must say where the hand goes; got no reaching")
+            raise ValueError(f"{who} must have reaching for the hand; got none")
         for point in (reference.center_of_mass, reference.reaching or reference.center_of_mass):
             values = np.concatenate([point.position, point.rate, point.acceleration])
             if values.shape != (9,) or not np.isfinite(values).all():
@@ -200,15 +200,15 @@ class WholeBodyModel:
             raise ValueError(f"{who}'s posture must be finite; got {reference.posture}")
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
-        """World position of the reaching point, (3,) [m].
+        """Returns the reaching point in the world, (3,) [m].
 
         Raises:
-            ValueError: No hand was chosen.
+            ValueError: The model has no hand.
         """
         kinematics = self.kinematics
         if self.hand is None:
             raise ValueError(
-                f"robot '{kinematics.robot.name}': no hand was chosen of "
+                f"robot '{kinematics.robot.name}': the model has no hand, expected one of "
                 f"{list(kinematics.robot.reaching_frames)}"
             )
         kinematics.set_positions(q)
@@ -216,10 +216,10 @@ class WholeBodyModel:
 
 
 class Stance:
-    """Sizes and constant entries of the programs with the same feet standing.
+    """Sizes and constant entries of programs with the same stance feet.
 
-    The rows are the equations of motion (n_v), the feet's stillness, then the friction pyramids;
-    the columns v̇ (n_v), then the forces of the standing feet's points (3 each).
+    The rows are the equations of motion (n_v), the contact constraints and the friction pyramids;
+    the columns v̇ (n_v) and the forces of the stance feet's points (3 each).
     """
 
     def __init__(self, model: WholeBodyModel, is_stance: np.ndarray):
@@ -231,12 +231,12 @@ class Stance:
         num_columns = n_v + 3 * num_points
         num_rows = n_v + num_still + 4 * num_points
 
-        # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z; together they say f_z ≥ 0.
+        # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z imply f_z ≥ 0.
         mu = parameters.friction
         pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
         self.A = np.zeros((num_rows, num_columns))
         self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
-        # Without torques of its own the base is a joint whose limit is zero.
+        # The unactuated base has torque limits of zero.
         limits = np.concatenate([np.zeros(NUM_BASE_VELOCITIES), model.torque_limits])
         self.lower, self.upper = np.full(num_rows, -math.inf), np.zeros(num_rows)
         self.lower[:n_v], self.upper[:n_v] = -limits, limits

@@ -1,4 +1,4 @@
-"""Whole-body control as one quadratic program: accelerations and contact forces, not torques."""
+"""Whole-body control as a quadratic program in accelerations and contact forces."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from drake_safety.control.whole_body_model import (
 )
 
 SOLVED = 0
-"""Status of a solution that is one; daqp's own exit flags, all negative, stand for the others."""
+"""Status of a solved program; other values are daqp's negative exit flags."""
 
-_BOUNDLESS = 1e12  # Nothing of a robot has a squared norm of this size.
+_BOUNDLESS = 1e12  # Squared norms from this size on count as not finite.
 _TINY = 1e-300
 _ORIGIN = np.zeros(3)
 _FIRST, _LAST = slice(0, 3), slice(-3, None)
 
 
 class NotFiniteError(ValueError):
-    """A state or set point that no program can be built for."""
+    """A state or set point is not finite."""
 
 
 @dataclass(kw_only=True)
 class WholeBodyQP:
     """Minimise ½ v̇ᵀHv̇ + gᵀv̇ + ½|y|² subject to lower ≤ A [v̇; y] ≤ upper, with forces f = s y.
 
-    The first n_v rows are the equations of motion, whose value is the generalised force less
-    its bias: zero for the floating base, a torque within its limits for a joint.
+    The first n_v rows are the equations of motion, whose value is the generalised force less its
+    bias: zero for the floating base, a joint torque within its limits otherwise.
     """
 
     H: np.ndarray
@@ -46,37 +46,37 @@ class WholeBodyQP:
     """(n_v,)."""
     A: np.ndarray
     num_vdot_rows: int
-    """The rows of A that v̇ has a part in come first: this many."""
+    """Number of the first rows of A, in which v̇ has nonzero entries."""
     lower: np.ndarray
     upper: np.ndarray
     sense: np.ndarray
-    """``EQUALITY`` for the rows of A whose bounds are equal, else 0."""
+    """``EQUALITY`` for rows of A with equal bounds, else 0."""
     bias: np.ndarray
     """Coriolis and gravity terms h of the equations of motion M v̇ + h = S τ + Jᵀf, (n_v,)."""
     force_scale: float
     """s [N]."""
 
     def torques(self, x: np.ndarray) -> np.ndarray:
-        """Joint torques (n_j,) [N·m] at x = [v̇; y]."""
+        """Returns the joint torques (n_j,) [N·m] at x = [v̇; y]."""
         joints = slice(NUM_BASE_VELOCITIES, len(self.bias))
         return self.A[joints] @ x + self.bias[joints]
 
 
 @dataclass(kw_only=True)
 class WholeBodySolution:
-    """A solution of the program; meaningless unless its status is ``SOLVED``."""
+    """A solution of the program, valid if its status is ``SOLVED``."""
 
     vdot: np.ndarray
     """(n_v,)."""
     forces: np.ndarray
-    """Of the standing feet's contact points, in the world, (n_points, 3) [N]."""
+    """Forces at the stance feet's contact points in the world, (n_points, 3) [N]."""
     torques: np.ndarray
     """(n_j,) [N·m]."""
     status: int
 
 
 class _TaskRows:
-    """Rows of the stacked tasks: wanted acceleration J v̇ + J̇v, three to a task."""
+    """Rows of the stacked tasks, three per task, with accelerations J v̇ + J̇v."""
 
     def __init__(self, num_rows: int, num_velocities: int):
         self.J = np.empty((num_rows, num_velocities))
@@ -92,26 +92,26 @@ class _TaskRows:
 def build_qp(
     model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
 ) -> WholeBodyQP:
-    """The quadratic program of one instant.
+    """Builds the quadratic program at one instant.
 
     Args:
-        model: Whose program.
+        model: The model.
         q: Positions (n_q,).
         v: Velocities (n_v,).
-        reference: What the tasks follow.
+        reference: References of the tasks.
 
     Raises:
-        NotFiniteError: A state or a point that is not finite, or as large as no robot's.
+        NotFiniteError: A state or a point is not finite or implausibly large.
     """
     _check_size(model, "the state", q.dot(q) + v.dot(v))
-    # Without an orientation the plant would end the process, as with a state that is not finite.
+    # Drake's plant aborts the process for a zero quaternion, as for a state that is not finite.
     _check_size(model, "the inverse of the quaternion", 1.0 / max(q[:4].dot(q[:4]), _TINY))
     plant, context = model.kinematics.plant, model.kinematics.context
     plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
     M = plant.CalcMassMatrix(context)
     C = plant.CalcBiasTerm(context)
-    # The base's translational rows of M v̇ + C are the rate of the linear momentum: divided by
-    # the mass they are the centre of mass's Jacobian and bias, and gravity acts along them.
+    # The base's translational rows of M v̇ + C are the rate of linear momentum; divided by the
+    # mass they are the Jacobian and bias of the centre of mass.
     J_com = M[3:NUM_BASE_VELOCITIES] / model.mass
     bias = C - model.weight_W @ J_com
 
@@ -119,7 +119,7 @@ def build_qp(
     tasks = _TaskRows(model.num_task_rows, n_v)
     tasks.J[:3] = J_com
     tasks.Jdot_v[:3] = C[3:NUM_BASE_VELOCITIES] / model.mass
-    # The base's columns of J_com hold -[p]x of the centre of mass seen from the base.
+    # The base's columns of J_com contain -[p]x of the centre of mass relative to the base.
     p_com = q[4:7] + (J_com[1, 2], J_com[2, 0], J_com[0, 1])
     tasks.follow(_FIRST, reference.center_of_mass, p_com)
     _set_orientations(model, reference, tasks)
@@ -171,7 +171,7 @@ def _add_contacts(
     lower: np.ndarray,
     upper: np.ndarray,
 ) -> None:
-    """The forces' part of the equations of motion, and the rows that keep the feet still."""
+    """Sets the forces' columns in the equations of motion, and the contact constraints."""
     plant, context = model.kinematics.plant, model.kinematics.context
     world, n_v, kv = model.kinematics.world_frame, model.num_velocities, JacobianWrtVariable.kV
     Jdot_v = np.empty(stance.still_rows.stop - n_v)
@@ -196,7 +196,7 @@ def _add_contacts(
         A[row:stop, :n_v] = J_foot[-foot.num_rows :]
         Jdot_v[row - n_v : stop - n_v] = foot_bias[-foot.num_rows :]
         row = stop
-    # A foot's velocity decays: J v̇ = -J̇v - K_d J v.
+    # J v̇ = -J̇v - K_d J v lets a foot's velocity decay.
     rows = stance.still_rows
     lower[rows] = upper[rows] = -Jdot_v - model.parameters.contact_damping * (A[rows, :n_v] @ v)
 
@@ -204,12 +204,12 @@ def _add_contacts(
 def task_errors(
     model: WholeBodyModel, q: np.ndarray, reference: WholeBodyReference
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks, at rest.
+    """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest.
 
     Args:
-        model: Whose tasks; its scratch Context has the positions ``q`` afterwards.
+        model: The model; its scratch Context has the positions ``q`` afterwards.
         q: Positions (n_q,).
-        reference: What the tasks follow.
+        reference: References of the tasks.
     """
     kinematics = model.kinematics
     kinematics.set_positions(q)
@@ -272,14 +272,11 @@ def _set_hand(
 
 
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
-    """Solves the program exactly, by daqp's dual active-set method.
-
-    It always starts cold: the same program has the same solution to the last bit.
-    """
+    """Solves the program by daqp's dual active-set method, deterministically without warm start."""
     n_v = len(qp.bias)
     n = qp.A.shape[1]
-    # With H = UᵀU and v̇ = U⁻¹z the cost is |[z; y]|² but for its linear part. LAPACK gets there in
-    # a third of the time that daqp takes for a matrix of which it does not know the structure.
+    # With H = UᵀU and v̇ = U⁻¹z the quadratic cost is ½|[z; y]|². LAPACK's factorisation takes a
+    # third of the time of daqp's, which ignores the matrix's structure.
     U, _ = dpotrf(qp.H.T)
     A, g = qp.A.copy(), np.zeros(n)
     A[: qp.num_vdot_rows, :n_v] = dtrtrs(U, qp.A[: qp.num_vdot_rows, :n_v].T, trans=1)[0].T

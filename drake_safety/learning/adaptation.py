@@ -1,4 +1,4 @@
-"""How feedback changes beliefs by the paper's update; `recalibration` has the sharpened mode's."""
+"""The paper's update of beliefs from feedback; see `recalibration` for the sharpened mode's."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from drake_safety.learning.grid import Grid
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptation:
-    """What an assessment was adapted to.
+    """Record of an adaptation.
 
     Attributes:
         method: "paper" or "recalibration".
-        variation: Of the actual episodes.
-        num_sets: How many feedback sets there were.
-        num_differing: How many of them had a twin that ended differently.
+        variation: Plant variation of the actual episodes.
+        num_sets: Number of feedback sets.
+        num_differing: Number of feedback sets whose twin ended differently.
     """
 
     method: str
@@ -32,15 +32,14 @@ class Adaptation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScores:
-    """What the training segments left behind in the cells.
+    """Embedded training segments, from which the cells' beliefs are computed.
 
     Attributes:
         points: Psi(x), (K, N, 2).
         score: lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        heads: What the base logit is made of, see `BaseLogit.heads`, (N, 2); none where the maps
-            have no heads.
-        nearest: Column of the constraint that is predicted to be nearest its violation, (N,).
+        heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
+        nearest: Column of the constraint with the smallest predicted margin, (N,).
     """
 
     points: np.ndarray
@@ -57,12 +56,12 @@ def prior_beliefs(
     num_causes: int,
     uncertainty: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Beliefs of every map's cells from the training segments alone, (K, R*R, 3 + n_c).
+    """Computes beliefs of every map's cells from the training segments, (K, R*R, 3 + n_c).
 
     Args:
         training: The training segments.
         grid: The grid.
-        parameters: Of the assessment.
+        parameters: The assessment's parameters.
         num_causes: n_c.
         uncertainty: mu of every segment in every map, (K, N); mu_ini by default.
     """
@@ -72,7 +71,7 @@ def prior_beliefs(
         [
             belief_masses.fuse_cells(
                 belief_masses.from_scores(training.score, mu, training.cause, num_causes),
-                # L(x): the cell of Psi(x), not of the point t-SNE gave the segment.
+                # L(x) is the cell of Psi(x), not of the segment's point in t-SNE.
                 grid.locate(points),
                 num_cells=grid.num_cells,
                 min_count=parameters.min_count,
@@ -90,14 +89,14 @@ def paper_beliefs(
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> np.ndarray:
-    """Beliefs as the paper adapts them, (K, R*R, 3 + n_c).
+    """Computes beliefs by the paper's adaptation, (K, R*R, 3 + n_c).
 
     Args:
         training: The training segments.
         feedback: Segments of all feedback so far.
         points: Psi(x) of the feedback, (K, M, 2).
         grid: The grid.
-        parameters: Of the assessment.
+        parameters: The assessment's parameters.
         num_causes: n_c.
     """
     settings = parameters.adaptation
@@ -136,17 +135,16 @@ def feedback_beliefs(
     settings: AdaptationParameters,
     num_sets: int,
 ) -> np.ndarray:
-    """The feedback belief of every cell by G, (R*R, 3 + n_c); empty where there is none.
+    """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 
     Departure: n_f is by default the number of samples in the cell. Read literally, as the number of
-    all sets, 40 of them leave an uncertainty of 5e-8, and a single sample wipes out the prior of
-    its cell.
+    all sets, 40 sets leave an uncertainty of 5e-8, and a single sample replaces its cell's prior.
 
     Args:
         certain: Beliefs of the feedback segments, mu = 0, (M, 3 + n_c).
         cells: Cell of each, -1 for outside, (M,).
         grid: The grid.
-        settings: beta, alpha, and what n_f counts.
+        settings: beta, alpha and the definition of n_f.
         num_sets: Number of feedback sets.
     """
     count = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
@@ -157,7 +155,7 @@ def feedback_beliefs(
 
 
 def combined(prior: np.ndarray, feedback: np.ndarray) -> np.ndarray:
-    """F of both beliefs of each cell, (R*R, 3 + n_c); without feedback the prior as it is."""
+    """Fuses prior and feedback of each cell, (R*R, 3 + n_c); without feedback, the prior."""
     num_cells = len(prior)
     both = belief_masses.fuse_cells(
         np.concatenate([prior, feedback]),

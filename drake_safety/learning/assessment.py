@@ -1,4 +1,4 @@
-"""The safety assessment function Gamma: how likely the closed loop stays safe from here on."""
+"""The safety assessment function Γ: the probability that the closed loop stays safe."""
 
 from __future__ import annotations
 
@@ -46,47 +46,44 @@ ADAPTATION_METHODS = ("recalibration", "paper")
 
 
 class SafetyAssessment:
-    """Gamma: from the state and the desired outputs ahead to a belief about safety.
+    """Γ: maps the state and the desired preview to a belief about safety.
 
     `fit` learns it from nominal episodes. Learned attributes end in an underscore:
 
     - `info_`: the `EpisodesInfo` of the training episodes.
     - `grid_`: the `Grid` of the embedding space.
-    - `embedding_`: the maps Psi, an `Embedding`, immutable.
-    - `beliefs_`: the belief of every map's cells, (K, R*R, 3 + n_c); it may be replaced, and every
-      prediction takes other beliefs as an argument.
+    - `embedding_`: the maps Psi, an immutable `Embedding`.
+    - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
+      predictions take other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
-      segments in the cells, (K, N, 2), (N,), (N,), which adaptation starts from; where the maps
-      have heads also `training_heads_` and `training_nearest_`, what the `BaseLogit` of the
-      segments is made of and the constraint that is predicted to be nearest, (N, 2), (N,).
+      training segments, (K, N, 2), (N,), (N,), from which adaptation starts; for maps with heads
+      also `training_heads_` and `training_nearest_`, see `TrainingScores`, (N, 2), (N,).
     - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
-    - `correction_`: the `Correction`, what feedback adds to the base logit;
-      nothing before any.
-    - `adaptation_`: the `Adaptation` to feedback; None before any.
-    - `used_`: every set of episodes that was learned from, calibrated or adapted with, as
-      `UsedEpisodes`: what judges the assessment must be drawn with other seeds.
-    - `calibrations_`: the `Calibration` by its kind, of these maps and `beliefs_`; empty until it
-      is set.
+    - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
+    - `adaptation_`: the `Adaptation` to feedback; initially None.
+    - `used_`: every set of episodes used for training, calibration or adaptation, as
+      `UsedEpisodes`; evaluation needs other seeds.
+    - `calibrations_`: the `Calibration` by kind for these maps and `beliefs_`; initially empty.
 
-    Departure ("sharpened" only): x gains the safe set's own signed margins along the plan
-    (`features`), the maps learn safety and future margins beside t-SNE's points from every start
-    row, Gamma interpolates between cell centres instead of jumping at cell edges, and it is the
-    mean over a few maps, each with its own grid. Read literally the method is weak on the robots;
-    the "paper" mode is that reading, to compare with.
+    Departure ("sharpened" only): x gains the safe set's signed margins along the plan (`features`),
+    the maps learn safety and future margins beside t-SNE's points from every start row, Γ is
+    interpolated bilinearly between cell centres, and it is the mean of an ensemble of maps, each
+    with its own grid. Read literally, the method is weak on the robots; the "paper" mode is that
+    reading, for comparison.
     """
 
     def __init__(self, parameters: AssessmentParameters | None = None):
-        # A copy: what a scenario is changed to afterwards is not what was learned with.
+        # A copy, so that later changes of a scenario do not change a trained assessment.
         self.parameters = copy.deepcopy(parameters or AssessmentParameters())
 
     @property
     def uses_features(self) -> bool:
-        """Whether x has the features: in the sharpened mode."""
+        """Whether x contains the features, as in the sharpened mode."""
         return self.parameters.is_sharpened
 
     @property
     def num_causes(self) -> int:
-        """n_c, the number of constraints that can be violated."""
+        """n_c, the number of constraints."""
         return len(self.info_.constraint_names)
 
     def fit(
@@ -95,9 +92,9 @@ class SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
-            episodes: Nominal episodes whose horizon is the parameters' own.
+            episodes: Nominal episodes with the parameters' horizon.
             progress: Called with a stage ("distances", "t-SNE", "training", "beliefs") and the
-                fraction of it that is done.
+                fraction done.
 
         Returns:
             Itself.
@@ -109,18 +106,19 @@ class SafetyAssessment:
         info = episodes.info
         if info.horizon != parameters.horizon:
             raise ValueError(
-                f"SafetyAssessment: horizon is {parameters.horizon}, but the episodes of "
-                f"'{info.scenario}' look {info.horizon} steps ahead"
+                f"SafetyAssessment: horizon is {parameters.horizon}, but that of the episodes of "
+                f"'{info.scenario}' is {info.horizon}"
             )
-        training = segments_for(episodes, parameters)
-        segments = training.segments
+        segments, has_target = segments_for(episodes, parameters)
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
         x = self._inputs(
             segments.state if parameters.is_sharpened else segments.true_state,
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, base_logit = learned_maps(training, x, self.grid_, parameters, progress)
+        self.embedding_, base_logit = learned_maps(
+            segments, has_target, x, self.grid_, parameters, progress
+        )
         self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
@@ -148,7 +146,7 @@ class SafetyAssessment:
         return self
 
     def prior_beliefs(self) -> np.ndarray:
-        """The belief of every map's cells before any feedback, (K, R*R, 3 + n_c)."""
+        """Computes the beliefs of every map's cells before any feedback, (K, R*R, 3 + n_c)."""
         self._check_fitted()
         return adaptation.prior_beliefs(
             self._training, self.grid_, self.parameters, self.num_causes
@@ -167,21 +165,21 @@ class SafetyAssessment:
     def adapt(
         self, feedback: Sequence[FeedbackSet], *, method: str | None = None
     ) -> SafetyAssessment:
-        """Adapts to what the actual robot did; this assessment stays as it is.
+        """Returns a copy adapted to feedback from the actual robot.
 
-        Every adaptation starts from the nominal episodes, as F is not associative: give all
-        feedback there is, not only what is new.
+        Every adaptation starts from the nominal episodes, as F is not associative: pass all
+        feedback, not only the new sets.
 
         Departure ("recalibration"): see `recalibration.recalibrated_beliefs`.
 
         Args:
             feedback: Pairs of actual episodes and their nominal twins.
-            method: "recalibration" changes the base logit, and scores with it; "paper" is the
-                paper's update, by a discrepancy function and feedback beliefs. By default "paper"
-                in the paper's mode and without heads, else "recalibration".
+            method: "recalibration" corrects the base logit and with it the training scores;
+                "paper" is the paper's update by a discrepancy function and feedback beliefs.
+                Default: "recalibration" for maps with heads, else "paper".
 
         Returns:
-            Another assessment with the same maps.
+            A new assessment with the same maps.
 
         Raises:
             ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
@@ -193,7 +191,7 @@ class SafetyAssessment:
         if method not in ADAPTATION_METHODS or (method == "recalibration" and not has_heads):
             raise ValueError(
                 f"SafetyAssessment of '{self.info_.scenario}': cannot adapt by '{method}'; the "
-                f"methods are {list(ADAPTATION_METHODS)}, and 'recalibration' takes maps with heads"
+                f"methods are {list(ADAPTATION_METHODS)}, and 'recalibration' needs maps with heads"
             )
         check_feedback(feedback, self.info_)
         drawn = used_episodes(feedback)
@@ -203,7 +201,7 @@ class SafetyAssessment:
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
         adapted.parameters = copy.deepcopy(self.parameters)
-        # What was promised was promised of other beliefs.
+        # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
         adapted.used_ = [*(one for one in self.used_ if one.purpose != "adaptation"), *drawn]
         arguments = (self.grid_, self.parameters, self.num_causes)
@@ -213,7 +211,7 @@ class SafetyAssessment:
                 self._training, segments, points, *arguments
             )
         elif self.base_logit_ is not None:
-            # Outcomes are what counts: with the same ones on both sides there is no evidence.
+            # Only pairs with different outcomes are evidence of a reality gap.
             if any(one.differs for one in feedback):
                 change, hidden, hidden_range = recalibration.fitted_change(
                     *recalibration.outcomes(
@@ -243,15 +241,15 @@ class SafetyAssessment:
         return adapted
 
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
-        """Refuses seeds of episodes that were used to learn, calibrate or adapt.
+        """Checks that seeds were not used for training, calibration or adaptation.
 
         Args:
-            *seeds: Of the sets.
-            purpose: "calibration" or "adaptation" where the sets take the place of those of an
-                earlier one, which then do not count; by default they are to judge by.
+            *seeds: Seeds of the sets of episodes.
+            purpose: "calibration" or "adaptation" if the sets replace those of an earlier one,
+                which are then ignored; the default is evaluation.
 
         Raises:
-            ValueError: One was used; says for what, and which seed is free.
+            ValueError: A seed was used; the message names its purpose and a free seed.
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
@@ -260,15 +258,15 @@ class SafetyAssessment:
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
     ) -> None:
-        """Keeps thresholds in place of earlier ones, and what they were chosen on.
+        """Replaces the thresholds with a promised miss rate.
 
         Args:
             calibrations: One of each kind.
-            info: What the episodes share that they were chosen on.
-            num_episodes: How many there were.
+            info: The `EpisodesInfo` of the calibration episodes.
+            num_episodes: Number of calibration episodes.
 
         Raises:
-            ValueError: These episodes were learned from or adapted with.
+            ValueError: The episodes were used for training or adaptation.
         """
         self.check_unused(info.seed, purpose="calibration")
         kept = [one for one in self.used_ if one.purpose != "calibration"]
@@ -276,7 +274,7 @@ class SafetyAssessment:
         self.used_ = [*kept, UsedEpisodes.of("calibration", info, num_episodes)]
 
     def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
-        """The segments of feedback sets, cut as the training episodes were."""
+        """Splits feedback sets into segments as the training episodes were split."""
         parameters = self.parameters
         return segments_of(
             feedback,
@@ -289,12 +287,11 @@ class SafetyAssessment:
     def _inputs(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """x, (N, n_x): [s; z*] in the paper's mode, [s; z*; features] in the sharpened one."""
         return inputs(state, desired_preview, features, self.parameters)
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "beliefs_"):
-            raise ValueError("SafetyAssessment: it has not been fitted or loaded yet")
+            raise ValueError("SafetyAssessment: not fitted or loaded yet")
 
     def _or_own(
         self, beliefs: np.ndarray | None, correction: Correction | None
@@ -324,17 +321,17 @@ class SafetyAssessment:
         """Assesses N inputs.
 
         Args:
-            state: States as the assessor sees them, (N, n_s).
-            desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
-            features: Features, (N, n_f); the paper's mode has no use for them.
-            beliefs: Beliefs of the cells instead of `beliefs_`, (K, R*R, 3 + n_c).
-            correction: What is added to the base logit instead of `correction_`.
+            state: Measured states, (N, n_s).
+            desired_preview: Desired outputs over the horizon, row-major in time, (N, H*n_z).
+            features: Features, (N, n_f); ignored in the paper's mode.
+            beliefs: Beliefs of the cells; `beliefs_` by default, (K, R*R, 3 + n_c).
+            correction: Correction of the base logit; `correction_` by default.
 
         Returns:
-            The assessments. An input that is not finite is empty: Gamma is 0 there.
+            The assessments. Inputs that are not finite get the empty belief, where Γ is 0.
 
         Raises:
-            ValueError: The widths or a shape are wrong, or there is nothing learned yet.
+            ValueError: A width or a shape is wrong, or the assessment is not fitted.
         """
         self._check_fitted()
         beliefs, correction = self._or_own(beliefs, correction)
@@ -373,18 +370,38 @@ class SafetyAssessment:
         )
         return result.one(0)
 
+    def unsafe_logits(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the mean logit of an unsafe end and its gradient with respect to x.
+
+        Γ is constant where all corners of a cell agree; the safety heads' logit has a slope
+        everywhere, for planners that need a gradient. The arguments are those of `predict`.
+
+        Returns:
+            x (N, n_x), the logit (N,) and its gradient (N, n_x).
+
+        Raises:
+            ValueError: The maps have no safety head, as in the paper's mode.
+        """
+        x = self._inputs(state, desired_preview, features)
+        return x, *self.embedding_.logit_gradient(x)
+
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one safetensors file, first under a temporary name: it is whole or absent."""
+        """Writes one safetensors file atomically."""
         self._check_fitted()
         learned = {name: value for name, value in vars(self).items() if name.endswith("_")}
         assessment_file.write(Path(path), self.parameters, learned)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
-        """Reads what `save` wrote.
+        """Reads a file written by `save`.
 
         Raises:
-            ValueError: The file is truncated, of another kind, or of another schema version.
+            ValueError: The file is truncated, not an assessment, or of another schema version.
         """
         parameters, learned = assessment_file.read(Path(path))
         assessment = cls(parameters)

@@ -1,4 +1,4 @@
-"""Assessments on disk: one safetensors file each, whole or absent."""
+"""Reading and writing assessments as safetensors files."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "training_heads": (np.float32, float),
     "training_nearest": (np.int16, np.int64),
 }
-"""What is kept of the training segments, as it is stored and as it is used."""
+"""Arrays of the training segments: the type on disk and in memory."""
 _OF_HEADS = ("training_heads", "training_nearest")
 
 
 def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
-    """Writes one safetensors file, first under a temporary name.
+    """Writes one safetensors file atomically.
 
     Args:
         path: The file.
-        parameters: What the assessment was learned with.
+        parameters: The assessment's parameters.
         learned: The assessment's learned attributes by name.
     """
     from safetensors.numpy import save
@@ -86,19 +86,19 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
-    """Reads what `write` wrote.
+    """Reads a file written by `write`.
 
     Returns:
         The parameters, and the learned attributes by name.
 
     Raises:
-        ValueError: The file is truncated, of another kind, of another schema version, or lacks
-            what every one has.
+        ValueError: The file is truncated, not an assessment, of another schema version, or
+            incomplete.
     """
     metadata, tensors = _open(path)
     if metadata.get("schema") != SCHEMA:
         raise ValueError(
-            f"'{path}' is no safety assessment: its schema is '{metadata.get('schema')}', "
+            f"'{path}' is not a safety assessment: its schema is '{metadata.get('schema')}', "
             f"expected '{SCHEMA}'"
         )
     if metadata.get("schema_version") != str(SCHEMA_VERSION):
@@ -128,7 +128,7 @@ def _learned(
     expected_inputs = num_inputs(info, parameters)
     if embedding.num_inputs != expected_inputs:
         raise ValueError(
-            f"its maps take {embedding.num_inputs} inputs, its names amount to {expected_inputs}"
+            f"its maps have {embedding.num_inputs} inputs, expected {expected_inputs} by its names"
         )
     base_logit = numbers["base_logit"]
     if base_logit is not None:
@@ -169,7 +169,7 @@ def _learned(
 def _used(
     info: EpisodesInfo, calibrations: list[Calibration], stored: list[dict[str, Any]] | None
 ) -> list[UsedEpisodes]:
-    """What was used; in a file that does not say, what its other entries tell of it."""
+    """The used episodes; inferred from other entries in files that do not store them."""
     if stored is not None:
         return [UsedEpisodes(**one) for one in stored]
     used = [UsedEpisodes.of("training", info, None)]
@@ -180,12 +180,12 @@ def _used(
 
 
 def single(values: np.ndarray) -> np.ndarray:
-    """Values that single precision holds, as doubles: files keep one number for every segment."""
+    """Rounds values to single precision, in which files store one number for every segment."""
     return values.astype(np.float32).astype(float)
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
+    """Returns the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -201,4 +201,4 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
             metadata = dict(opened.metadata() or {})
             return metadata, {name: opened.get_tensor(name) for name in opened.keys()}
     except SafetensorError as error:
-        raise ValueError(f"'{path}' is no safety assessment, or is truncated: {error}") from error
+        raise ValueError(f"'{path}' is not a safety assessment or truncated: {error}") from error

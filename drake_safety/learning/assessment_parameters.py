@@ -1,4 +1,4 @@
-"""What a safety assessment is learned and adapted with: the schema of a scenario's `assessment`."""
+"""The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
 from dataclasses import dataclass, field
 
@@ -7,25 +7,30 @@ from drake_safety.learning.distance import BACKENDS
 MODES = ("paper", "sharpened")
 
 
+def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
+    if not holds:
+        who, value = type(parameters).__name__, getattr(parameters, name)
+        raise ValueError(f"{who}: {name} is {value}, expected {expected}")
+
+
 @dataclass(kw_only=True)
 class AdaptationParameters:
-    """How feedback of the actual robot changes an assessment.
+    """Parameters of the adaptation to feedback from the actual robot.
 
-    The first five default to the paper's Table I, update_interval to its text.
+    The first four default to the paper's Table I, update_interval to its text.
 
     Attributes:
-        gate: sigma_thre, standard deviation of the discrepancy up to which it is believed (paper).
-        least_uncertainty: mu_min of nominal beliefs where nothing differs (paper).
-        decay_rate: alpha, how fast feedback beliefs lose their uncertainty (paper).
+        gate: sigma_thre, largest standard deviation at which the discrepancy is used (paper).
+        least_uncertainty: mu_min of nominal beliefs without discrepancy (paper).
+        decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
-        update_interval: k_u, feedback sets from one update to the next.
+        update_interval: k_u, number of feedback sets between two updates.
         counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
-            its own cell, or literally the number of all feedback sets (paper).
-        offset_std: Standard deviation of the prior of what changes in the base logit's
-            offset (sharpened).
-        slope_std: The same of either of its slopes (sharpened).
-        hidden_std: The same of what the maps' last hidden layer adds to it, where its activations
-            are as far from their mean as they are in feedback (sharpened).
+            its cell, or literally the number of all feedback sets (paper).
+        offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
+        slope_std: The same for each of its slopes (sharpened).
+        hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
+            mean distance of activations from their mean (sharpened).
     """
 
     gate: float = 0.3
@@ -40,29 +45,23 @@ class AdaptationParameters:
 
     def __post_init__(self) -> None:
         for name in ("least_uncertainty", "first_uncertainty"):
-            self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
+            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in ("offset_std", "slope_std", "hidden_std"):
-            self._expect(name, getattr(self, name) > 0.0, "> 0")
+            _expect(self, name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
-            self._expect(name, getattr(self, name) >= 0.0, ">= 0")
-        self._expect("update_interval", self.update_interval >= 1, ">= 1")
-
-    def _expect(self, name: str, holds: bool, expected: str) -> None:
-        if not holds:
-            raise ValueError(
-                f"AdaptationParameters: {name} is {getattr(self, name)}, expected {expected}"
-            )
+            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
+        _expect(self, "update_interval", self.update_interval >= 1, ">= 1")
 
 
 @dataclass(kw_only=True)
 class AssessmentParameters:
-    """What a safety assessment is trained with.
+    """Parameters of a safety assessment.
 
     discount, horizon, score_weight, initial_uncertainty and min_count default to the paper's
     Table I, resolution and cell_length to its text; the other defaults are our own.
 
-    The paper's mode is fixed beyond Table I: one plain map with two layers of 128, trained on
-    segments that do not overlap. What is marked "sharpened" has no meaning there.
+    The paper's mode has one plain map with two layers of 128, trained on segments that do not
+    overlap; it ignores the attributes marked "sharpened".
 
     Attributes:
         mode: "sharpened" or "paper".
@@ -71,36 +70,35 @@ class AssessmentParameters:
         score_weight: delta, the weight of score differences in Omega.
         initial_uncertainty: mu_ini of nominal beliefs.
         min_count: k_min, beliefs below which a cell stays empty.
-        resolution: Cells a side of the grid.
+        resolution: Number of cells per side of the grid.
         cell_length: Side of a cell.
-        distance_backend: What computes dynamic time warping: "dtaidistance", or "tslearn", which
-            takes some twenty times as long and gives the same values.
+        distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
+            which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
-        seed: Seeds t-SNE and the maps.
+        seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
-        batch_size: Segments a training step.
-        epochs: Passes over the segments (sharpened; the paper's mode makes 40 over its fewer ones).
+        batch_size: Segments per training step.
+        epochs: Passes over the segments (sharpened; 40 in the paper's mode).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of the episodes that maps are tried on, before others of their kind learn
-            from all: what they say of these makes Gamma a probability (sharpened).
+        held_out: Share of held-out episodes. The base logit is fitted to maps trained without
+            them; the final maps are trained on all episodes (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
-        dropout: Share of activations dropped in training (sharpened).
-        target_weight: Weight of the distance to t-SNE's points (sharpened). A light one lets safety
-            decide where neighbours in t-SNE part.
+        dropout: Dropout rate (sharpened).
+        target_weight: Weight of the distance to t-SNE's points (sharpened). With a small weight,
+            safety separates segments that are neighbours in t-SNE.
         safety_weight: Weight of the safety head's loss (sharpened).
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
-        raw_input_scale: Spread of state and preview as a map sees them, beside features of spread
-            one (sharpened). Where the features say nearly all, a small one keeps the maps from
-            learning the rest by heart.
-        feature_unit: Features enter a second time as asinh(f / feature_unit), which spreads out
-            what lies near a margin's zero [unit of the features]; 0 leaves that out (sharpened).
-        shortest_segment: Steps that a safe episode's segment has at least; 0 stands for the whole
+        raw_input_scale: Spread of state and preview as a map's inputs, where features have spread
+            one (sharpened). A small scale prevents overfitting to them if the features suffice.
+        feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
+            margins near zero [unit of the features]; 0 disables it (sharpened).
+        shortest_segment: Least number of steps of a safe episode's segment; 0 means the whole
             horizon (sharpened). For episodes that end at rest.
-        first_row_weight: Weight of the segment an episode starts with, relative to the others: they
-            are few, and verdicts at planning time rest on them (sharpened).
-        adaptation: How feedback of the actual robot changes it.
+        first_row_weight: Weight of an episode's first segment relative to the others (sharpened).
+            First segments are few, but verdicts at planning time depend on them.
+        adaptation: Parameters of the adaptation.
     """
 
     mode: str = "sharpened"
@@ -137,11 +135,11 @@ class AssessmentParameters:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
             )
-        self._expect(
-            "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
+        _expect(
+            self, "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
         )
         for name in ("discount", "initial_uncertainty"):
-            self._expect(name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
+            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in (
             "score_weight",
             "target_weight",
@@ -149,9 +147,9 @@ class AssessmentParameters:
             "margin_weight",
             "feature_unit",
         ):
-            self._expect(name, getattr(self, name) >= 0.0, ">= 0")
+            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
         for name in ("horizon", "min_count", "resolution", "batch_size", "epochs", "ensemble_size"):
-            self._expect(name, getattr(self, name) >= 1, ">= 1")
+            _expect(self, name, getattr(self, name) >= 1, ">= 1")
         for name in (
             "cell_length",
             "learning_rate",
@@ -159,29 +157,28 @@ class AssessmentParameters:
             "first_row_weight",
             "raw_input_scale",
         ):
-            self._expect(name, getattr(self, name) > 0.0, "> 0")
-        self._expect(
-            "shortest_segment", 0 <= self.shortest_segment <= self.horizon, "a value in 0..horizon"
+            _expect(self, name, getattr(self, name) > 0.0, "> 0")
+        _expect(
+            self,
+            "shortest_segment",
+            0 <= self.shortest_segment <= self.horizon,
+            "a value in 0..horizon",
         )
-        self._expect("perplexity", self.perplexity >= 1.0, ">= 1")
+        _expect(self, "perplexity", self.perplexity >= 1.0, ">= 1")
         for name in ("dropout", "held_out"):
-            self._expect(name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
-        self._expect(
+            _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
+        _expect(
+            self,
             "hidden_sizes",
             bool(self.hidden_sizes) and all(size >= 1 for size in self.hidden_sizes),
-            "one width >= 1 a layer",
+            "one width >= 1 per layer",
         )
-        self._expect(
+        _expect(
+            self,
             "margin_range",
             len(self.margin_range) == 2 and self.margin_range[0] < self.margin_range[1],
             "[lowest, highest]",
         )
-
-    def _expect(self, name: str, holds: bool, expected: str) -> None:
-        if not holds:
-            raise ValueError(
-                f"AssessmentParameters: {name} is {getattr(self, name)}, expected {expected}"
-            )
 
     @property
     def is_sharpened(self) -> bool:
@@ -195,10 +192,10 @@ class AssessmentParameters:
 
     @property
     def stride(self) -> int:
-        """Rows between the starts of two segments: one, or H in the paper's mode."""
+        """Rows between the starts of segments: one, or H in the paper's mode."""
         return 1 if self.is_sharpened else self.horizon
 
     @property
     def shortest(self) -> int:
-        """Steps that a safe episode's segment has at least."""
+        """Least number of steps of a safe episode's segment."""
         return (self.shortest_segment or self.horizon) if self.is_sharpened else self.horizon

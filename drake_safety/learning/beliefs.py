@@ -30,20 +30,20 @@ def from_scores(
     cause: np.ndarray | None = None,
     num_causes: int = 0,
 ) -> np.ndarray:
-    """The belief that each unsafety score stands for.
+    """Converts unsafety scores to beliefs.
 
     Args:
         score: Unsafety scores lambda in [0, 1], (N,).
-        uncertainty: mu in [0, 1], one for all or (N,).
-        cause: Column of the constraint each unsafe mass belongs to, -1 for none, (N,).
+        uncertainty: mu in [0, 1], scalar or (N,).
+        cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
         num_causes: n_c.
 
     Returns:
         Beliefs (N, 3 + n_c).
 
     Raises:
-        ValueError: A score or an uncertainty lies outside [0, 1], or causes are asked for and not
-            given, or an unsafe score has no cause.
+        ValueError: A score or an uncertainty lies outside [0, 1], `cause` is missing although
+            `num_causes` > 0, or an unsafe score has no cause.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -51,9 +51,7 @@ def from_scores(
         if not np.all((values >= 0.0) & (values <= 1.0)):
             raise ValueError(f"from_scores: every {name} must lie in [0, 1], got {values}")
     if num_causes and cause is None:
-        raise ValueError(
-            f"from_scores: {num_causes} causes are asked for, but `cause` is not given"
-        )
+        raise ValueError(f"from_scores: got no `cause`, expected one of {num_causes} causes each")
     beliefs = np.zeros((*score.shape, 3 + num_causes))
     # Eq. (bba_training_data)
     beliefs[..., SAFE] = (1.0 - uncertainty) * (1.0 - score)
@@ -71,20 +69,20 @@ def from_scores(
 
 
 def fuse(beliefs: np.ndarray) -> np.ndarray:
-    """F: the joint fusion of a set of beliefs.
+    """Applies F, the joint fusion of a set of beliefs.
 
-    Certain beliefs (mu = 0) outweigh all others and are averaged, vacuous ones (mu = 1) have no
-    weight. F gathers no evidence (equal mu stays mu) and is not associative: fuse a set at once.
+    Certain beliefs (mu = 0) outweigh all others and are averaged; vacuous ones (mu = 1) have no
+    weight. F accumulates no evidence (equal mu stays mu) and is not associative: fuse a set at
+    once.
 
-    Departure: the printed products of uncertainties underflow from some 600 beliefs on. Divided by
-    their common product they become weights w = (1 - mu) / mu, which is the same value without
-    loss.
+    Departure: the printed products of uncertainties underflow from about 600 beliefs on. Divided
+    by their common product they become the weights w = (1 - mu) / mu, which give the same value.
 
     Args:
         beliefs: A set of beliefs, (k, 3 + n_c).
 
     Returns:
-        The fused belief, (3 + n_c,); empty if the set is empty or all of it is vacuous.
+        The fused belief, (3 + n_c,); empty if the set is empty or all beliefs are vacuous.
     """
     beliefs = np.asarray(beliefs, dtype=float)
     return fuse_cells(beliefs, np.zeros(len(beliefs), dtype=int), num_cells=1, min_count=0)[0]
@@ -93,7 +91,7 @@ def fuse(beliefs: np.ndarray) -> np.ndarray:
 def fuse_cells(
     beliefs: np.ndarray, cells: np.ndarray, *, num_cells: int, min_count: int
 ) -> np.ndarray:
-    """The belief of every grid cell, fused jointly from the beliefs that lie in it.
+    """Fuses the beliefs in every grid cell jointly.
 
     Args:
         beliefs: Beliefs, (N, 3 + n_c).
@@ -105,7 +103,7 @@ def fuse_cells(
         Beliefs (V, 3 + n_c).
 
     Raises:
-        ValueError: `cells` has another length than `beliefs`.
+        ValueError: `cells` and `beliefs` differ in length.
     """
     beliefs = np.asarray(beliefs, dtype=float)
     cells = np.asarray(cells)
@@ -119,8 +117,8 @@ def fuse_cells(
     uncertainty = beliefs[:, UNCERTAINTY]
     count = np.bincount(cells, minlength=num_cells)
 
-    # Within a cell the smallest mu scales all weights, so that a tiny mu cannot overflow; where it
-    # is zero only the certain beliefs keep a weight, the limit of w = (1 - mu) / mu.
+    # The smallest mu of a cell scales its weights, so that a tiny mu cannot overflow. Where it is
+    # zero, only the certain beliefs keep a weight, the limit of w = (1 - mu) / mu.
     smallest = np.full(num_cells, np.inf)
     np.minimum.at(smallest, cells, uncertainty)
     is_certain = uncertainty == 0.0
@@ -129,8 +127,7 @@ def fuse_cells(
     total = np.bincount(cells, weights=weight, minlength=num_cells)
 
     fused = empty(num_cells, num_columns - 3)
-    # Eq. (compute_prior_estmate_bba): k_v >= k_min, as displayed; the prose says the opposite at
-    # equality.
+    # Eq. (compute_prior_estmate_bba): k_v >= k_min as in the equation; the paper's text has >.
     is_filled = (count >= min_count) & (total > 0.0)
     divisor = np.where(is_filled, total, 1.0)
     for column in range(num_columns):
@@ -146,7 +143,7 @@ def fuse_cells(
 
 
 def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarray) -> np.ndarray:
-    """G: the average of the certain beliefs in every grid cell, with an uncertainty of its own.
+    """Applies G: averages the certain beliefs in every grid cell and sets the cell's uncertainty.
 
     Args:
         beliefs: Beliefs, mu = 0, (N, 3 + n_c).
@@ -154,10 +151,10 @@ def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarra
         uncertainty: mu of each cell, (V,).
 
     Returns:
-        Beliefs (V, 3 + n_c); empty where there is none to average.
+        Beliefs (V, 3 + n_c); cells without beliefs are empty.
 
     Raises:
-        ValueError: `cells` has another length than `beliefs`.
+        ValueError: `cells` and `beliefs` differ in length.
     """
     if cells.shape != beliefs.shape[:1]:
         raise ValueError(

@@ -1,18 +1,16 @@
-"""Thresholds with a promised miss rate: how often an unsafe episode may be called safe.
+"""Thresholds with a promised miss rate: the share of unsafe episodes whose verdict is "safe".
 
-An episode has one score, however many segments it has: only episodes are independent. Of the
-scores of n unsafe episodes a threshold stays below the k-th lowest, so that k - 1 of them are
-missed. How large k may be is what the two rules differ in.
+Every episode has one score, because only episodes are independent. The threshold lies below the
+k-th lowest score of n unsafe episodes, so that k - 1 of them are missed. Two rules choose k:
 
-Conformal: of n episodes and one more, drawn alike, each is as likely as any other to have the k-th
-lowest score. With k = ⌊miss rate (n + 1)⌋ the further one is missed with a probability of at most
-the miss rate, on average over calibration sets.
+- Conformal: among n + 1 exchangeable episodes every rank is equally likely. With
+  k = ⌊miss rate (n + 1)⌋ a new unsafe episode is missed with a probability of at most the miss
+  rate, on average over calibration sets.
+- With a confidence ("PAC"): k is the largest for which Clopper and Pearson's upper bound of the
+  miss rate, with k - 1 of n missed, does not exceed the promise: P(Binomial(n, miss rate) ≤ k - 1)
+  ≤ 1 - confidence. The promise then holds for this calibration set with that confidence.
 
-With a confidence ("PAC"): k is the largest for which Clopper and Pearson's upper bound of the miss
-rate, k - 1 of n being missed, does not exceed the promise: P(Binomial(n, miss rate) ≤ k - 1) ≤
-1 - confidence. It then holds for this calibration set, with that confidence.
-
-Either rule looks at one class alone, so it holds whatever the share of unsafe episodes is.
+Both rules use one class alone and hold for any share of unsafe episodes.
 """
 
 import math
@@ -26,32 +24,33 @@ from drake_safety.learning.segments import Segments
 SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
 """The verdicts."""
 PLAN, MOTION = "plan", "motion"
-"""What an episode is scored by: its first row, when the plan is made, or its worst row of all."""
+"""Score of an episode: that of its first row, at planning time, or that of its worst row."""
 KINDS = (PLAN, MOTION)
 
-_BELOW_ALL = 1e-6  # By how much a threshold stays below the lowest score, wherever it is rounded.
+_BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust against rounding.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Two thresholds of Γ = b_safe / (1 - μ), and what they promise.
+    """Two thresholds of Γ = b_safe / (1 - μ) and their promised rates.
 
-    Γ ≥ `threshold` is safe, Γ < `unsafe_below` unsafe, and between them the answer is "don't
-    know".
+    The verdict is "safe" for Γ ≥ `threshold`, "unsafe" for Γ < `unsafe_below`, and "don't know" in
+    between.
 
     Attributes:
-        kind: "plan" or "motion": what an episode was scored by.
-        miss_rate: Promised share of unsafe episodes called safe.
-        false_alarm_rate: Promised share of safe episodes called unsafe.
-        confidence: With which both hold for this calibration set; None for on average over sets.
-        threshold: From which Γ on the verdict is safe.
-        unsafe_below: Below which Γ the verdict is unsafe; at most `threshold`.
-        num_unsafe: Unsafe episodes it was made with.
-        num_safe: Safe ones.
-        num_missed: How many of these unsafe episodes are called safe.
-        num_accepted: How many of these safe ones are.
+        kind: "plan" or "motion", the score of an episode.
+        miss_rate: Promised share of unsafe episodes with the verdict "safe".
+        false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
+        confidence: Confidence of both rates for this calibration set; None for rates on average
+            over calibration sets.
+        threshold: Lower bound of Γ for "safe".
+        unsafe_below: Upper bound of Γ for "unsafe"; at most `threshold`.
+        num_unsafe: Number of unsafe calibration episodes.
+        num_safe: Number of safe calibration episodes.
+        num_missed: Number of unsafe calibration episodes with the verdict "safe".
+        num_accepted: Number of safe calibration episodes with the verdict "safe".
         seed: Seed of the episodes.
-        scenario_hash: Of the simulation they came from.
+        scenario_hash: Hash of the simulation.
     """
 
     kind: str
@@ -80,20 +79,20 @@ class Calibration:
 
     @property
     def promise(self) -> str:
-        """What it promises, in words."""
+        """The promised miss rate in words."""
         how = "on average" if self.confidence is None else f"{100 * self.confidence:g} % confidence"
         return f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {how}"
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
-        """The verdicts on Γ (N,), as words; on NaN it is "don't know"."""
-        gamma = np.asarray(safety_probability, dtype=float)
-        verdicts = np.full(gamma.shape, UNKNOWN, dtype=object)
-        verdicts[gamma >= self.threshold] = SAFE
-        verdicts[gamma < self.unsafe_below] = UNSAFE
+        """Returns the verdicts for Γ (N,) as strings; "don't know" for NaN."""
+        probability = np.asarray(safety_probability, dtype=float)
+        verdicts = np.full(probability.shape, UNKNOWN, dtype=object)
+        verdicts[probability >= self.threshold] = SAFE
+        verdicts[probability < self.unsafe_below] = UNSAFE
         return verdicts
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Returns the fields as JSON values."""
         return asdict(self)
 
 
@@ -108,24 +107,25 @@ def calibrate(
     seed: int = 0,
     scenario_hash: str = "",
 ) -> Calibration:
-    """Chooses both thresholds on episodes that Γ has not learned from.
+    """Chooses both thresholds on episodes that were not used for training.
 
     Args:
-        unsafe_score: 1 - Γ of each episode, (N,); NaN counts as the most unsafe of all.
-        is_unsafe: Whether each ended unsafely, (N,).
-        kind: What the episodes were scored by.
-        miss_rate: Promised share of unsafe episodes called safe, in (0, 1).
-        false_alarm_rate: Promised share of safe episodes called unsafe, in (0, 1).
-        confidence: With which both shall hold, in (0, 1); None for on average.
+        unsafe_score: 1 - Γ of each episode, (N,); NaN counts as most unsafe.
+        is_unsafe: Whether each episode ended unsafely, (N,).
+        kind: "plan" or "motion", the score of an episode.
+        miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).
+        false_alarm_rate: Promised share of safe episodes with the verdict "unsafe", in (0, 1).
+        confidence: Confidence of both rates, in (0, 1); None for rates on average.
         seed: Seed of the episodes.
-        scenario_hash: Of the simulation they came from.
+        scenario_hash: Hash of the simulation.
 
     Raises:
-        ValueError: Too few unsafe or safe episodes for what is promised; says how many it takes.
+        ValueError: Too few unsafe or safe episodes for the promised rates; the message names the
+            number that is needed.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     above = score_threshold(score, label, miss_rate, confidence=confidence)
-    # The same rule for the other class, whose scores count from the other end.
+    # The same rule for the safe class, with the order of the scores reversed.
     below = -score_threshold(-score, ~label, false_alarm_rate, confidence=confidence, whose="safe")
     return Calibration(
         kind=kind,
@@ -133,7 +133,7 @@ def calibrate(
         false_alarm_rate=false_alarm_rate,
         confidence=confidence,
         threshold=1.0 - above,
-        # Where the classes lie apart, what is not safe is unsafe.
+        # If the classes are separable, no gap is left for "don't know".
         unsafe_below=1.0 - max(above, below),
         num_unsafe=int(label.sum()),
         num_safe=int((~label).sum()),
@@ -152,22 +152,21 @@ def score_threshold(
     confidence: float | None = None,
     whose: str = "unsafe",
 ) -> float:
-    """The highest score that may be called safe for a promised miss rate.
+    """Returns the highest score with the verdict "safe" for a promised miss rate.
 
     Args:
-        unsafe_score: Unsafe scores, (N,); NaN counts as the most unsafe of all.
+        unsafe_score: Unsafe scores, (N,); NaN counts as most unsafe.
         is_unsafe: Labels, (N,).
         miss_rate: Promised share of unsafe samples that score at most the threshold, in (0, 1).
-        confidence: With which it shall hold, in (0, 1); None for on average.
-        whose: What the samples with the label are called in an error.
+        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
+        whose: Name of the labelled class in an error message.
 
     Returns:
-        A threshold midway between the score it must stay below and the next lower one, of either
-        label; just below it when there is none.
+        The midpoint between the k-th lowest unsafe score and the next lower score of either label;
+        just below the former if there is none.
 
     Raises:
-        ValueError: Too few samples have the label, no score is finite, or a share is not in (0,
-            1).
+        ValueError: Too few samples have the label, no score is finite, or a rate is not in (0, 1).
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
@@ -178,7 +177,7 @@ def score_threshold(
         needed = episodes_needed(miss_rate, confidence=confidence)
         how = "on average" if confidence is None else f"with a confidence of {confidence:g}"
         raise ValueError(
-            f"calibration: a rate of {miss_rate:g} {how} takes at least {needed} {whose} episodes; "
+            f"calibration: a rate of {miss_rate:g} {how} needs at least {needed} {whose} episodes; "
             f"of {len(score)} episodes {found.size} are {whose}"
         )
     bound = found[rank - 1]
@@ -189,15 +188,15 @@ def score_threshold(
 
 
 def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | None = None) -> int:
-    """How many of n unsafe episodes a threshold may miss; -1 if n are too few for the promise.
+    """Returns how many of n unsafe episodes may be missed; -1 if n is too small for the promise.
 
     Args:
         num_unsafe: n.
-        miss_rate: The rate that is promised, in (0, 1).
-        confidence: With which it shall hold, in (0, 1); None for on average.
+        miss_rate: Promised miss rate, in (0, 1).
+        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
 
     Raises:
-        ValueError: A share is not in (0, 1).
+        ValueError: A rate is not in (0, 1).
     """
     _check_share("miss_rate", miss_rate)
     if confidence is None:
@@ -212,14 +211,14 @@ def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | Non
 
 
 def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int:
-    """The least number of unsafe episodes with which a miss rate can be promised.
+    """Returns the least number of unsafe episodes for a promised miss rate.
 
     Args:
-        miss_rate: The rate that is promised, in (0, 1).
-        confidence: With which it shall hold, in (0, 1); None for on average.
+        miss_rate: Promised miss rate, in (0, 1).
+        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
 
     Raises:
-        ValueError: A share is not in (0, 1).
+        ValueError: A rate is not in (0, 1).
     """
     _check_share("miss_rate", miss_rate)
     if confidence is None:
@@ -229,21 +228,21 @@ def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int
 
 
 def least_miss_rate(num_unsafe: int) -> float:
-    """The lowest miss rate that n unsafe episodes can promise on average: none is missed."""
+    """Returns the lowest miss rate that n unsafe episodes can promise on average."""
     return 1.0 / (num_unsafe + 1)
 
 
 def episode_scores(
     segments: Segments, unsafe_score: np.ndarray, kind: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One score an episode.
+    """Reduces the scores of segments to one score per episode.
 
-    A plan is judged once, by its first row. A motion is watched: it is called unsafe as soon as one
-    row is, so its score is the largest of all.
+    A plan is assessed once, by its first row. A motion is monitored and unsafe as soon as one row
+    is, so its score is the largest of all rows.
 
     Args:
-        segments: The N segments of some episodes, every row of them.
-        unsafe_score: Unsafe score of each, (N,); NaN counts as the most unsafe of all.
+        segments: The N segments of some episodes, from every row.
+        unsafe_score: Unsafe score of each, (N,); NaN counts as most unsafe.
         kind: "plan" or "motion".
 
     Returns:
@@ -269,7 +268,8 @@ def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarra
         raise ValueError(f"calibration: labels must be boolean, got {label.dtype}")
     if score.ndim != 1 or score.shape != label.shape:
         raise ValueError(
-            f"calibration: scores and labels must be as many, got {score.shape} and {label.shape}"
+            f"calibration: scores and labels must be of equal length, got {score.shape} and "
+            f"{label.shape}"
         )
     return np.where(np.isnan(score), math.inf, score), label
 

@@ -1,4 +1,4 @@
-"""The discrepancy function D: where the nominal model's scores cannot be relied on."""
+"""The discrepancy function D between actual and nominal unsafety scores."""
 
 from __future__ import annotations
 
@@ -13,23 +13,16 @@ _CHUNK = 2048
 class DiscrepancyFunction:
     """D(y), a Gaussian process regression of |lambda actual - lambda nominal| on Psi(x).
 
-    The amplitude of the kernel is fixed at one: a fitted one shrinks with the differences, and then
-    sigma is small everywhere, data or not. Length scale and noise are fitted on at most 250 of the
-    points; the posterior is exact with all of them.
+    The kernel's amplitude is fixed at one: a fitted amplitude shrinks with the differences, which
+    makes sigma small everywhere, even without data. Length scale and noise are fitted on at most
+    250 points; the posterior is exact with all points.
     """
 
-    def __init__(self) -> None:
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
-        self._kernel: Any = ConstantKernel(1.0, "fixed") * RBF(10.0, (3.0, 40.0)) + WhiteKernel(
-            0.03, (1e-3, 0.08)
-        )
-
     def fit(self, points: np.ndarray, difference: np.ndarray) -> DiscrepancyFunction:
-        """Learns D.
+        """Fits D.
 
         Args:
-            points: Psi(x) of the feedback, (N, 2), in units of the grid.
+            points: Psi(x) of the feedback, (N, 2), in grid units.
             difference: |lambda actual - lambda nominal|, (N,).
 
         Returns:
@@ -45,23 +38,23 @@ class DiscrepancyFunction:
         points, difference = points[is_finite].astype(float), difference[is_finite].astype(float)
         if not len(points):
             raise ValueError("DiscrepancyFunction: none of the feedback's points is finite")
-        kernel = _fitted(self._kernel, points, difference)
+        kernel = _fitted_kernel(points, difference)
         self.length_scale = float(kernel.k1.k2.length_scale)
         self.noise = float(kernel.k2.noise_level)
-        # The noise is of what was seen, and no part of sigma.
+        # As `alpha`, the noise of the observations is no part of sigma.
         self._process: Any = GaussianProcessRegressor(
             RBF(self.length_scale), alpha=self.noise, optimizer=None
         ).fit(points, difference)
         return self
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean m, clipped to [0, 1], and standard deviation sigma without the noise.
+        """Predicts the mean m, clipped to [0, 1], and the standard deviation sigma without noise.
 
         Args:
             points: (M, 2).
 
         Returns:
-            m and sigma, (M,) each; 0 and 1, the prior's, where a point is not finite.
+            m and sigma, (M,) each; the prior's 0 and 1 where a point is not finite.
         """
         mean, deviation = np.zeros(len(points)), np.ones(len(points))
         rows = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -73,17 +66,19 @@ class DiscrepancyFunction:
         return np.clip(mean, 0.0, 1.0), deviation
 
 
-def _fitted(kernel: Any, points: np.ndarray, difference: np.ndarray) -> Any:
+def _fitted_kernel(points: np.ndarray, difference: np.ndarray) -> Any:
     import warnings
 
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+    kernel = ConstantKernel(1.0, "fixed") * RBF(10.0, (3.0, 40.0)) + WhiteKernel(0.03, (1e-3, 0.08))
     if len(points) > _MOST_FITTED:
         rows = np.random.default_rng(0).choice(len(points), _MOST_FITTED, replace=False)
         points, difference = points[rows], difference[rows]
     with warnings.catch_warnings():
-        # Of a parameter that ends at its bound, which is what bounds are for.
+        # Hyperparameters may end at their bounds.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return GaussianProcessRegressor(kernel=kernel).fit(points, difference).kernel_
 
@@ -96,13 +91,13 @@ def updated_uncertainty(
     least: float,
     initial: float,
 ) -> np.ndarray:
-    """The uncertainty mu of nominal beliefs under a discrepancy, (N,).
+    """Returns the uncertainty mu of nominal beliefs under a discrepancy, (N,).
 
     Args:
         mean: m of the discrepancy at each belief's point, (N,).
-        deviation: sigma there, (N,).
+        deviation: sigma at each belief's point, (N,).
         gate: sigma_thre.
         least: mu_min.
-        initial: mu_ini, where the discrepancy is not known.
+        initial: mu_ini, used where sigma exceeds the gate.
     """
     return np.where(deviation <= gate, least + mean * (1.0 - least), initial)

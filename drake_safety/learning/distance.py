@@ -1,10 +1,10 @@
 """The safety distance Omega between segments, as a graph of nearest neighbours.
 
-Only the nearest neighbours under Omega are ever kept. Two exact bounds make this cheap. The
-Euclidean distance of two error sequences, the shorter one held at its last value, is the cost of
-one admissible warping path and so bounds DTW from above; it gives each segment a radius within
-which its neighbours must lie. Sorted by that radius, a block of segments needs DTW only up to its
-own largest radius, and dtaidistance's C implementation abandons a pair as soon as it exceeds it.
+Two exact bounds make the graph cheap. The Euclidean distance of two error sequences, the shorter
+one held at its last value, is the cost of one admissible warping path and so bounds DTW from above;
+it gives each segment a radius that contains its neighbours. Sorted by that radius, a block of
+segments needs DTW only up to its own largest radius, and dtaidistance's C implementation abandons
+a pair as soon as it exceeds it.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ def neighbour_graph(
     backend: str = "dtaidistance",
     progress: Callable[[float], None] | None = None,
 ) -> NeighbourGraph:
-    """The exact nearest neighbours under the safety distance Omega.
+    """Finds the exact nearest neighbours under the safety distance Omega.
 
     Args:
         error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H,
             n_z).
-        length: Samples of each that count, (N,).
+        length: Number of valid samples of each sequence, (N,).
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
-        backend: "dtaidistance", or "tslearn", which has no use for the bounds.
+        backend: "dtaidistance", or "tslearn", which ignores the bounds.
         progress: Called with the fraction done.
 
     Returns:
@@ -71,11 +71,11 @@ def neighbour_graph(
     num_segments = len(error)
     if not 0 < num_neighbours < num_segments:
         raise ValueError(
-            f"neighbour_graph: {num_neighbours} neighbours are asked for among {num_segments} "
-            "segments, expected fewer neighbours than segments"
+            f"neighbour_graph: got {num_neighbours} neighbours among {num_segments} segments, "
+            "expected fewer neighbours than segments"
         )
     if not np.all(np.isfinite(error)):
-        raise ValueError("neighbour_graph: the errors hold values that are not finite")
+        raise ValueError("neighbour_graph: the errors contain values that are not finite")
     series = _series(error, length)
     held = _hold_last(error, length)
     max_dtw = _max_dtw(series, held, backend)
@@ -132,10 +132,7 @@ def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
 def _dtw_block(
     series: list[np.ndarray], rows: slice, columns: slice, backend: str, limit: float = np.inf
 ) -> np.ndarray:
-    """DTW of `rows` against `columns`: sqrt(sum ||.||^2) along the best path.
-
-    Where it exceeds `limit` it may be infinite.
-    """
+    """DTW of `rows` against `columns`, sqrt(sum ||.||^2); values above `limit` may be infinite."""
     if backend == "tslearn":
         from tslearn.metrics import cdist_dtw
         from tslearn.utils import to_time_series_dataset
@@ -157,7 +154,7 @@ def _dtw_block(
 
 
 def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Blocks of rows of the matrix of Euclidean distances, rounded upwards."""
+    """Row blocks of the Euclidean distance matrix, rounded up."""
     squares = np.einsum("ij,ij->i", held, held)
     for start in range(0, len(held), _BLOCK):
         rows = slice(start, min(start + _BLOCK, len(held)))

@@ -1,4 +1,4 @@
-"""The low-dimensional embedding: its t-SNE target, and the map Psi that torch trains after it."""
+"""Training of the low-dimensional embedding: the t-SNE target and the map Psi."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import NeighbourGraph
 from drake_safety.learning.trained_maps import Embedding
 
@@ -23,18 +24,18 @@ def tsne(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> np.ndarray:
-    """The t-SNE embedding of a neighbour graph, (N, 2); the same seed gives the same bits.
+    """Computes the t-SNE embedding of a neighbour graph, (N, 2), deterministically for a seed.
 
-    The distances enter as they are: openTSNE squares them itself. It runs on one thread:
-    several gain nothing with the FFT of large sets, and on a busy machine they mostly wait.
+    Distances are not squared here: openTSNE squares them. It runs on one thread, as more threads
+    do not speed up the FFT of large sets.
 
     Raises:
-        ValueError: The graph has fewer than three times `perplexity` neighbours a segment.
+        ValueError: The graph has fewer than three times `perplexity` neighbours per segment.
     """
     num_neighbours = graph.indices.shape[1]
     if num_neighbours < int(3 * perplexity):
         raise ValueError(
-            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours a segment, "
+            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours per segment, "
             f"the graph has {num_neighbours}"
         )
     import openTSNE
@@ -68,47 +69,18 @@ def tsne(
     return np.asarray(embedding, dtype=float).copy()
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapSettings:
-    """How a map Psi is built and trained.
-
-    Attributes:
-        hidden_sizes: Widths of the trunk's layers.
-        dropout: Share of trunk activations dropped while training.
-        epochs: Passes over the inputs.
-        batch_size: Inputs a step.
-        learning_rate: Peak of the one-cycle schedule.
-        target_weight: Weight of the squared distance to t-SNE's point.
-        safety_weight: Weight of the safety head's cross entropy; 0 leaves the head out.
-        margin_weight: Weight of the margin head's Huber loss; 0 leaves the head out.
-        margin_unit: Margin that counts as one in the Huber loss [unit of the margins].
-        margin_range: Margins are clipped to this range [unit of the margins].
-    """
-
-    hidden_sizes: tuple[int, ...]
-    dropout: float
-    epochs: int
-    batch_size: int
-    learning_rate: float
-    target_weight: float
-    safety_weight: float
-    margin_weight: float
-    margin_unit: float
-    margin_range: tuple[float, float]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapData:
-    """What a map Psi learns from.
+    """Training data of a map Psi.
 
     Attributes:
         x: Inputs, (N, n_x).
-        has_target: Inputs that t-SNE saw, (N,).
-        target: Their points, in the order of x, (M, 2).
+        has_target: Whether the input has a point in t-SNE, (N,).
+        target: Points of these inputs, in the order of x, (M, 2).
         is_unsafe: Whether the input's episode ended unsafely, (N,).
         margins: Smallest future margins, (N, n_c).
         sample_weight: Weight of each input in all losses, (N,).
-        input_scale: Spread of each column of x as the map sees it, (n_x,).
+        input_scale: Spread of each column of x after standardisation, (n_x,).
     """
 
     x: np.ndarray
@@ -120,7 +92,7 @@ class MapData:
     input_scale: np.ndarray
 
     def take(self, rows: np.ndarray) -> MapData:
-        """Some of the inputs, chosen by a mask (N,)."""
+        """Selects inputs by a mask (N,)."""
         return MapData(
             x=self.x[rows],
             has_target=self.has_target[rows],
@@ -134,34 +106,34 @@ class MapData:
 
 def train_map(
     data: MapData,
-    settings: MapSettings,
+    parameters: AssessmentParameters,
     *,
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Trains one map Psi; the same seed on the same machine gives the same weights.
+    """Trains one map Psi, deterministically for a seed and a machine.
 
-    Departure: the paper trains Psi on ||y - Psi(x)|| alone and leaves safety out. With a safety
-    head on y and a margin head on the trunk, the map separates what t-SNE places together but ends
-    differently; held-out accuracy on the robots rises from weak to that of a direct classifier.
+    Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
+    head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
+    on the robots rises to that of a direct classifier.
 
     Args:
-        data: Inputs and targets; x is standardised here, with a floor under the spread so that a
-            column that hardly moves is not amplified.
-        settings: Shape of the network and of the training.
-        seed: Seeds the initial weights, the batches and the dropout.
+        data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
+            nearly constant columns are not amplified.
+        parameters: The assessment's parameters. A head whose weight is 0 is omitted.
+        seed: Seed of the initial weights, the batches and the dropout.
         progress: Called with the fraction done.
 
     Returns:
-        The weights of one member, as `Embedding` names them, without the leading member axis.
+        The weights of one member, named as in `Embedding`, without the leading member axis.
     """
     import torch
 
     num_threads = torch.get_num_threads()
-    # Layers this small gain nothing from threads; one is also the quickest on the wall clock.
+    # One thread is fastest for layers of this size.
     torch.set_num_threads(1)
     try:
-        return _train(torch, data, settings, seed, progress)
+        return _train(torch, data, parameters, seed, progress)
     finally:
         torch.set_num_threads(num_threads)
 
@@ -169,11 +141,11 @@ def train_map(
 def _train(
     torch: Any,
     data: MapData,
-    settings: MapSettings,
+    parameters: AssessmentParameters,
     seed: int,
     progress: Callable[[float], None] | None,
 ) -> dict[str, np.ndarray]:
-    has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
+    has_safety, has_margins = parameters.safety_weight > 0.0, parameters.margin_weight > 0.0
     mean = data.x.mean(axis=0)
     spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
     target_scale = float(data.target.std())
@@ -181,7 +153,7 @@ def _train(
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        net = _build_network(torch, num_inputs, num_margins, has_safety, settings)
+        net = _build_network(torch, num_inputs, num_margins, has_safety, parameters)
         x = torch.from_numpy(((data.x - mean) / spread).astype(np.float32))
         target = torch.zeros(len(x), 2)
         has_target = torch.from_numpy(np.asarray(data.has_target, dtype=bool))
@@ -189,31 +161,29 @@ def _train(
         weight = torch.from_numpy(np.asarray(data.sample_weight, dtype=np.float32))
         target_weight = weight * has_target
         is_unsafe = torch.from_numpy(np.asarray(data.is_unsafe, dtype=np.float32))
-        margins = torch.from_numpy(
-            (np.clip(data.margins, *settings.margin_range) / settings.margin_unit).astype(
-                np.float32
-            )
-        )
-        num_batches = -(-len(x) // settings.batch_size)
+        low, high = parameters.margin_range
+        clipped = np.clip(data.margins, low, high) / parameters.margin_unit
+        margins = torch.from_numpy(clipped.astype(np.float32))
+        num_batches = -(-len(x) // parameters.batch_size)
         optimiser = torch.optim.AdamW(
-            net.parameters(), lr=settings.learning_rate, weight_decay=1e-4, fused=True
+            net.parameters(), lr=parameters.learning_rate, weight_decay=1e-4, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser,
-            max_lr=settings.learning_rate,
-            total_steps=settings.epochs * num_batches + 1,
+            max_lr=parameters.learning_rate,
+            total_steps=parameters.epochs * num_batches + 1,
         )
         functional = torch.nn.functional
-        # The targets' share of a batch varies by chance, so its mean over the whole set divides.
+        # The share of targets varies between batches, so the mean over the whole set normalises.
         mean_target_weight = float(target_weight.mean())
-        for epoch in range(settings.epochs):
-            for batch in torch.randperm(len(x)).split(settings.batch_size):
+        for epoch in range(parameters.epochs):
+            for batch in torch.randperm(len(x)).split(parameters.batch_size):
                 z = net["trunk"](x[batch])
                 output = net["output"](z)
                 y, w = output[:, :2], weight[batch]
                 squared = ((y - target[batch]) ** 2).sum(dim=1)
                 loss = (
-                    settings.target_weight
+                    parameters.target_weight
                     * (target_weight[batch] * squared).mean()
                     / mean_target_weight
                 )
@@ -222,34 +192,38 @@ def _train(
                     entropy = functional.binary_cross_entropy_with_logits(
                         logit, is_unsafe[batch], weight=w
                     )
-                    loss = loss + settings.safety_weight * entropy
+                    loss = loss + parameters.safety_weight * entropy
                 if has_margins:
                     huber = functional.huber_loss(output[:, 2:], margins[batch], reduction="none")
-                    loss = loss + settings.margin_weight * (w * huber.mean(dim=1)).mean()
+                    loss = loss + parameters.margin_weight * (w * huber.mean(dim=1)).mean()
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
                 schedule.step()
             if progress is not None:
-                progress((epoch + 1) / settings.epochs)
-    return _folded_weights(net, mean, spread, target_scale, num_margins, settings)
+                progress((epoch + 1) / parameters.epochs)
+    return _folded_weights(net, mean, spread, target_scale, num_margins, parameters)
 
 
 def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:
-    """One `Embedding` of the members that `train_map` returned."""
+    """Stacks members returned by `train_map` into one `Embedding`."""
     weights = {name: np.stack([member[name] for member in members]) for name in members[0]}
     return Embedding(weights, num_margins=num_margins)
 
 
 def _build_network(
-    torch: Any, num_inputs: int, num_margins: int, has_safety: bool, settings: MapSettings
+    torch: Any,
+    num_inputs: int,
+    num_margins: int,
+    has_safety: bool,
+    parameters: AssessmentParameters,
 ) -> Any:
     nn = torch.nn
     trunk, width = [], num_inputs
-    for size in settings.hidden_sizes:
+    for size in parameters.hidden_sizes:
         trunk += [nn.Linear(width, size), nn.ReLU()]
-        if settings.dropout > 0.0:
-            trunk.append(nn.Dropout(settings.dropout))
+        if parameters.dropout > 0.0:
+            trunk.append(nn.Dropout(parameters.dropout))
         width = size
     net = nn.ModuleDict(
         {"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)}
@@ -267,7 +241,7 @@ def _folded_weights(
     spread: np.ndarray,
     target_scale: float,
     num_margins: int,
-    settings: MapSettings,
+    parameters: AssessmentParameters,
 ) -> dict[str, np.ndarray]:
     """The trained layers with the standardisation of x, y and the margins folded in."""
 
@@ -288,7 +262,7 @@ def _folded_weights(
             weight = weight / spread[:, None]
         weights[f"trunk.{index}.weight"], weights[f"trunk.{index}.bias"] = weight, bias
     ((weight, bias),) = linear_layers([net["output"]])
-    column_scale = np.array([target_scale] * 2 + [settings.margin_unit] * num_margins)
+    column_scale = np.array([target_scale] * 2 + [parameters.margin_unit] * num_margins)
     weights["output.weight"], weights["output.bias"] = weight * column_scale, bias * column_scale
     if "safety" in net:
         for index, (weight, bias) in enumerate(linear_layers(net["safety"])):

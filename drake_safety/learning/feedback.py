@@ -1,4 +1,4 @@
-"""Feedback of an actual robot: its episodes beside their nominal twins, reduced to segments."""
+"""Feedback from an actual robot: its episodes paired with nominal twins, split into segments."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import DIVERGED, Episodes, EpisodesInfo, split, unsafety_score
 
 START_TOLERANCE = 1e-2
-"""By how much a twin's first true state may differ: logged positions are not exact."""
+"""Tolerance of a twin's first true state: logged positions are not exact."""
 _logger = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeedbackSet:
-    """One actual episode and its nominal twin from the same state along the same plan.
+    """An actual episode and its nominal twin from the same state along the same plan.
 
-    Both are known by what adaptation needs: the inputs x at every start row of the actual one, the
-    twin's at its first, and when either ended.
+    Holds what adaptation needs: the inputs x at every start row of the actual episode and at the
+    twin's first row, and the end of both.
 
     Attributes:
-        info: What the actual episodes share.
+        info: The `EpisodesInfo` of the actual episodes.
         nominal_hash: Scenario hash of the twin.
         twin_seed: Seed of the twin's set.
         index: Number of the pair.
-        state: State as the assessor sees it, (N, n_s).
+        state: Measured state, (N, n_s).
         true_state: State without observation noise, (N, n_s).
-        desired_preview: Coming desired outputs, (N, H*n_z).
+        desired_preview: Desired outputs over the horizon, (N, H*n_z).
         features: Features, (N, n_f).
         steps_since_start: Rows from the episode's `first_step` to each start, (N,).
         remaining_steps: R, steps until the actual episode ends, (N,).
-        nominal_remaining_steps: Steps from there until the twin ends, (N,); 0 where it has ended.
-        twin_state: State as the assessor sees it at the twin's first row, (n_s,).
-        twin_desired_preview: Coming desired outputs there, (H*n_z,).
-        twin_features: Features there, (n_f,).
+        nominal_remaining_steps: Steps until the twin ends, (N,); 0 after its end.
+        twin_state: Measured state at the twin's first row, (n_s,).
+        twin_desired_preview: Desired preview at the twin's first row, (H*n_z,).
+        twin_features: Features at the twin's first row, (n_f,).
         is_unsafe: Whether the actual episode ended unsafely.
-        nominal_is_unsafe: Whether the twin did.
+        nominal_is_unsafe: Whether the twin ended unsafely.
         cause: Column of the constraint that ended the actual episode, -1 when safe.
     """
 
@@ -67,25 +67,23 @@ class FeedbackSet:
 
     @property
     def differs(self) -> bool:
-        """Whether one of the two is safe and the other is not."""
+        """Whether exactly one of the two episodes is safe."""
         return self.is_unsafe != self.nominal_is_unsafe
 
 
 def feedback_sets(
     actual: Episodes, nominal: Episodes, *, nominal_hash: str | None = None
 ) -> list[FeedbackSet]:
-    """Pairs actual episodes with their nominal twins, by index.
-
-    A pair of which one simulation diverged says nothing and is left out.
+    """Pairs actual episodes with their nominal twins by index, without diverged pairs.
 
     Args:
         actual: Episodes of the actual robot.
-        nominal: Their twins; others may be among them.
-        nominal_hash: Scenario hash of the nominal plant, where the twins' own also tells of the
-            options that pairs were made with; theirs by default.
+        nominal: The twins; further episodes are ignored.
+        nominal_hash: Scenario hash of the nominal plant, if the twins' hash also covers the options
+            of the pairs; the twins' hash by default.
 
     Raises:
-        ValueError: The two sets are of different tasks, a twin is missing, or begins elsewhere.
+        ValueError: The tasks differ, a twin is missing, or a twin starts in another state.
     """
     _check_same_task(actual.info, nominal.info)
     twins = {episode.index: episode for episode in nominal}
@@ -100,8 +98,8 @@ def feedback_sets(
         apart = np.abs(episode.true_state[0] - twin.true_state[0]).max(initial=0.0)
         if not apart <= START_TOLERANCE:
             raise ValueError(
-                f"feedback of '{actual.info.scenario}': the twin of episode {episode.index} begins "
-                f"elsewhere; their first states differ by {apart:.3g}"
+                f"feedback of '{actual.info.scenario}': the twin of episode {episode.index} starts "
+                f"in another state; their first states differ by {apart:.3g}"
             )
         if DIVERGED in (episode.cause, twin.cause):
             _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
@@ -143,17 +141,17 @@ def _check_same_task(actual: EpisodesInfo, nominal: EpisodesInfo) -> None:
 
 
 def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> None:
-    """Refuses feedback of another scenario than an assessment was learned from.
+    """Checks that feedback is of the scenario that an assessment was trained on.
 
     Args:
         feedback: The feedback sets.
-        learned: What the training episodes share.
+        learned: The `EpisodesInfo` of the training episodes.
 
     Raises:
-        ValueError: There is none, or it is another's; both sides are named.
+        ValueError: There is no feedback, or it differs; the message names both values.
     """
     if not feedback:
-        raise ValueError(f"feedback of '{learned.scenario}': there is none to adapt to")
+        raise ValueError(f"feedback of '{learned.scenario}': got none, expected at least one set")
     for one in feedback:
         sides = {
             name: (getattr(one.info, name), getattr(learned, name))
@@ -172,12 +170,12 @@ def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> No
             if got != expected:
                 raise ValueError(
                     f"feedback set {one.index} and the assessment differ in {what}: the feedback "
-                    f"has {got}, the assessment was learned with {expected}"
+                    f"has {got}, the assessment was trained with {expected}"
                 )
 
 
 def used_episodes(feedback: Sequence[FeedbackSet]) -> list[UsedEpisodes]:
-    """The sets of actual episodes and of twins that feedback is of."""
+    """Returns the sets of actual and twin episodes in feedback."""
     sides = [(one.info.variation, one.info.scenario_hash, one.info.seed) for one in feedback]
     sides += [("nominal", one.nominal_hash, one.twin_seed) for one in feedback]
     return [
@@ -194,17 +192,17 @@ def used_episodes(feedback: Sequence[FeedbackSet]) -> list[UsedEpisodes]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeedbackSegments:
-    """Segments of several feedback sets, as an update takes them.
+    """Segments of several feedback sets.
 
     Attributes:
         set_index: Position of the segment's set, (N,).
-        state: State that Psi is given, (N, n_s).
-        desired_preview: Coming desired outputs, (N, H*n_z).
+        state: State in x, (N, n_s).
+        desired_preview: Desired outputs over the horizon, (N, H*n_z).
         features: Features, (N, n_f).
         score: lambda of the actual episode, (N,).
         nominal_score: lambda of the twin, (N,).
         is_unsafe: Whether the actual episode ended unsafely, (N,).
-        nominal_is_unsafe: Whether the twin did, (N,).
+        nominal_is_unsafe: Whether the twin ended unsafely, (N,).
         cause: Column of the constraint that ended the actual episode, -1 when safe, (N,).
     """
 
@@ -225,17 +223,17 @@ class FeedbackSegments:
 def segments_of(
     feedback: Sequence[FeedbackSet], *, stride: int, shortest: int, discount: float, plain: bool
 ) -> FeedbackSegments:
-    """The segments of feedback sets, cut as the training episodes were.
+    """Splits feedback sets into segments as training episodes are split.
 
-    A twin that has left the safe set before a segment begins scores 1 there.
+    A twin that has left the safe set before a segment starts scores 1 there.
 
     Args:
         feedback: The feedback sets.
         stride: Rows between two starts.
-        shortest: Steps that a safe episode's segment has at least.
+        shortest: Least number of steps of a safe episode's segment.
         discount: gamma of the unsafety score.
-        plain: Whether nominal plants, taken for the actual one, show the state without noise, as
-            the paper's mode has learned it.
+        plain: Whether to use the state without noise for "actual" episodes of the nominal plant, as
+            in training in the paper's mode.
 
     Raises:
         ValueError: No set has a segment of that length.

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 OUTSIDE = -1
-"""Cell of a point that no cell contains; NaN lies outside too."""
+"""Cell of a point outside the grid, and of NaN."""
 
 _FILL = 1.1
 """Ratio of the grid's half width to the largest coordinate of the points it is scaled for."""
@@ -17,10 +17,10 @@ _FILL = 1.1
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Resolution x resolution square cells, centred at the origin.
+    """A grid of resolution x resolution square cells, centred at the origin.
 
     Cell (i, j) has the index i * resolution + j, where i counts along the first coordinate. A cell
-    contains its lower edges and not its upper ones.
+    contains its lower edges but not its upper ones.
 
     Attributes:
         resolution: Number of cells a side, R.
@@ -54,10 +54,10 @@ class Grid:
         return np.column_stack([first.ravel(), second.ravel()])
 
     def scale(self, points: np.ndarray) -> np.ndarray:
-        """Centres points (N, 2) and rescales them to fill the grid.
+        """Centres points (N, 2) and scales them to 1.1 * max|y| = half width.
 
         Departure: the extent of a t-SNE embedding grows with the number of points, so a cell length
-        in its units has no meaning across data sets. Afterwards 1.1 * max|y| is the half width.
+        in its units is not comparable across data sets.
 
         Raises:
             ValueError: The points are not finite or all coincide.
@@ -69,7 +69,7 @@ class Grid:
         return centred * (self.half_width / (_FILL * extent))
 
     def locate(self, points: np.ndarray) -> np.ndarray:
-        """L: the cell of each point (..., 2), or `OUTSIDE`."""
+        """Returns L, the cell of each point (..., 2), or `OUTSIDE`."""
         position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
         is_inside = _is_within(position, self.resolution)
         index = np.where(is_inside, position, 0.0).astype(int)
@@ -77,7 +77,7 @@ class Grid:
         return np.where(is_inside[..., 0], cells, OUTSIDE)
 
     def bilinear(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weights that interpolate between the centres of the four cells around each point.
+        """Returns bilinear weights between the centres of the four cells around each point.
 
         Between the outermost centres and the grid's edge only the nearest existing centres count.
 
@@ -85,8 +85,8 @@ class Grid:
             points: (..., 2).
 
         Returns:
-            Cells (..., 4) and their weights (..., 4), which sum to one; a point that lies outside
-            the grid has cells `OUTSIDE` and weights zero.
+            Cells (..., 4) and their weights (..., 4), which sum to one; outside the grid the cells
+            are `OUTSIDE` and the weights zero.
         """
         position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
         is_inside = _is_within(position, self.resolution)
@@ -94,7 +94,7 @@ class Grid:
         position = np.where(is_inside, position - 0.5, 0.0).clip(0.0, last)
         lower = np.minimum(position.astype(int), max(last - 1, 0))
         fraction = position - lower
-        # Both neighbours along an axis, and then the four pairs of them.
+        # Two neighbours along each axis give four cells.
         index = np.stack([lower, np.minimum(lower + 1, last)], axis=-2)
         weight = np.stack([1.0 - fraction, fraction], axis=-2)
         cells = index[..., :, None, 0] * self.resolution + index[..., None, :, 1]
@@ -107,5 +107,5 @@ class Grid:
 
 
 def _is_within(position: np.ndarray, resolution: int) -> np.ndarray:
-    """Whether positions (..., 2) in units of cells lie in the grid, (..., 1); not where NaN."""
+    """Whether positions (..., 2) in units of cells lie in the grid, (..., 1); false for NaN."""
     return np.all((position >= 0.0) & (position < resolution), axis=-1, keepdims=True)

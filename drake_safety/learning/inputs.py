@@ -1,4 +1,4 @@
-"""x, what the maps take in: the state, the desired outputs ahead and, "sharpened", the features."""
+"""The maps' input x: state, desired preview and, in the sharpened mode, features."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def inputs(
     features: np.ndarray | None,
     parameters: AssessmentParameters,
 ) -> np.ndarray:
-    """x, (..., n_x): [s; z*] in the paper's mode, [s; z*; features] in the sharpened one.
+    """Returns x, (..., n_x): [s; z*] in the paper's mode, [s; z*; features] when sharpened.
 
     Args:
-        state: States as the assessor sees them, (..., n_s).
-        desired_preview: Coming desired outputs, row-major in time, (..., H*n_z).
-        features: Features, (..., n_f); the paper's mode has no use for them.
-        parameters: Of the assessment. With a feature unit u, asinh(features / u) comes last.
+        state: Measured states, (..., n_s).
+        desired_preview: Desired outputs over the horizon, row-major in time, (..., H*n_z).
+        features: Features, (..., n_f); ignored in the paper's mode.
+        parameters: The assessment's. A feature unit u appends asinh(features / u).
     """
     parts = [np.asarray(state, dtype=float), np.asarray(desired_preview, dtype=float)]
     if features is not None and parameters.is_sharpened:
@@ -31,7 +31,7 @@ def inputs(
 
 
 def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:
-    """n_x, the width of x."""
+    """Returns n_x, the width of x."""
     width = len(info.state_names) + info.horizon * len(info.output_names)
     if parameters.is_sharpened:
         width += len(info.feature_names) * (2 if parameters.feature_unit else 1)
@@ -39,10 +39,10 @@ def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:
 
 
 def check_width(num_columns: int, info: EpisodesInfo, parameters: AssessmentParameters) -> None:
-    """Refuses an x of another width, and says what it should consist of.
+    """Checks the width of x.
 
     Raises:
-        ValueError: There are not n_x columns.
+        ValueError: The number of columns is not n_x.
     """
     if num_columns != num_inputs(info, parameters):
         num_features = len(info.feature_names) if parameters.is_sharpened else 0

@@ -1,4 +1,4 @@
-"""What an assessment says of inputs: beliefs read from the grid where the maps send them."""
+"""Evaluation of an assessment: beliefs read from the grid at the maps' outputs."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from drake_safety.learning.grid import OUTSIDE, Grid
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 LOGIT_LIMIT = 8.0
-"""Largest logit that a head is believed."""
+"""Heads' logits are clipped to this magnitude."""
 SHIFT_LIMIT = 100.0
-"""Largest shift of the base logit: beyond it sigma is 0 or 1 anyway, and exp must not overflow."""
+"""Largest shift of the base logit, which keeps exp from overflowing."""
+NO_CAUSE = -1
+"""Cause where no constraint is likely to be violated."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Assessments:
-    """What an assessment says of N inputs.
+    """Assessments of N inputs.
 
     Attributes:
-        safety_probability: Gamma = b_safe, (N,). At most 1 - mu: not a calibrated probability.
-        normalized: b_safe / (1 - mu), the safe share of what is known, (N,); 0 where nothing is.
+        safety_probability: Γ = b_safe, (N,). At most 1 - mu: not a calibrated probability.
+        normalized: b_safe / (1 - mu), the safe share of the known mass, (N,); 0 where mu is 1.
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for inputs that are not finite.
-        embedding: y by the first map, (N, 2); NaN for inputs that are not finite.
-        cause_probability: b_unsafe split by the constraint that will be violated, (N, n_c).
+        embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
+        cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
-            margins], (N, n_c); NaN for inputs that are not finite, without a margin head, and
-            always in the paper's mode.
-        unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN where there is none.
-        calibrated: Safety probability by the maps' heads, corrected by what feedback of the actual
-            robot has shown, (N,); 0 where nothing is known. Without heads it is `normalized`.
+            margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
+        unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN without a head.
+        calibrated: Calibrated probability of safety from the base logit with the correction by
+            feedback, (N,); 0 where mu is 1. Without heads equal to `normalized`.
     """
 
     safety_probability: np.ndarray
@@ -44,7 +45,7 @@ class Assessments:
     calibrated: np.ndarray
 
     def one(self, row: int) -> Assessment:
-        """What it says of one of them."""
+        """Returns the assessment in one row."""
         return Assessment(
             safety_probability=float(self.safety_probability[row]),
             normalized=float(self.normalized[row]),
@@ -58,7 +59,7 @@ class Assessments:
 
 @dataclass(kw_only=True, eq=False, slots=True)
 class Assessment:
-    """What an assessment says of one input; the fields of `Assessments` without the axis N."""
+    """Assessment of one input; the fields of `Assessments` without the axis N."""
 
     safety_probability: float
     normalized: float
@@ -71,17 +72,17 @@ class Assessment:
 
 @dataclass(frozen=True, kw_only=True)
 class BaseLogit:
-    """The base logit: one logit of an unsafe end from what the maps' heads say.
+    """The base logit: a logit of an unsafe end from the outputs of the maps' heads.
 
     ``offset + safety_slope z - margin_slope m / margin_unit``, where z is the mean logit of the
-    safety heads and m the smallest predicted margin; a head that is missing has no part in it.
+    safety heads and m the smallest predicted margin; the term of a missing head is zero.
 
     Attributes:
         margin_unit: Unit of margins [unit of the margins].
-        margin_range: Margins are clipped to this range [unit of the margins].
+        margin_range: Range that margins are clipped to [unit of the margins].
         offset: The base logit where both heads are zero.
-        safety_slope: What a logit of the safety heads counts for.
-        margin_slope: Logits by which a margin of one unit is safer.
+        safety_slope: Slope in the logit of the safety heads.
+        margin_slope: Slope in the negative margin, in `margin_unit`.
     """
 
     margin_unit: float
@@ -91,7 +92,7 @@ class BaseLogit:
     margin_slope: float = 1.0
 
     def heads(self, output: EmbeddingOutput) -> np.ndarray:
-        """z and -m / margin_unit of all inputs, (N, 2); zero for a head that is missing."""
+        """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head."""
         found = np.zeros((output.embedding.shape[1], 2))
         if np.isfinite(output.unsafe_logit).any() or not output.margins.shape[2]:
             found[:, 0] = np.clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT).mean(axis=0)
@@ -101,21 +102,21 @@ class BaseLogit:
         return found
 
     def of_heads(self, heads: np.ndarray) -> np.ndarray:
-        """The base logit, (N,), of what `heads` gave."""
+        """Returns the base logit (N,) from the values of `heads`, (N, 2)."""
         logit = self.offset + heads @ (self.safety_slope, self.margin_slope)
         return np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
 @dataclass(eq=False, slots=True)
 class Correction:
-    """What feedback adds to the base logit: to its three numbers, and by what else the maps know.
+    """Correction of the base logit by feedback.
 
     Attributes:
-        change: What is added to the offset, safety slope and margin slope, (3,).
-        hidden: What each activation of the maps' last hidden layer, and a last entry of 1, adds to
-            the base logit, (K, num_activations + 1).
-        hidden_range: Least and most that they add together, (2,): what they added in feedback, for
-            beyond it nobody knows.
+        change: Changes of the offset, safety slope and margin slope, (3,).
+        hidden: Weights of the activations of the maps' last hidden layer, and a constant, (K,
+            num_activations + 1).
+        hidden_range: Least and largest sum of the hidden layer's terms in feedback, to which it is
+            clipped, (2,).
         guard: 1 in cells of each map where the base logit must not fall, else 0, (K, R*R).
     """
 
@@ -126,7 +127,7 @@ class Correction:
 
     @classmethod
     def none(cls, embedding: Embedding, grid: Grid) -> Correction:
-        """No correction, as before any feedback."""
+        """Returns the zero correction."""
         return cls(
             change=np.zeros(3),
             hidden=np.zeros((embedding.num_members, embedding.num_activations + 1)),
@@ -136,23 +137,23 @@ class Correction:
 
     @property
     def is_any(self) -> bool:
-        """Whether anything is added at all."""
+        """Whether the correction is not zero."""
         return bool(self.change.any() or self.hidden.any())
 
     def residual(self, embedding: Embedding, x: np.ndarray) -> np.ndarray:
-        """What the hidden layer adds at finite inputs (N, n_x), (N,)."""
+        """Returns the hidden layer's contribution at finite inputs (N, n_x), (N,)."""
         if not self.hidden.any():
             return np.zeros(len(x))
         added = hidden_sum(embedding.activations(x), self.hidden)
         return np.clip(added, *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
-        """What is added to the base logit, (N,).
+        """Returns the shift of the base logit, (N,).
 
         Args:
             heads: z and -m / margin_unit, (N, 2).
-            residual: What the hidden layer adds, (N,).
-            guard: What is read from the cells' guard, (N,).
+            residual: Contribution of the hidden layer, (N,).
+            guard: Interpolated guard of the cells, (N,).
         """
         shift = self.change[0] + heads @ self.change[1:] + residual
         shift = np.clip(shift, -SHIFT_LIMIT, SHIFT_LIMIT)
@@ -160,23 +161,53 @@ class Correction:
 
 
 def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """What activations (K, N, n) amount to by weights (K, n + 1), the last one constant, (N,)."""
+    """Sums activations (K, N, n) by weights (K, n + 1), the last of which is constant, (N,)."""
     return np.einsum("kni,ki->n", activations, hidden[:, :-1]) + hidden[:, -1].sum()
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
-    """Where more than half of a belief comes from cells that know nothing, (N,).
+    """Returns where more than half of a belief comes from empty cells, (N,).
 
     Args:
         belief: (b_safe, b_unsafe, mu), (N, 3).
-        initial_uncertainty: mu_ini, what a cell that knows all it can leaves open.
+        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
     """
     return belief[:, belief_masses.UNCERTAINTY] > 0.5 * (1.0 + initial_uncertainty)
 
 
 def sigmoid(z: np.ndarray) -> np.ndarray:
-    """1 / (1 + exp(-z)) of logits that are not beyond some hundreds."""
+    """Returns 1 / (1 + exp(-z)) for logits of moderate magnitude."""
     return 1.0 / (1.0 + np.exp(-z))
+
+
+def likely_causes(
+    cause_probability: np.ndarray,
+    predicted_margins: np.ndarray,
+    margin_unit: float | np.ndarray = 1.0,
+) -> np.ndarray:
+    """Returns the constraint that is most likely to be violated first.
+
+    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
+    the paper's mode, the one with the largest unsafe mass. Cells contain segments that end alike
+    for different reasons, so for a single motion the margins are more specific than the mass.
+
+    Args:
+        cause_probability: b_unsafe split by constraint, (N, n_c).
+        predicted_margins: Predicted smallest margin of each constraint [m, rad], (N, n_c); NaN
+            where none is predicted.
+        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
+
+    Returns:
+        Columns of the constraints, (N,); `NO_CAUSE` without margins and mass.
+    """
+    probability = np.asarray(cause_probability, dtype=float)
+    relative = np.asarray(predicted_margins, dtype=float) / margin_unit
+    if probability.shape[1] == 0:
+        return np.full(len(probability), NO_CAUSE)
+    by_mass = np.where(probability.max(axis=1) > 0.0, probability.argmax(axis=1), NO_CAUSE)
+    has_margins = np.isfinite(relative).any(axis=1)
+    by_margin = np.where(np.isfinite(relative), relative, np.inf).argmin(axis=1)
+    return np.where(has_margins, by_margin, by_mass)
 
 
 def predict(
@@ -194,24 +225,24 @@ def predict(
     Args:
         x: Inputs, (N, n_x).
         embedding: The maps.
-        grid: The grid of their cells.
+        grid: The grid.
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        correction: What feedback adds to the base logit.
+        correction: Correction of the base logit by feedback.
         base_logit: The base logit; None without heads.
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)
     cells, weights = _cells(output.embedding, grid, is_sharpened)
     is_outside = cells[..., 0] == OUTSIDE
-    # Rows of all members' cells; a point outside has weights of zero, so any row will do for it.
+    # Rows of all members' cells; points outside have zero weights, so their row is arbitrary.
     cells = cells + grid.num_cells * np.arange(len(cells))[:, None, None]
     num_members, _, num_columns = beliefs.shape
     masses = np.einsum("knw,knwc->nc", weights, beliefs.reshape(-1, num_columns)[cells])
-    # A map that sends the input outside its grid knows nothing of it.
+    # A map whose output lies outside its grid contributes the empty belief.
     masses[:, belief_masses.UNCERTAINTY] += is_outside.sum(axis=0)
     masses /= num_members
     safe = masses[:, belief_masses.SAFE]
-    # As a sum, not as 1 - mu: rounding must not lift the share above one.
+    # A sum instead of 1 - mu, so that rounding cannot raise the share above one.
     known = safe + masses[:, belief_masses.UNSAFE]
     is_known = known > 0.0
     normalized = np.divide(safe, known, out=np.zeros_like(safe), where=is_known)
@@ -230,7 +261,7 @@ def predict(
     if output.margins.shape[2]:
         margins = output.margins.mean(axis=0)
     return Assessments(
-        # Gamma(x) = b_safe of the cell that Psi(x) lies in
+        # Γ(x) = b_safe of the cell of Psi(x)
         safety_probability=safe.copy(),
         normalized=normalized,
         belief=masses[:, :3].copy(),
@@ -243,7 +274,7 @@ def predict(
 
 
 def _cells(points: np.ndarray, grid: Grid, is_sharpened: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Cells that beliefs are read from and their weights, (K, N, 4), or (K, N, 1) as printed."""
+    """Cells to read and their weights, (K, N, 4), or (K, N, 1) in the paper's mode."""
     if is_sharpened:
         return grid.bilinear(points)
     cells = grid.locate(points)[..., None]

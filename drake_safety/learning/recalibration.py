@@ -1,4 +1,4 @@
-"""How feedback changes the base logit, and beliefs with it: the update of the sharpened mode."""
+"""Recalibration: the sharpened mode's update of base logit and beliefs from feedback."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from drake_safety.learning.trained_maps import Embedding
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcomes:
-    """What the maps say of rows of episodes, and how the episodes ended.
+    """Outputs of the maps for rows of episodes, with the episodes' labels.
 
     Attributes:
-        heads: What the base logit is made of, see `BaseLogit.heads`, (M, 2).
-        activations: Of the maps' last hidden layer, (K, M, n).
+        heads: Inputs of the base logit, see `BaseLogit.heads`, (M, 2).
+        activations: Activations of the maps' last hidden layer, (K, M, n).
         is_unsafe: Whether the row's episode ended unsafely, (M,).
-        weight: What the row counts for, (M,).
+        weight: Sample weight, (M,).
     """
 
     heads: np.ndarray
@@ -34,12 +34,12 @@ class Outcomes:
 
 
 def row_weights(num_rows: np.ndarray) -> np.ndarray:
-    """What rows of episodes count for: one for an episode's first row, and two for all together.
+    """Returns sample weights: one for an episode's first row, and two spread over all its rows.
 
-    Rows of an episode share their end: an episode is worth a few samples, not one for each row.
+    The rows of an episode share one label, so an episode counts as a few samples.
 
     Args:
-        num_rows: Rows of each episode; they follow each other.
+        num_rows: Number of rows of each episode, in order.
     """
     first = np.cumsum(num_rows) - num_rows
     weight = np.repeat(2.0 / num_rows, num_rows)
@@ -53,13 +53,16 @@ def outcomes(
     embedding: Embedding,
     base_logit: BaseLogit,
 ) -> tuple[Outcomes, Outcomes]:
-    """All rows of the actual episodes, and the first ones of their twins.
+    """Evaluates the maps on all rows of the actual episodes and on the twins' first rows.
 
     Args:
         feedback: The feedback sets.
-        inputs: x from states, previews and features.
+        inputs: Function of states, previews and features that returns x.
         embedding: The maps.
         base_logit: The base logit.
+
+    Returns:
+        The actual episodes' outcomes and the twins'.
     """
     num_rows = np.array([len(one) for one in feedback])
     sides = (
@@ -95,16 +98,15 @@ def outcomes(
 def fitted_change(
     actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is added to the base logit, by its own three numbers and by the maps' last hidden layer.
+    """Fits the correction of the base logit.
 
-    With phi = (1, z, -m / margin_unit, activations), w minimises the log loss of sigma(ell + w .
-    phi), ell being a row's base logit, on the actual episodes, with a normal prior, and less what
-    ell itself is wrong about at the start of the twins: w . sum phi (sigma(ell) - label). What is
-    hard to tell of a start is so for both of a pair and cancels, and so does what ell is wrong
-    about on the nominal plant, too. Later a twin is in another state, and its end says nothing of
-    where the actual robot is: those rows of the actual episodes count without one. Activations are
-    taken from their mean in units of their mean distance from it, so that all of them together add
-    as much as `hidden_std` says. What the slopes change by leaves them >= 0.
+    With phi = (1, z, -m / margin_unit, activations) and the base logit ell, w minimises the log
+    loss of sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell
+    at the start of the twins, w . sum phi (sigma(ell) - label). Errors of ell that a pair shares,
+    from an ambiguous start or on the nominal plant, cancel. Later rows of the actual episodes have
+    no counterpart, as the twin is then in another state. Activations are centred and divided by
+    their mean distance from the mean, so that their joint contribution has the standard deviation
+    `hidden_std`. The corrected slopes stay >= 0.
 
     Args:
         actual: Rows of the actual episodes.
@@ -120,7 +122,7 @@ def fitted_change(
     num_members, _, num_activations = actual.activations.shape
     mean = actual.activations.mean(axis=1, keepdims=True)
     unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
-    unit = max(float(unit), 1e-12)  # One row alone is its own mean.
+    unit = max(float(unit), 1e-12)  # Zero for a single row.
 
     def columns(outcomes: Outcomes) -> np.ndarray:
         hidden = (outcomes.activations - mean).transpose(1, 0, 2).reshape(len(outcomes.heads), -1)
@@ -155,10 +157,10 @@ def fitted_change(
 
 
 def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Mean of values (M,) in every map's cells, (K, R*R); 0 where there are none.
+    """Averages values (M,) in every map's cells, (K, R*R); 0 in cells without points.
 
     Args:
-        values: One a point.
+        values: One value per point.
         points: Psi(x), (K, M, 2).
         grid: The grid.
     """
@@ -173,14 +175,13 @@ def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray
 
 
 def guarded_cells(feedback: FeedbackSegments, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """1 in the cells of every map most of whose feedback was unsafe, else 0, (K, R*R).
+    """Returns 1 in every map's cells where most feedback was unsafe, else 0, (K, R*R).
 
     Args:
         feedback: The feedback.
-        points: Psi(x) of it, (K, M, 2).
+        points: Psi(x) of the feedback, (K, M, 2).
         grid: The grid.
     """
-    # Safe counts against unsafe: a majority of unsafe segments is above zero.
     vote = np.where(feedback.is_unsafe, 1.0, -1.0)
     return (cell_means(vote, points, grid) > 0.0).astype(float)
 
@@ -194,25 +195,25 @@ def recalibrated_beliefs(
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> np.ndarray:
-    """Beliefs from training scores that are moved as the logit is, (K, R*R, 3 + n_c).
+    """Computes beliefs from training scores shifted as the base logit is, (K, R*R, 3 + n_c).
 
-    Departure: the paper learns where the nominal scores are unreliable and trusts them less there.
-    That hardly moves the safe share of a cell, as F keeps the ratio of its masses, and the
-    discrepancy has no sign. Adding sigma(ell + shift) - sigma(ell) to every score moves the
-    boundary between safe and unsafe itself. What the hidden layer adds is known where feedback was:
-    its mean in a cell holds for all that the cell was trained on.
+    Departure: the paper raises the uncertainty where nominal scores are unreliable. That hardly
+    changes the safe share of a cell, as F keeps the ratio of its masses and the discrepancy has no
+    sign. Adding sigma(ell + shift) - sigma(ell) to every score moves the boundary between safe and
+    unsafe. The hidden layer's contribution is known at the feedback only; its mean in a cell is
+    used for all training segments of the cell.
 
     Args:
         training: The training segments.
         base_logit: The base logit.
-        correction: What is added to the base logit.
-        residual: What the hidden layer adds to it in every map's cells, (K, R*R).
+        correction: The correction of the base logit.
+        residual: Mean contribution of the hidden layer in every map's cells, (K, R*R).
         grid: The grid.
-        parameters: Of the assessment.
+        parameters: The assessment's parameters.
         num_causes: n_c.
     """
     if training.heads is None or training.nearest is None:
-        raise ValueError("recalibrated_beliefs: the maps have no heads, and so no logit to move")
+        raise ValueError("recalibrated_beliefs: the maps have no heads")
     all_logit = base_logit.of_heads(training.heads)
     fused = []
     for points, added, guard in zip(training.points, residual, correction.guard, strict=True):
@@ -221,10 +222,10 @@ def recalibrated_beliefs(
         logit, score = all_logit[inside], training.score[inside]
         here = cells[inside]
         shift = correction.shift(training.heads[inside], added[here], guard[here])
-        # Without a shift the difference is zero to the bit, and so are the scores the same.
+        # Without a shift the difference is exactly zero, and the scores stay the same.
         score = np.clip(score + (sigmoid(logit + shift) - sigmoid(logit)), 0.0, 1.0)
         cause = training.cause[inside]
-        # What has become possible has the cause that is nearest.
+        # Newly unsafe segments get the constraint with the smallest margin.
         cause = np.where(cause >= 0, cause, training.nearest[inside])
         masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
         fused.append(

@@ -1,9 +1,8 @@
-"""Which seeds each purpose draws its episodes with, and which an assessment has used up.
+"""Default seeds of each purpose, and the seeds that an assessment has used.
 
-Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets of one seed begin alike,
-whichever plant is simulated, and whether balls are thrown or not. What judges an assessment must
-not have been drawn with a seed that it has learned from, been calibrated or adapted with. Here is
-the one table of default seeds; those of two purposes are never the same.
+Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets with one seed start in the
+same states for every plant, with and without balls. Episodes for evaluation must not share a seed
+with those used for training, calibration or adaptation. The default seeds of two purposes differ.
 """
 
 from __future__ import annotations
@@ -15,22 +14,22 @@ from typing import NamedTuple
 from drake_safety.learning.segments import EpisodesInfo
 
 NOT_DRAWN = -1
-"""In place of a seed where episodes were recorded: nothing else can begin as they did."""
+"""Seed of recorded episodes, whose starts no other set shares."""
 
 
 class SeedBlock(NamedTuple):
-    """Seeds that follow each other, one for each set of episodes that a command draws.
+    """Consecutive seeds, one for each set of episodes that a command draws.
 
     Attributes:
-        first: The first of them by default; the blocks lie a million apart.
-        purposes: What the sets are for, in the order of their seeds.
+        first: Default of the first seed; the blocks are a million apart.
+        purposes: Purposes of the sets, in the order of their seeds.
     """
 
     first: int
     purposes: tuple[str, ...]
 
     def seeds(self, first: int | None = None) -> dict[str, int]:
-        """The seed of each purpose, from the default or from another first one on."""
+        """Returns the seed of each purpose, starting at `first` or the default."""
         start = self.first if first is None else first
         return {purpose: start + i for i, purpose in enumerate(self.purposes)}
 
@@ -39,14 +38,13 @@ TRAINING = SeedBlock(0, ("training",))
 EVALUATION = SeedBlock(
     1_000_000, ("evaluation", "disturbances", "disturbance thresholds", "thresholds")
 )
-"""Thresholds of recalls are chosen on other episodes than those that are judged, and thresholds of
-alarms and triggers on other throws or pushes."""
+"""Thresholds are chosen on other episodes, throws and pushes than the evaluated ones."""
 CALIBRATION = SeedBlock(2_000_000, ("calibration",))
 PLANNING = SeedBlock(3_000_000, ("planning",))
 ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation", "oracle"))
-"""Nominal twins have the seed of the actual episodes beside them."""
+"""Nominal twins have the seed of their actual episodes."""
 DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
-"""What `run`, `play` and `check` show."""
+"""For `run`, `play` and `check`."""
 BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION)
 
 
@@ -56,10 +54,10 @@ class UsedEpisodes:
 
     Attributes:
         purpose: "training", "calibration" or "adaptation".
-        variation: Which plant was simulated.
-        scenario_hash: Of the simulation.
+        variation: The simulated plant variation.
+        scenario_hash: Hash of the simulation.
         seed: Seed of the set, or `NOT_DRAWN`.
-        num_episodes: How many; None where an earlier version's file does not say.
+        num_episodes: Number of episodes; None if unknown, as in files of earlier versions.
     """
 
     purpose: str
@@ -70,7 +68,7 @@ class UsedEpisodes:
 
     @classmethod
     def of(cls, purpose: str, info: EpisodesInfo, num_episodes: int | None) -> UsedEpisodes:
-        """A set, of which `info` is known."""
+        """Returns the entry of a set with this `EpisodesInfo`."""
         return cls(
             purpose=purpose,
             variation=info.variation,
@@ -85,16 +83,15 @@ class UsedEpisodes:
 
 
 def check_unused(used: Sequence[UsedEpisodes], seeds: Iterable[int], who: str) -> None:
-    """Refuses seeds that an assessment has used.
+    """Checks that an assessment has not used seeds.
 
     Args:
-        used: What it has used.
-        seeds: Of the sets that are to be drawn.
-        who: Who draws them.
+        used: The episodes that the assessment has used.
+        seeds: Seeds of the sets to be drawn.
+        who: Prefix of the error message.
 
     Raises:
-        ValueError: One is used; says for what, and the next seed that is free with all that go
-            with it.
+        ValueError: A seed was used; the message names its purpose and the next free seed.
     """
     wanted = sorted(seeds)
     spent = {one.seed: one for one in used if one.seed != NOT_DRAWN}
@@ -105,6 +102,6 @@ def check_unused(used: Sequence[UsedEpisodes], seeds: Iterable[int], who: str) -
     while any(seed + shift in spent for seed in wanted):
         shift += 1
     raise ValueError(
-        f"{who}: seed {found} would give episodes that begin as {spent[found]} did; "
+        f"{who}: seed {found} gives episodes that start as {spent[found]}; "
         f"choose another seed, such as {wanted[0] + shift}"
     )

@@ -1,4 +1,4 @@
-"""Episodes of a closed loop, their unsafety scores, and their split into horizon-long segments."""
+"""Episodes of a closed loop, their unsafety scores, and their split into segments."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ RECORDED = (
     "features",
     "margins",
 )
-"""What an episode holds of every row, beside its time."""
+"""Arrays that an episode holds per row, besides its time."""
 DIVERGED = "diverged"
-"""Cause of an episode whose simulation failed; such an episode says nothing about safety."""
+"""Cause of an episode whose simulation failed; it has no safety label."""
 
 
 class EpisodeError(RuntimeError):
-    """An error that a diagram raised during an episode, and that is no diverged simulation."""
+    """An error raised by a diagram during an episode, other than a diverged simulation."""
 
 
 def installed_versions(*packages: str) -> dict[str, str]:
@@ -42,12 +42,12 @@ def installed_versions(*packages: str) -> dict[str, str]:
 
 @dataclass(kw_only=True)
 class EpisodesInfo:
-    """What all episodes of a set share.
+    """Metadata that all episodes of a set share.
 
     Attributes:
         scenario: Name of the scenario.
-        scenario_hash: SHA-256 of all that decides what a rollout does, robot files included.
-        variation: Which plant was simulated, e.g. "nominal" or "actual".
+        scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
+        variation: The simulated plant variation, e.g. "nominal" or "actual".
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
         step_s: Time between two rows of an episode, the assessment step [s].
         horizon: The safety assessment horizon H [steps].
@@ -56,9 +56,9 @@ class EpisodesInfo:
         state_names: Names of the n_s columns of `state`.
         output_names: Names of the n_z columns of `output`.
         feature_names: Names of the n_f columns of `features`.
-        versions: Package versions the episodes were made with.
-        num_steps: T, steps of an episode that is not cut short; 0 where it is not known.
-        code: SHA-256 of the source code that simulated; "" where it is not known.
+        versions: Package versions at the time of the simulation.
+        num_steps: T, steps of a complete episode; 0 if unknown.
+        code: SHA-256 of the simulating source code; "" if unknown.
     """
 
     scenario: str
@@ -87,7 +87,7 @@ class EpisodesInfo:
 
     @property
     def widths(self) -> dict[str, int]:
-        """Columns of each recorded array, by its name."""
+        """Number of columns of each recorded array by name."""
         num_states, num_outputs = len(self.state_names), len(self.output_names)
         return {
             "state": num_states,
@@ -104,23 +104,23 @@ class EpisodesInfo:
 class Episode:
     """One closed-loop rollout, sampled at rows 0..K; row r is at time r * step_s.
 
-    The last row is the sample at the end: t = T, or the instant at which the safe set was left.
+    The last row is the sample at t = T or at the instant when the safe set was left.
 
     Attributes:
         index: Number of the episode within its set.
         time_s: Time [s], (K+1,).
-        state: State as the assessor sees it, observation noise included, (K+1, n_s).
+        state: Measured state, with observation noise, (K+1, n_s).
         true_state: State without observation noise, (K+1, n_s).
         output: Measured output z [m], (K+1, n_z).
         desired_output: Desired output z* [m], (K+1, n_z).
-        desired_preview: The coming H desired outputs, row-major in time, in the frame of `state`,
+        desired_preview: The next H desired outputs, row-major in time, in the frame of `state`,
             (K+1, H*n_z).
-        features: Features as the assessor sees them, (K+1, n_f).
+        features: Measured features, (K+1, n_f).
         margins: Signed distance to each safety constraint, negative where violated, (K+1, n_c).
         is_safe: Whether the whole rollout stayed in the safe set.
         cause: "" when safe, else the name of the violated constraint, or "diverged".
-        first_step: First row whose future is undisturbed; the rows before are no training data.
-        num_controller_failures: How often a controller had no command of its own.
+        first_step: First row with an undisturbed future; earlier rows are not used for training.
+        num_controller_failures: Number of failed controller updates.
     """
 
     index: int
@@ -144,14 +144,14 @@ class Episode:
 
 
 class Episodes(Sequence[Episode]):
-    """A set of episodes that share one `EpisodesInfo`; a slice of it is again a set."""
+    """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
         """Checks every episode against `info`.
 
         Raises:
-            ValueError: An array has not the width or the number of rows that `info` and `time_s`
-                imply, or the cause is unknown or contradicts `is_safe`.
+            ValueError: An array's shape does not fit `info` and `time_s`, or the cause is unknown
+                or contradicts `is_safe`.
         """
         self.info = info
         self._episodes = list(episodes)
@@ -166,7 +166,7 @@ class Episodes(Sequence[Episode]):
     @overload
     def __getitem__(self, key: slice) -> Episodes: ...
     def __getitem__(self, key: int | slice) -> Episode | Episodes:
-        """One episode, or the set of the episodes of a slice."""
+        """Returns one episode, or the set of a slice."""
         if isinstance(key, slice):
             return Episodes(self.info, self._episodes[key])
         return self._episodes[key]
@@ -209,7 +209,7 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
 def unsafety_score(
     remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float
 ) -> np.ndarray:
-    """How much each segment contributes to its episode's unsafe end: lambda, in [0, 1].
+    """Computes the unsafety score lambda of segments, in [0, 1].
 
     Args:
         remaining_steps: R, steps from the segment's start to the termination, (N,).
@@ -217,7 +217,7 @@ def unsafety_score(
         discount: gamma in [0, 1].
 
     Returns:
-        The unsafety scores, (N,): 0 for a safe episode's segments.
+        The unsafety scores, (N,): 0 for segments of safe episodes.
     """
     # Eq. (unsafety_score): lambda = gamma^R(i) if the trajectory is unsafe, else 0.
     return np.where(is_unsafe, float(discount) ** np.asarray(remaining_steps, dtype=float), 0.0)
@@ -225,7 +225,7 @@ def unsafety_score(
 
 @dataclass(kw_only=True, eq=False)
 class Segments:
-    """Pieces of episodes, each at most H steps long, with what a safety assessment learns from.
+    """Segments of episodes, each at most H steps long, as training data of an assessment.
 
     Attributes:
         episode: Position of the episode in its set, (N,).
@@ -235,15 +235,15 @@ class Segments:
         is_unsafe: Whether the episode ended unsafely, (N,).
         score: Unsafety score lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        state: Starting state as the assessor sees it, (N, n_s).
+        state: Measured starting state, (N, n_s).
         true_state: Starting state without observation noise, (N, n_s).
-        desired_preview: Coming desired outputs, (N, H*n_z).
+        desired_preview: Desired outputs over the horizon, (N, H*n_z).
         features: Features at the start, (N, n_f).
         future_margins: Smallest margin of each constraint from the start to the episode's end, (N,
             n_c).
         error: Tracking errors z* - z [m], the last one repeated beyond the segment's length, (N,
             H, n_z).
-        length: Number of samples of `error` that were recorded, (N,): H, or less where cut short.
+        length: Number of recorded samples of `error`, (N,): H, or less at an episode's end.
     """
 
     episode: np.ndarray
@@ -265,26 +265,25 @@ class Segments:
         return len(self.score)
 
     def take(self, rows: np.ndarray) -> Segments:
-        """The segments chosen by a mask or by indices, (M,)."""
+        """Selects segments by a mask or by indices, (M,)."""
         return Segments(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
 def split(
     episodes: Episodes, *, stride: int, discount: float, shortest: int | None = None
 ) -> Segments:
-    """Cuts episodes into segments of the assessment horizon H.
+    """Splits episodes into segments of the assessment horizon H.
 
-    Segments start where at least ``shortest`` steps of a whole episode are left: where nothing
-    happens after an episode's end, part of the horizon is enough. The rule is the same for both
-    labels, so that the row at which a segment starts says nothing about its label: an unsafe
-    episode gives a segment from every such row before its end. Segments that reach beyond the end
-    are cut short and keep the terminal sample. Diverged episodes give none.
+    Segments start where at least ``shortest`` steps of a complete episode are left; less than the
+    horizon suffices if the robot is at rest after the episode's end. The rule is the same for both
+    labels, so that a segment's start row carries no information about its label. Segments that
+    reach beyond the end are cut short and keep the terminal sample. Diverged episodes are skipped.
 
     Args:
         episodes: The episodes; H is `episodes.info.horizon`.
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
-        shortest: Steps of a whole episode that are left at a segment's start; H by default.
+        shortest: Least number of steps left of a complete episode; H by default.
 
     Raises:
         ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
@@ -299,13 +298,13 @@ def split(
     offsets = np.arange(horizon)
     names = episodes.info.constraint_names
     pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
-    # Where T is not known, it is the longest that was seen.
+    # If T is unknown, the longest episode is taken as complete.
     whole = episodes.info.num_steps or max((e.num_steps for e in episodes), default=0)
     for position, episode in enumerate(episodes):
         if episode.cause == DIVERGED:
             continue
         num_steps = episode.num_steps
-        # A safe episode may be shorter than a whole one, as a stretch of a robot's log is.
+        # A safe episode may be shorter than T, as a part of a robot's log is.
         end = min(num_steps, (num_steps if episode.is_safe else whole) - shortest + 1)
         rows = np.arange(episode.first_step, end, stride)
         if rows.size == 0:

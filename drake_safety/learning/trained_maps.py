@@ -1,4 +1,4 @@
-"""Trained maps Psi, evaluated by numpy: an online run needs no torch."""
+"""Evaluation of trained maps Psi in numpy, without torch."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import NamedTuple
 import numpy as np
 
 INPUT_LIMIT = 1e30
-"""Squared length from which on an input counts as not finite."""
+"""Squared norm above which an input counts as not finite."""
 
 _CHUNK = 8192
 
 
 class EmbeddingOutput(NamedTuple):
-    """What a stack of K maps says of inputs.
+    """Outputs of a stack of K maps.
 
     Attributes:
         embedding: y, (K, N, 2).
         unsafe_logit: Logit of an unsafe end, (K, N); NaN for maps without a safety head.
-        margins: Predicted smallest future margin of each constraint, in the margins' own unit,
-            (K, N, n_c); NaN for maps without a margin head.
+        margins: Predicted smallest future margin of each constraint [unit of the margins], (K, N,
+            n_c); no columns for maps without a margin head.
     """
 
     embedding: np.ndarray
@@ -29,19 +29,19 @@ class EmbeddingOutput(NamedTuple):
 
 
 class Embedding:
-    """A stack of K trained maps Psi of equal shape, immutable.
+    """An immutable stack of K trained maps Psi of equal shape.
 
-    Its weights are the arrays `weights`: "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
+    The arrays `weights` are "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
     "output.weight" (K, width, 2 + n_c) whose first two columns give y and the others the margins;
     with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
     (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], *, num_margins: int):
-        """Takes the weights as they are.
+        """Copies the weights to single precision.
 
         Raises:
-            ValueError: Weights are missing or their shapes do not fit each other.
+            ValueError: Weights are missing or their shapes are inconsistent.
         """
         self.weights = {
             name: np.ascontiguousarray(w, dtype=np.float32) for name, w in weights.items()
@@ -84,17 +84,17 @@ class Embedding:
 
     @property
     def has_heads(self) -> bool:
-        """Whether the maps predict safety or margins besides y."""
+        """Whether the maps have a safety head or a margin head."""
         return self.has_safety_head or self.num_margins > 0
 
     def is_same(self, other: Embedding) -> bool:
-        """Whether the maps are the same to the bit."""
+        """Whether the weights are identical."""
         return self.weights.keys() == other.weights.keys() and all(
             np.array_equal(w, other.weights[name]) for name, w in self.weights.items()
         )
 
     def scaled(self, factors: np.ndarray) -> Embedding:
-        """The same maps with y multiplied by a factor each, (K,); their safety heads follow."""
+        """Returns maps with y scaled by one factor each, (K,), and the same safety logits."""
         weights = {name: w.copy() for name, w in self.weights.items()}
         for name in ("output.weight", "output.bias"):
             weights[name][..., :2] *= factors.reshape(-1, *[1] * (weights[name].ndim - 1))
@@ -103,7 +103,7 @@ class Embedding:
         return Embedding(weights, num_margins=self.num_margins)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
-        """All members' outputs for inputs (N, n_x); rows that are not finite give NaN."""
+        """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN."""
         x = self._checked(x)
         shape = (self.num_members, len(x))
         output = EmbeddingOutput(
@@ -125,12 +125,40 @@ class Embedding:
         return output
 
     def activations(self, x: np.ndarray) -> np.ndarray:
-        """Of the members' last hidden layer at finite inputs (N, n_x), (K, N, num_activations)."""
+        """Returns the last hidden layers at finite inputs (N, n_x), (K, N, num_activations)."""
         return self._hidden(self._checked(x))
 
     def embed(self, x: np.ndarray) -> np.ndarray:
-        """Psi: inputs (N, n_x) to points (K, N, 2)."""
+        """Applies Psi to inputs (N, n_x), (K, N, 2)."""
         return self.evaluate(x).embedding
+
+    def logit_gradient(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mean safety logit at x (N, n_x) and its gradient: (N,) and (N, n_x).
+
+        Raises:
+            ValueError: The maps have no safety head.
+        """
+        if not self.has_safety_head:
+            raise ValueError("Embedding.logit_gradient: the maps have no safety head")
+        w = self.weights
+        logit, gradient = np.zeros(len(x)), np.zeros(np.shape(x))
+        for k in range(self.num_members):
+            z = np.asarray(x, dtype=float)
+            is_active = []
+            for i in range(self.num_layers):
+                z = z @ w[f"trunk.{i}.weight"][k] + w[f"trunk.{i}.bias"][k]
+                is_active.append(z > 0.0)
+                z = np.maximum(z, 0.0)
+            y = z @ w["output.weight"][k][:, :2] + w["output.bias"][k][:2]
+            hidden = y @ w["safety.0.weight"][k] + w["safety.0.bias"][k]
+            member = np.maximum(hidden, 0.0) @ w["safety.1.weight"][k] + w["safety.1.bias"][k]
+            logit += member[:, 0]
+            back = (hidden > 0.0) * w["safety.1.weight"][k][:, 0]
+            back = back @ w["safety.0.weight"][k].T @ w["output.weight"][k][:, :2].T
+            for i in reversed(range(self.num_layers)):
+                back = (back * is_active[i]) @ w[f"trunk.{i}.weight"][k].T
+            gradient += back
+        return logit / self.num_members, gradient / self.num_members
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
         x = np.asarray(x, dtype=np.float32)

@@ -1,10 +1,10 @@
-"""How an assessment's maps are trained: from episodes to segments, t-SNE's points and Psi."""
+"""Training of an assessment's maps: from episodes to segments, t-SNE's points and Psi."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
     MapData,
-    MapSettings,
     stack_members,
     train_map,
     tsne,
@@ -23,28 +22,20 @@ from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 _INSIDE_SHARE = 0.995
-"""Share of the inputs that a map may not send beyond the extent of t-SNE's points."""
+"""Quantile of the inputs whose outputs are scaled to the extent of t-SNE's points."""
 _logger = logging.getLogger("drake_safety")
 
 StageProgress = Callable[[str, float], None]
-"""Called with a stage and the fraction of it that is done."""
+"""Called with a stage and the fraction done."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainingSegments:
-    """The segments of training episodes, and which of them t-SNE sees.
+def segments_for(
+    episodes: Episodes, parameters: AssessmentParameters
+) -> tuple[Segments, np.ndarray]:
+    """Splits training episodes into segments according to the mode.
 
-    Attributes:
-        segments: The N segments.
-        has_target: Those that t-SNE sees, (N,).
-    """
-
-    segments: Segments
-    has_target: np.ndarray
-
-
-def segments_for(episodes: Episodes, parameters: AssessmentParameters) -> TrainingSegments:
-    """Cuts training episodes as the mode wants them.
+    Returns:
+        The segments, and whether each is embedded by t-SNE, (N,).
 
     Raises:
         ValueError: The episodes give too few segments for t-SNE.
@@ -73,24 +64,26 @@ def segments_for(episodes: Episodes, parameters: AssessmentParameters) -> Traini
         episodes.num_diverged,
         num_targeted,
     )
-    return TrainingSegments(segments=segments, has_target=has_target)
+    return segments, has_target
 
 
 def learned_maps(
-    training: TrainingSegments,
+    segments: Segments,
+    has_target: np.ndarray,
     x: np.ndarray,
     grid: Grid,
     parameters: AssessmentParameters,
     progress: StageProgress | None,
 ) -> tuple[Embedding, BaseLogit | None]:
-    """t-SNE of the segments, and the maps Psi that reproduce it.
+    """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
-        training: The training segments.
+        segments: The training segments.
+        has_target: Whether each is embedded by t-SNE, (N,).
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
-        parameters: Of the assessment.
-        progress: Called with "distances", "t-SNE", "training" and the fraction that is done.
+        parameters: The assessment's parameters.
+        progress: Called with "distances", "t-SNE", "training" and the fraction done.
 
     Returns:
         The maps, and the base logit of their heads; None without heads.
@@ -99,8 +92,7 @@ def learned_maps(
     def stage(name: str) -> Callable[[float], None] | None:
         return None if progress is None else lambda fraction: progress(name, fraction)
 
-    segments = training.segments
-    targeted = segments.take(training.has_target)
+    targeted = segments.take(has_target)
     graph = neighbour_graph(
         targeted.error,
         targeted.length,
@@ -118,7 +110,7 @@ def learned_maps(
     )
     data = MapData(
         x=x,
-        has_target=training.has_target,
+        has_target=has_target,
         target=grid.scale(points),
         is_unsafe=segments.is_unsafe,
         margins=segments.future_margins,
@@ -129,12 +121,12 @@ def learned_maps(
     label = segments.is_unsafe[is_held_out]
     report = stage("training")
     if not parameters.is_sharpened or not 0 < label.sum() < len(label):
-        # There is nothing to try maps on.
+        # No held-out episodes of both labels.
         embedding = _train(data, parameters, report)
         tried, is_held_out = embedding, np.ones(len(segments), dtype=bool)
     else:
-        # As scikit-learn's CalibratedClassifierCV(ensemble=False): others like them are tried on
-        # what they have not learned, and no episode is lost to the maps themselves.
+        # As scikit-learn's CalibratedClassifierCV(ensemble=False): a first ensemble is evaluated
+        # on the held-out episodes, and the final one is trained on all episodes.
         tried = _train(data.take(~is_held_out), parameters, _part(report, 0))
         embedding = _train(data, parameters, _part(report, 1))
     if not embedding.has_heads:
@@ -145,19 +137,18 @@ def learned_maps(
 
 
 def _part(progress: Callable[[float], None] | None, half: int) -> Callable[[float], None] | None:
-    """Tells of the first or second half of a stage."""
+    """Progress of the first or second half of a stage."""
     return None if progress is None else lambda fraction: progress(0.5 * (half + fraction))
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Which segments are held out for the base logit, (N,): those of some episodes.
+    """Returns which segments are held out for the base logit, (N,), by whole episodes.
 
-    The base logit is asked for the mean of the ensemble. What that is worth shows only where none
-    of the maps knows the end, so all of them leave out the same episodes.
+    The base logit is a function of the ensemble's mean, so all maps hold out the same episodes.
 
     Args:
         segments: The training segments.
-        parameters: Of the assessment.
+        parameters: The assessment's parameters.
     """
     episodes = np.unique(segments.episode)
     share = min(parameters.held_out, 0.5) if parameters.is_sharpened else 0.0
@@ -189,19 +180,16 @@ def _train(
     parameters: AssessmentParameters,
     progress: Callable[[float], None] | None,
 ) -> Embedding:
-    is_sharpened = parameters.is_sharpened
-    settings = MapSettings(
-        hidden_sizes=tuple(parameters.hidden_sizes) if is_sharpened else (128, 128),
-        dropout=parameters.dropout if is_sharpened else 0.0,
-        epochs=parameters.epochs if is_sharpened else 40,
-        batch_size=parameters.batch_size,
-        learning_rate=parameters.learning_rate,
-        target_weight=parameters.target_weight if is_sharpened else 1.0,
-        safety_weight=parameters.safety_weight if is_sharpened else 0.0,
-        margin_weight=parameters.margin_weight if is_sharpened else 0.0,
-        margin_unit=parameters.margin_unit,
-        margin_range=(parameters.margin_range[0], parameters.margin_range[1]),
-    )
+    if not parameters.is_sharpened:
+        parameters = replace(
+            parameters,
+            hidden_sizes=[128, 128],
+            dropout=0.0,
+            epochs=40,
+            target_weight=1.0,
+            safety_weight=0.0,
+            margin_weight=0.0,
+        )
     num_members = parameters.num_members
     members = []
     for member in range(num_members):
@@ -213,17 +201,17 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        members.append(train_map(data, settings, seed=seed, progress=report))
-    num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
+        members.append(train_map(data, parameters, seed=seed, progress=report))
+    num_margins = data.margins.shape[1] if parameters.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
-    return _fill_grid(embedding, data) if is_sharpened else embedding
+    return _fill_grid(embedding, data) if parameters.is_sharpened else embedding
 
 
 def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
-    """Scales the maps so that what they do with the inputs is as wide as t-SNE's points.
+    """Scales the maps so that their outputs are as wide as t-SNE's points.
 
-    Departure: a light weight on the distance to t-SNE's points leaves the maps' scale open;
-    some inputs would fall off the grid, or all into few of its cells.
+    Departure: a small weight of the distance to t-SNE's points leaves the maps' scale open; outputs
+    would fall outside the grid, or into few of its cells.
     """
     reach = np.abs(embedding.embed(data.x)).max(axis=2)
     extent = np.quantile(reach, _INSIDE_SHARE, axis=1)
@@ -233,13 +221,13 @@ def _fill_grid(embedding: Embedding, data: MapData) -> Embedding:
 def fitted_base_logit(
     output: EmbeddingOutput, segments: Segments, parameters: AssessmentParameters
 ) -> BaseLogit:
-    """Scales what the ensemble's heads say to one logit, by logistic regression.
+    """Fits the base logit to the ensemble's heads by logistic regression.
 
     Args:
-        output: What maps say of segments that none of them has learned from: of those that they
-            have they are too sure.
-        segments: These segments.
-        parameters: Of the assessment.
+        output: The maps' outputs for held-out segments; on training segments they are
+            overconfident.
+        segments: The held-out segments.
+        parameters: The assessment's parameters.
     """
     logit = BaseLogit(
         margin_unit=parameters.margin_unit,
@@ -261,7 +249,7 @@ def _logistic(z: np.ndarray, label: np.ndarray, weight: np.ndarray) -> list[floa
 
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
         logit = columns @ values
-        # As light as a hundredth of a sample: it only keeps separable classes finite.
+        # The weight of a hundredth of a sample keeps the slopes finite for separable classes.
         penalty = 0.01 / len(z) * values
         residual = share * (1.0 / (1.0 + np.exp(-np.clip(logit, -500.0, 500.0))) - y)
         cost = share @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * penalty @ values

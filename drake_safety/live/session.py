@@ -12,7 +12,7 @@ from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.causes import NO_CAUSE, likely_causes
+from drake_safety.learning.prediction import NO_CAUSE, likely_causes
 from drake_safety.live.panel import (
     INK_RGB,
     RECOVERY_RGB,

@@ -1,1 +1,1 @@
-"""Logs of a real robot, read into episodes: CSV, Parquet, MCAP and ROS bags."""
+"""Conversion of a real robot's logs to episodes: CSV, Parquet, MCAP and ROS bags."""

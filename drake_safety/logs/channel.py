@@ -1,4 +1,4 @@
-"""Channel: the numbers of one table or topic as a log holds them, and where each one stands."""
+"""Channel: the raw columns of a table or topic in a log, with their locations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_safety.logs.log_map import TIME_UNITS
 
-_MANY = 40  # Names that a message lists before it says how many more there are.
+_MANY = 40  # Largest number of names in a message.
 
 
 @dataclass(kw_only=True, eq=False)
@@ -19,13 +19,13 @@ class Channel:
 
     Attributes:
         path: The log.
-        topic: Of the messages; empty for a table.
-        time: As it stands in the log, integers or floats, (N,).
+        topic: Topic of the messages; empty for a table.
+        time: Time in the log's unit, integers or floats, (N,).
         time_unit: Unit of ``time``.
-        time_name: What the time is called there.
-        columns: The wanted columns by name, (N,) floats each.
-        row_name: What a row is called: "line", "row" or "message".
-        first_row: Number of the first one.
+        time_name: Name of the time column.
+        columns: The requested columns by name, (N,) floats each.
+        row_name: Name of a row: "line", "row" or "message".
+        first_row: Number of the first row.
     """
 
     path: Path
@@ -38,23 +38,23 @@ class Channel:
     first_row: int
 
     def where(self, row: int, column: str = "") -> str:
-        """A row, and a column if given, in words."""
+        """Describes the location of a row, and of a column if given."""
         text = f"log '{self.path}', {self.row_name} {self.first_row + row}"
         if self.topic:
             text += f" of topic '{self.topic}'"
         return f"{text}, column '{column}'" if column else text
 
     def seconds_since(self, origin: float | int) -> np.ndarray:
-        """Time since an instant of the log's own clock, exact for integer clocks, (N,) [s]."""
+        """Returns the time since an instant of the log's clock, exact for integers, (N,) [s]."""
         return (self.time - origin) / TIME_UNITS[self.time_unit]
 
     def table(self, names: Iterable[str]) -> np.ndarray:
-        """Columns side by side, (N, n)."""
+        """Returns columns as an array, (N, n)."""
         return np.stack([self.columns[name] for name in names], axis=1)
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for a message; of very many the first ones."""
+    """Formats names for a message, at most the first 40."""
     names = list(names)
     if len(names) <= _MANY:
         return str(names)
@@ -62,7 +62,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def missing_extra(path: Path, error: ImportError) -> ValueError:
-    """What to say when a package that reads a log is not installed."""
+    """Returns the error for a package that is not installed."""
     return ValueError(
         f"log '{path}' needs the package '{error.name}': pip install 'drake_safety[logs]'"
     )

@@ -1,4 +1,4 @@
-"""What is wrong with a log, said with its file, row and column, before anything is made of it."""
+"""Plausibility checks of a log; errors name file, row and column."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
 
-_MIN_ROWS = 3  # Derivatives need them.
-_INTERVALS_S = (1e-4, 0.5)  # What the usual time between two rows of a log is between.
+_MIN_ROWS = 3  # For derivatives.
+_INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _NORM_TOLERANCE = 0.01
 _MAX_TILT_RAD = math.radians(60.0)
-_FOOT_SHARE = 0.2  # Of the standing height: how far the lowest foot may seem off the ground.
-_FAR_RAD = 0.3  # Beyond a joint's stop no servo, and no offset of an encoder, gets it.
-_REACH_SHARE = 3.0  # Of the standing height: how far from the base z* can be.
-_RATE_FACTOR = 20.0  # Degrees for radians make 57, millimetres for metres 1000.
-_SLIP_M = 0.004  # Feet that stand are seen to slide by less, encoders and all.
+_FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing height.
+_FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
+_REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
+_RATE_FACTOR = 20.0  # Confusing degrees and radians gives 57, millimetres and metres 1000.
+_SLIP_M = 0.004  # Largest apparent slip of stance feet.
 _SLIP_FACTOR = 3.0
-_MOVING = 1.0  # Velocities below this are not compared with derivatives.
+_MOVING = 1.0  # Lower velocities are not compared with derivatives.
 
 
 def check_time(channel: Channel, max_gap_s: float) -> None:
-    """Refuses a time that is not finite, does not advance, is in other units, or has gaps.
+    """Checks that time is finite, increasing, in plausible units and without gaps.
 
     Args:
         channel: A table or topic.
-        max_gap_s: Longest time between two rows that is bridged [s].
+        max_gap_s: Largest time between two rows [s].
 
     Raises:
-        ValueError: Names the row.
+        ValueError: A check failed; the message names the row.
     """
     time = channel.time
     if len(time) < _MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
         raise ValueError(
-            f"log '{channel.path}'{of} has {len(time)} rows; it takes {_MIN_ROWS} at least"
+            f"log '{channel.path}'{of} has {len(time)} rows, expected at least {_MIN_ROWS}"
         )
     if not np.isfinite(time).all():
         row = int(np.argmin(np.isfinite(time)))
@@ -62,20 +62,20 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
             f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
         )
     step_s = step / TIME_UNITS[channel.time_unit]
-    # A little more than the limit is rounding: a log of 10 Hz has no gaps of 0.1 s.
+    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
     if step_s.max() > max_gap_s * (1 + 1e-6):
         row = int(np.argmax(step_s > max_gap_s * (1 + 1e-6))) + 1
         raise ValueError(
-            f"{channel.where(row, channel.time_name)}: a gap of {step_s[row - 1]:g} s before it; "
-            f"no more than {max_gap_s:g} s are bridged ('max_gap_s' of the map)"
+            f"{channel.where(row, channel.time_name)}: a gap of {step_s[row - 1]:g} s before it, "
+            f"expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
         )
 
 
 def check_finite(channel: Channel) -> None:
-    """Refuses values that are missing or not finite.
+    """Checks that all values exist and are finite.
 
     Raises:
-        ValueError: Names the first row, and the column.
+        ValueError: A value is not; the message names the first row and the column.
     """
     bad = {name: ~np.isfinite(values) for name, values in channel.columns.items()}
     rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
@@ -89,14 +89,14 @@ def check_finite(channel: Channel) -> None:
 
 
 def check_norms(channel: Channel, names: list[str]) -> None:
-    """Refuses quaternions whose norm is not 1.
+    """Checks that quaternions have a norm of 1.
 
     Args:
-        channel: Where the quaternion is.
+        channel: Channel of the quaternion.
         names: Its four columns.
 
     Raises:
-        ValueError: Names the first row.
+        ValueError: A norm differs; the message names the first row.
     """
     norms = np.linalg.norm(channel.table(names), axis=1)
     is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
@@ -114,19 +114,19 @@ def check_first_row(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Refuses a log whose robot does not stand on the ground in the first row.
+    """Checks that the robot stands on the ground in the first row.
 
-    A wrong order of the quaternion lays it down or turns it over; wrong units lift its feet off
-    the ground or take its joints beyond their stops. What would make it stand is named.
+    A wrong order of the quaternion tilts it; wrong units lift its feet off the ground or move
+    joints beyond their stops. The error suggests changes of the map that pass the check.
 
     Args:
         kinematics: The robot.
-        log_map: The map as it is.
-        positions: The first row's positions (n_q,), if read by a map.
-        where: The first row in words.
+        log_map: The map.
+        positions: Function that returns the first row's positions (n_q,) for a map.
+        where: Location of the first row.
 
     Raises:
-        ValueError: Says what is implausible, and which other map is not.
+        ValueError: The check failed; the message names the reason and plausible maps.
     """
     wrong = _implausible(kinematics, positions(log_map))
     if not wrong:
@@ -155,19 +155,19 @@ def check_stillness(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Refuses a quaternion in whose other order the feet would stand far more still.
+    """Checks that the feet do not slip far less with the other order of the quaternion.
 
-    x y z w read as w x y z turns an upright robot by half a turn about the vertical: it stands,
-    but as its base moves to one side its feet seem to slide to it twice as far.
+    Reading x y z w as w x y z turns an upright robot by half a turn about the vertical: it stands,
+    but the feet seem to slip twice as far as the base moves.
 
     Args:
         kinematics: The robot.
-        log_map: The map as it is.
-        positions: Positions (N, n_q) at some rows, if read by a map.
-        where: The rows in words.
+        log_map: The map.
+        positions: Function that returns positions (N, n_q) at some rows for a map.
+        where: Location of the rows.
 
     Raises:
-        ValueError: Says how far the feet slide in either order.
+        ValueError: The check failed; the message has the slip in either order.
     """
     other = copy.deepcopy(log_map)
     (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
@@ -177,9 +177,9 @@ def check_stillness(
         slips.append(float(np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))))
     if slips[0] > _SLIP_M and slips[0] > _SLIP_FACTOR * slips[1]:
         raise ValueError(
-            f"{where}: the feet of robot '{kinematics.robot.name}' slide by {slips[0]:.3g} m, and "
-            f"by {slips[1]:.3g} m only if 'base_orientation.order' is "
-            f"{other.base_orientation.order}: it probably is"
+            f"{where}: the feet of robot '{kinematics.robot.name}' slide by {slips[0]:.3g} m, but "
+            f"only by {slips[1]:.3g} m if 'base_orientation.order' is "
+            f"{other.base_orientation.order}, which is more plausible"
         )
 
 
@@ -204,7 +204,7 @@ def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
 
 
 def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarray:
-    """How far joints (N, n_j) are beyond their stops [rad], negative inside."""
+    """Excess of joints (N, n_j) over their stops [rad], negative inside."""
     low, high = kinematics.position_limits.T
     return np.maximum(low - joints, joints - high)
 
@@ -212,16 +212,16 @@ def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarra
 def check_limits(
     kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
 ) -> None:
-    """Refuses joints that are far beyond their stops.
+    """Checks that joints are not far beyond their stops.
 
     Args:
         kinematics: The robot.
-        joints: At the channel's rows, (N, n_j) [rad].
-        channel: Where they are.
+        joints: Joint positions at the channel's rows, (N, n_j) [rad].
+        channel: Channel of the joints.
         names: The joints' columns.
 
     Raises:
-        ValueError: Names the first row, and the column.
+        ValueError: A joint is; the message names the first row and the column.
     """
     excess = _beyond_limits(kinematics, joints)
     is_far = excess > _FAR_RAD
@@ -238,17 +238,17 @@ def check_limits(
 def check_rates(
     logged: np.ndarray, derived: np.ndarray, channel: Channel, names: list[str], unit: str
 ) -> None:
-    """Refuses velocities that are far larger than the derivatives of what they belong to.
+    """Checks that velocities are not far larger than the derivatives of positions.
 
     Args:
         logged: Velocities in SI units, (N, n).
         derived: Derivatives of the logged positions, (M, n).
-        channel: Where the velocities are.
+        channel: Channel of the velocities.
         names: Their columns.
-        unit: What the map says their unit is.
+        unit: Their unit in the map.
 
     Raises:
-        ValueError: Names the column.
+        ValueError: The check failed; the message names the column.
     """
     size = np.sqrt(np.mean(logged**2, axis=0))
     expected = np.sqrt(np.mean(derived**2, axis=0))
@@ -258,29 +258,29 @@ def check_rates(
         row = int(np.argmax(np.abs(logged[:, column])))
         raise ValueError(
             f"{channel.where(row, names[column])}: velocities are {size[column]:.3g} on average, "
-            f"but what they belong to changes by {expected[column]:.3g} per second: is the unit "
-            f"really {unit} per second, and that of time right?"
+            f"but the derivatives of positions {expected[column]:.3g}: check the unit, {unit} per "
+            "second, and that of time"
         )
 
 
 def check_desired_output(
     kinematics: RobotKinematics, desired: np.ndarray, base: np.ndarray, where: str, unit: str
 ) -> None:
-    """Refuses desired outputs that no part of the robot could be at.
+    """Checks that the desired output is near the robot.
 
     Args:
         kinematics: The robot.
         desired: z* of the first row, (3,) [m].
-        base: Position of the base there, (3,) [m].
-        where: The row in words.
-        unit: What the map says the unit of z* is.
+        base: Position of the base in the first row, (3,) [m].
+        where: Location of the row.
+        unit: The unit of z* in the map.
 
     Raises:
-        ValueError: Says how far away it is.
+        ValueError: The check failed; the message has the distance.
     """
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(
             f"{where}: the desired output is {distance:.3g} m from the base of robot "
-            f"'{kinematics.robot.name}': is it in the same world, and its unit {unit}?"
+            f"'{kinematics.robot.name}': check its frame and its unit, {unit}"
         )

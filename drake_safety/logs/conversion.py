@@ -1,4 +1,4 @@
-"""From a log's columns to positions and velocities in Drake's order, in SI units."""
+"""Conversion of a log's columns to positions and velocities in Drake's order and SI units."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, LogMap, Positio
 
 
 def points(position: Position, channels: Mapping[str, Channel]) -> np.ndarray:
-    """Points in the world at their topic's times, (N, 3 n) [m]."""
+    """Returns points in the world at their topic's times, (N, 3 n) [m]."""
     table = channels[position.topic].table(position.columns)
     return LENGTH_UNITS[position.unit] * table
 
 
 def base_rotations(log_map: LogMap, channels: Mapping[str, Channel]) -> Rotation:
-    """Orientations of the base at their topic's times, (N,)."""
+    """Returns orientations of the base at their topic's times, (N,)."""
     orientation = log_map.base_orientation
     table = channels[orientation.topic].table(orientation.columns)
     return Rotation.from_quat(table, scalar_first=orientation.order == "wxyz")
@@ -27,7 +27,7 @@ def base_rotations(log_map: LogMap, channels: Mapping[str, Channel]) -> Rotation
 def joint_table(
     log_map: LogMap, channels: Mapping[str, Channel], joints: list[str], name: str
 ) -> np.ndarray:
-    """``joint_positions`` or ``joint_velocities`` in the robot's order, (N, n_j) [rad, rad/s]."""
+    """Returns joint positions or velocities in the robot's order, (N, n_j) [rad, rad/s]."""
     mapped = getattr(log_map, name)
     table = channels[mapped.topic].table([mapped.column(joint) for joint in joints])
     return ANGLE_UNITS[mapped.unit] * table
@@ -36,12 +36,12 @@ def joint_table(
 def base_velocities(
     velocity: Velocity, channels: Mapping[str, Channel], rotations: Rotation
 ) -> np.ndarray:
-    """A velocity of the base along the world's axes, (N, 3) [m/s or rad/s].
+    """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s].
 
     Args:
-        velocity: Where it is.
+        velocity: Its entry in the map.
         channels: The log.
-        rotations: Orientation of the base at that topic's times.
+        rotations: Orientation of the base at the velocity topic's times.
     """
     units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
     table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
@@ -49,12 +49,12 @@ def base_velocities(
 
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:
-    """Rotations at other times, along the great arc between two neighbours (slerp).
+    """Interpolates rotations by slerp.
 
     Args:
         time_s: Times of the rotations, increasing, (N,) [s].
         rotations: The rotations.
-        at_s: Wanted times, (M,) [s]; outside the first or last one holds.
+        at_s: Interpolation times, (M,) [s], clipped to the range of ``time_s``.
     """
     if len(time_s) == 1:
         return rotations[np.zeros(len(at_s), dtype=int)]
@@ -62,34 +62,34 @@ def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> R
 
 
 def values_at(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Columns at other times, linear between two neighbours, (M, n).
+    """Interpolates columns linearly, (M, n).
 
     Args:
         time_s: Times of the rows, increasing, (N,) [s].
         values: (N, n).
-        at_s: Wanted times, (M,) [s]; outside the first or last row holds.
+        at_s: Interpolation times, (M,) [s], clipped to the range of ``time_s``.
     """
     return np.stack([np.interp(at_s, time_s, column) for column in values.T], axis=1)
 
 
 def rates(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Derivatives of columns, exact for parabolas, (N, n) [1/s].
+    """Differentiates columns, exactly for parabolas, (N, n) [1/s].
 
     Args:
-        time_s: Times of the rows, increasing, (N,), three at least [s].
+        time_s: Times of at least three rows, increasing, (N,) [s].
         values: (N, n).
     """
     return np.gradient(values, time_s, axis=0, edge_order=2)
 
 
 def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
-    """Angular velocity of rotations along the world's axes, (N, 3) [rad/s].
+    """Differentiates rotations to angular velocities along the world's axes, (N, 3) [rad/s].
 
-    Each is the mean of those that lead to a row and away from it, weighted so that it is exact
-    where the angular velocity changes linearly.
+    Each is a weighted mean of the finite differences before and after the row, exact for linearly
+    changing angular velocities.
 
     Args:
-        time_s: Times of the rotations, increasing, (N,), three at least [s].
+        time_s: Times of at least three rotations, increasing, (N,) [s].
         rotations: The rotations.
     """
     step_s = np.diff(time_s)[:, None]

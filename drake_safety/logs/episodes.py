@@ -1,4 +1,4 @@
-"""Episodes from a log: what a loop's ports say of the states that a robot went through."""
+"""Conversion of logs to episodes, by evaluating a loop's ports at the logged states."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def episodes_from_log(
     *,
     desired_output: np.ndarray | None = None,
 ) -> Episodes:
-    """The episodes of :func:`cut_log`, without what they begin with."""
+    """Returns the episodes of :func:`cut_log` without their starts."""
     return cut_log(log, loop, desired_output=desired_output)[0]
 
 
@@ -42,25 +42,22 @@ def cut_log(
     *,
     desired_output: np.ndarray | None = None,
 ) -> tuple[Episodes, list[EpisodeStart]]:
-    """Turns logs into episodes of the actual robot, and says what each begins with, for its twin.
+    """Converts logs to consecutive episodes of the actual robot, with the starts of their twins.
 
-    An episode lasts as long as the scenario's, and the next begins where it ends. The last one of
-    a log ends where the robot leaves the safe set, as the loop's monitor sees it at its ticks; what
-    the log holds after that is not looked at, for it may be anything. A safe rest that is too short
-    for a segment is left out. What the assessor sees is what was logged: measurement noise is in
-    it already, and none is added. The preview is the logged z*, which after the last row stays
-    as it is; z* counts from the stance frame of the episode's first row.
+    Episodes have the scenario's duration. The last episode of a log ends where the robot leaves the
+    safe set at a tick of the loop's monitor; later rows are ignored. A safe remainder that is too
+    short for a segment is dropped. No noise is added to the logged states, which contain
+    measurement noise. The preview is the logged z*, constant after the last row, in the stance
+    frame of the episode's first row.
 
     Args:
-        log: The log, or several of one robot, whose episodes are numbered through.
-        loop: The loop whose ports say what each state means, without Γ; of a scenario its
-            ``actual`` one.
-        desired_output: z* in the world that was kept all the time, (n_z,) [m], for logs that
-            have none.
+        log: The log, or several of one robot, whose episodes are numbered consecutively.
+        loop: The loop without Γ that evaluates the states, or a scenario with an ``actual`` one.
+        desired_output: Constant z* in the world for logs without it, (n_z,) [m].
 
     Returns:
-        The episodes, and what each begins with: ``run_episode(nominal_loop, start=starts[i])``
-        is the twin of ``episodes[i]``.
+        The episodes and their starts: ``run_episode(nominal_loop, start=starts[i])`` is the twin
+        of ``episodes[i]``.
 
     Raises:
         ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
@@ -80,7 +77,7 @@ def cut_log(
 def _cut(
     log: RobotLog, loop: LeggedLoop, desired: np.ndarray
 ) -> list[tuple[Episode, EpisodeStart]]:
-    """The episodes of one log and their beginnings; z* in the world is ``desired``, (N, n_z)."""
+    """Episodes and starts of one log with z* in the world, (N, n_z) [m]."""
     scenario = loop.scenario
     shortest = scenario.assessment.shortest_segment or scenario.assessment.horizon
     context = loop.CreateDefaultContext()
@@ -120,12 +117,12 @@ def _desired_output(
     size = len(loop.output_names)
     if log.desired_output is not None:
         if desired_output is not None:
-            raise ValueError(f"{who} has a desired output of its own; leave the other one out")
+            raise ValueError(f"{who} has a desired output of its own; got another one")
         return log.desired_output
     if desired_output is None:
         raise ValueError(
-            f"{who} has no desired output, so nobody knows what was to come: map "
-            "'desired_output', or say which one was kept"
+            f"{who} has no desired output, which the preview needs: map 'desired_output', or pass "
+            "a constant one"
         )
     value = np.asarray(desired_output, dtype=float)
     if value.shape != (size,) or not np.isfinite(value).all():
@@ -134,7 +131,7 @@ def _desired_output(
 
 
 def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
-    """The logged state at a time, and the logged z* from then on as a plan."""
+    """The logged state at a time, with the later z* as a plan."""
     kinematics = loop.kinematics
     begin = np.array([begin_s])
     q, v = np.split(log.states_at(begin)[0], [kinematics.num_positions])
@@ -142,7 +139,7 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
     if log.foot_positions is not None:
         feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
     scenario = loop.scenario
-    # No preview and no outlook of the longest episode reaches further.
+    # Previews and outlooks of the longest episode end before.
     reach_s = 2 * scenario.episode_duration_s + scenario.assessment.horizon * scenario.step_s
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
@@ -151,7 +148,7 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
     knots = np.concatenate([begin, later])
     points = values_at(log.time_s, desired, knots).reshape(-1, 3)
     z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
-    # Without overshoot at steps of z*, and with a rate that has none.
+    # A shape-preserving interpolation does not overshoot at steps of z*.
     start.plan = (
         PiecewisePolynomial.CubicShapePreserving(knots - begin_s, z.T)
         if len(knots) > 2

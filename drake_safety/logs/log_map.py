@@ -1,4 +1,4 @@
-"""LogMap: the schema of a columns.yaml, which says where a log keeps what, and in which units."""
+"""LogMap: the schema of a columns.yaml, which maps a log's columns and their units."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -7,26 +7,26 @@ from pathlib import Path
 from drake_safety.robots.robot_model import load_typed_file
 
 TIME_UNITS = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
-"""How many of each are a second."""
+"""Units per second."""
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
-"""Metres of each; for a velocity, per second."""
+"""Metres per unit; for velocities, per second."""
 ANGLE_UNITS = {"rad": 1.0, "deg": 0.017453292519943295}
-"""Radians of each; for a rate, per second."""
+"""Radians per unit; for rates, per second."""
 ORDERS = ("wxyz", "xyzw")
-"""Orders of a quaternion's four columns."""
+"""Orders of a quaternion's columns."""
 FRAMES = ("world", "body")
-"""Frames that a velocity of the base may be given in."""
+"""Frames of a velocity of the base."""
 
 
 @dataclass(kw_only=True)
 class LogTime:
-    """When a row, or a message, was."""
+    """Time of a row or a message."""
 
     column: str = ""
-    """The column, or the field of every message (``header.stamp``); empty for the time at which
-    the messages were recorded."""
+    """The column, or the field of every message (``header.stamp``); empty for the recording time
+    of messages."""
     unit: str = "s"
-    """Of a number; a ROS stamp, a recording time and a column of dates need none."""
+    """Unit of a number; ignored for ROS stamps, recording times and dates."""
 
     def __post_init__(self) -> None:
         _check_one_of("time.unit", self.unit, TIME_UNITS)
@@ -34,15 +34,15 @@ class LogTime:
 
 @dataclass(kw_only=True)
 class _Columns:
-    """Where numbers are that belong together."""
+    """Columns of one quantity."""
 
     topic: str = ""
-    """Of the messages; empty for a table."""
+    """Topic of the messages; empty for a table."""
     columns: list[str] = field(default_factory=list)
     """Columns, or fields of the messages such as ``pose.pose.position.x``."""
 
     def _check(self, multiple: int, **chosen: tuple[str, Iterable[str]]) -> None:
-        """Refuses a number of columns, or a choice, given with what there is to choose from."""
+        """Checks the number of columns, and the values of options against known ones."""
         for name, (value, known) in chosen.items():
             _check_one_of(name, value, known)
         if len(self.columns) % multiple:
@@ -53,7 +53,7 @@ class _Columns:
 
 @dataclass(kw_only=True)
 class Position(_Columns):
-    """A point, or several one after the other, in the world: x, y, z."""
+    """One or several points in the world: x, y, z."""
 
     unit: str = "m"
 
@@ -66,7 +66,7 @@ class Orientation(_Columns):
     """The base's orientation in the world, a quaternion."""
 
     order: str = "wxyz"
-    """Of the columns."""
+    """Order of the columns."""
 
     def __post_init__(self) -> None:
         self._check(4, order=(self.order, ORDERS))
@@ -79,7 +79,7 @@ class Velocity(_Columns):
     unit: str = ""
     """m or mm, rad or deg, per second; m and rad by default."""
     frame: str = "world"
-    """Whose axes x, y, z are: ``world`` or ``body``, the base's own (as in ROS odometry)."""
+    """Frame of x, y, z: ``world`` or ``body``, the base's own (as in ROS odometry)."""
 
     def __post_init__(self) -> None:
         units = ("", *LENGTH_UNITS, *ANGLE_UNITS)
@@ -92,54 +92,54 @@ class Joints:
 
     topic: str = ""
     template: str = ""
-    """Column of every joint, its name in the place of ``{joint}``: ``q_{joint}``, or of messages
-    with names (sensor_msgs/JointState) ``position[{joint}]``."""
+    """Column of a joint, with ``{joint}`` in place of its name: ``q_{joint}``, or for messages with
+    names (sensor_msgs/JointState) ``position[{joint}]``."""
     columns: dict[str, str] = field(default_factory=dict)
-    """By joint, where the template does not hold: ``motor[3].q``, ``position[FR_HFE]``."""
+    """Columns by joint that differ from the template: ``motor[3].q``, ``position[FR_HFE]``."""
     unit: str = "rad"
     """rad or deg; for velocities per second."""
 
     def __post_init__(self) -> None:
         _check_one_of("unit", self.unit, ANGLE_UNITS)
         if self.template and "{joint}" not in self.template:
-            raise ValueError(f"template must hold '{{joint}}'; got '{self.template}'")
+            raise ValueError(f"template must contain '{{joint}}'; got '{self.template}'")
 
     def column(self, joint: str) -> str:
-        """The column of a joint; empty when the map has none."""
+        """Returns the column of a joint; empty if the map has none."""
         return self.columns.get(joint, self.template.replace("{joint}", joint))
 
 
 @dataclass(kw_only=True)
 class LogMap:
-    """What a ``columns.yaml`` holds."""
+    """The schema of a ``columns.yaml``."""
 
     time: LogTime = field(default_factory=LogTime)
     base_position: Position = field(default_factory=Position)
     base_orientation: Orientation = field(default_factory=Orientation)
     base_linear_velocity: Velocity = field(default_factory=Velocity)
-    """Of the base's origin; the derivative of its position if left out."""
+    """Velocity of the base's origin; by default the derivative of its position."""
     base_angular_velocity: Velocity = field(default_factory=Velocity)
-    """The derivative of the orientation if left out."""
+    """By default the derivative of the orientation."""
     joint_positions: Joints = field(default_factory=Joints)
     joint_velocities: Joints = field(default_factory=Joints)
-    """The derivatives of the positions if left out."""
+    """By default the derivatives of the positions."""
     desired_output: Position = field(default_factory=Position)
-    """z*: where the base, or the hand, is to be. An episode needs it."""
+    """z*, the desired position of the base or the hand. Required for episodes."""
     foot_positions: Position = field(default_factory=Position)
-    """Where the controller wants the feet: centres of the contact spheres, in the order of the
-    ``robot.yaml``. Where the joints have them if left out."""
+    """Desired centres of the contact spheres, in the order of the ``robot.yaml``; by default those
+    of the joint positions."""
     max_gap_s: float = 0.1
-    """Longest time between two rows that is bridged [s]."""
+    """Largest time between two rows [s]."""
 
     def check(self) -> None:
-        """Refuses a map that is not complete, or contradicts itself.
+        """Checks that the map is complete and consistent.
 
         Raises:
-            ValueError: Names the part.
+            ValueError: The check failed; the message names the entry.
         """
         for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
-                raise ValueError(f"'{name}.columns' is missing: a log without it says nothing")
+                raise ValueError(f"'{name}.columns' is missing")
         for name in ("base_position", "desired_output"):
             if len(getattr(self, name).columns) not in (0, 3):
                 raise ValueError(

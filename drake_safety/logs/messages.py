@@ -1,4 +1,4 @@
-"""Logs of messages: MCAP files, ROS 1 bags and ROS 2 bags."""
+"""Readers of message logs: MCAP files, ROS 1 bags and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drake_safety.logs.channel import Channel, listed, missing_extra
 from drake_safety.logs.log_map import LogTime
 
 Message = tuple[str, int, Any]
-"""Topic, time of recording [ns], and the decoded message."""
+"""Topic, recording time [ns] and decoded message."""
 
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 
@@ -51,7 +51,7 @@ def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) ->
             )
             return _channels(path, messages, wanted, time)
     except McapError as error:
-        raise ValueError(f"log '{path}' is damaged or no MCAP file: {error}") from error
+        raise ValueError(f"log '{path}' is damaged or not an MCAP file: {error}") from error
 
 
 def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
@@ -81,13 +81,13 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
             )
             return _channels(path, messages, wanted, time)
     except AnyReaderError as error:
-        raise ValueError(f"log '{path}' is damaged or no ROS bag: {error}") from error
+        raise ValueError(f"log '{path}' is damaged or not a ROS bag: {error}") from error
 
 
 def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:
     if "" in wanted:
         raise ValueError(
-            f"log '{path}' holds messages: the map must name the topic of {list(wanted[''])}; its "
+            f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; its "
             f"topics are {listed(sorted(existing))}"
         )
     missing = [topic for topic in wanted if topic not in existing]
@@ -141,17 +141,17 @@ def _channels(
 
 
 def field_of(path: str) -> Callable[[Any], Any]:
-    """A function that reads a field of a message.
+    """Returns a function that reads a field of a message.
 
     Args:
-        path: ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry whose
-            place is that of NAME in the ``name`` field beside it, as in sensor_msgs/JointState.
+        path: ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
+            index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
 
     Raises:
         ValueError: The path is malformed.
     """
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
-        raise ValueError(f"'{path}' is no field of a message, such as pose.position.x or q[3]")
+        raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")
     steps = [match.groups() for match in _STEP.finditer(path) if match.group() != "."]
 
     def read(message: Any) -> Any:
@@ -172,7 +172,7 @@ def _attribute(message: Any, name: str) -> Any:
     if not hasattr(message, name):
         existing = [key for key in getattr(message, "__slots__", None) or vars(message)]
         existing = [key for key in existing if not key.startswith("_")]
-        raise LookupError(f"there is no field '{name}'; there are {listed(existing)}")
+        raise LookupError(f"there is no field '{name}'; the fields are {listed(existing)}")
     return getattr(message, name)
 
 
@@ -194,4 +194,4 @@ def _number(value: Any) -> float | int:
         return value.item()
     if isinstance(value, int | float):
         return value
-    raise TypeError(f"it is no number but {type(value).__name__}")
+    raise TypeError(f"expected a number, got {type(value).__name__}")

@@ -1,4 +1,4 @@
-"""RobotLog: what a robot did, in Drake's order and SI units, read from a log of any format."""
+"""RobotLog: a robot's motion in Drake's order and SI units, read from a log of any format."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
 FORMATS = (".csv", ".parquet", ".mcap", ".bag")
-"""Suffixes of the files that can be read; a folder is a ROS 2 bag."""
+"""Suffixes of readable files; a folder is a ROS 2 bag."""
 
-_NUM_LOOKS = 50  # Rows, all over a log, at which its feet are looked at.
+_NUM_LOOKS = 50  # Number of rows at which the slip of the feet is checked.
 
 
 @dataclass(kw_only=True, eq=False)
 class RobotLog:
-    """What a robot did.
+    """Motion of a robot.
 
     Attributes:
-        path: Where it was read from.
+        path: The log.
         robot: Name of the robot.
         time_s: Time since the first row, increasing, (N,) [s].
         q: Positions: base quaternion (w, x, y, z), base position, joints, (N, n_q).
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
         desired_output: z* in the world, (N, n_z) [m], or None.
-        foot_positions: Where the controller wanted the feet, (N, 3 n_c) [m], or None.
+        foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
     """
 
     path: Path
@@ -61,9 +61,7 @@ class RobotLog:
         return float(self.time_s[-1])
 
     def states_at(self, at_s: np.ndarray) -> np.ndarray:
-        """Plant states [q, v] at any times of the log, (M, n_q + n_v).
-
-        Rotations are interpolated along the great arc, all else linearly.
+        """Interpolates plant states [q, v], (M, n_q + n_v): rotations by slerp, others linearly.
 
         Args:
             at_s: Times (M,) [s].
@@ -82,17 +80,17 @@ def read_log(
     *,
     step_s: float | None = None,
 ) -> RobotLog:
-    """Reads a log, checks all of it, and converts it.
+    """Reads, checks and converts a log.
 
     Args:
         path: A ``.csv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a ROS 2 bag.
-        log_map: What is where in it, or the path of a ``columns.yaml``.
+        log_map: The map of its columns, or the path of a ``columns.yaml``.
         robot: The robot.
-        step_s: Time between two rows of the result [s]; by default they are at the instants of
-            the base's positions.
+        step_s: Time between two rows of the result [s]; by default the times are those of the
+            base's positions.
 
     Raises:
-        ValueError: Whatever is missing or implausible, with file, row and column.
+        ValueError: A value is missing or implausible; the message names file, row and column.
     """
     path = Path(path)
     if not isinstance(log_map, LogMap):
@@ -111,7 +109,7 @@ def read_log(
 
 
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
-    """Columns by topic; those of the joints by the joints' names."""
+    """Names of the mapped columns by topic."""
     wanted: dict[str, list[str]] = {}
     for name in (
         "base_position",
@@ -133,8 +131,8 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]
         if unknown or missing:
             raise ValueError(
                 f"map: '{name}' must give a column to every joint of robot "
-                f"'{kinematics.robot.name}', {kinematics.joint_names}; it has none for {missing}"
-                f", and knows no joints {unknown}"
+                f"'{kinematics.robot.name}', {kinematics.joint_names}; it has none for {missing}, "
+                f"and the robot has no joints {unknown}"
             )
         columns = [part.column(joint) for joint in kinematics.joint_names]
         wanted.setdefault(part.topic, []).extend(columns)
@@ -190,7 +188,7 @@ def _converted(
     else:
         at_s = start + step_s * np.arange(int((end - start) / step_s + 1e-9) + 1)
     if len(at_s) < 2:
-        raise ValueError(f"log '{path}': its topics have {end - start:g} s in common: too little")
+        raise ValueError(f"log '{path}': its topics overlap for {end - start:g} s only")
     first_row = int(np.searchsorted(base_time, at_s[0]))
     where = channels[log_map.base_position.topic].where(min(first_row, len(base_time) - 1))
 

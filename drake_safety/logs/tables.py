@@ -1,4 +1,4 @@
-"""Logs that are tables: CSV and Parquet."""
+"""Readers of tables: CSV and Parquet."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         time: Where the time is.
 
     Raises:
-        ValueError: A column is missing or there twice, what stands in it is no number, or the
-            extra is not installed.
+        ValueError: A column is missing, duplicate or not numeric, or the extra is not installed.
     """
     pd = _pandas(path)
     names = _checked_names(path, wanted, time, _header_of(path))
     try:
-        # Cells stay text: whatever is no number can then be quoted as it stands.
+        # Read as text, so that errors can quote cells that are not numbers.
         frame = pd.read_csv(
             path, usecols=names, dtype=str, keep_default_na=False, skip_blank_lines=False
         )
@@ -50,8 +49,8 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         time: Where the time is.
 
     Raises:
-        ValueError: It is no Parquet file, a column is missing or holds no numbers, or the extra is
-            not installed.
+        ValueError: The file is not a Parquet file, a column is missing or not numeric, or the extra
+            is not installed.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -62,7 +61,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
             names = _checked_names(path, wanted, time, file.schema_arrow.names)
             frame = file.read(columns=names).to_pandas(timestamp_as_object=False)
     except (pa.ArrowInvalid, OSError) as error:
-        raise ValueError(f"log '{path}' is damaged or no Parquet file: {error}") from error
+        raise ValueError(f"log '{path}' is damaged or not a Parquet file: {error}") from error
     return _channel(path, frame, wanted, time, "row", 0)
 
 
@@ -129,7 +128,7 @@ def _channel(
 
 
 def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
-    """A column's numbers; integers stay integers, which a clock of nanoseconds needs."""
+    """A column as numbers; integers stay exact, as clocks in nanoseconds require."""
     values = frame[name].to_numpy()
     if values.dtype.kind in "iuf":
         return values
@@ -139,7 +138,7 @@ def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
         except (ValueError, TypeError, OverflowError):
             continue
     row = next(i for i, value in enumerate(values) if not _is_number(value))
-    raise ValueError(f"{channel.where(row, name)}: '{values[row]}' is no number")
+    raise ValueError(f"{channel.where(row, name)}: '{values[row]}' is not a number")
 
 
 def _is_number(value: object) -> bool:

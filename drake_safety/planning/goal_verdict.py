@@ -11,8 +11,7 @@ import numpy as np
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
-from drake_safety.learning.causes import NO_CAUSE, likely_causes
-from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.prediction import NO_CAUSE, is_unknown, likely_causes
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 

@@ -10,7 +10,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.gradients import unsafe_logits
 from drake_safety.planning.goal_verdict import (
     GoalVerdict,
     assess_goals,
@@ -142,7 +141,7 @@ def _descend(
         # Beyond the region nothing was learned: differences point inwards.
         inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
         inputs = goal_inputs(loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
-        x, logit, gradient = unsafe_logits(assessment, *inputs)
+        x, logit, gradient = assessment.unsafe_logits(*inputs)
         slope = (x[1:] - x[0]) @ gradient[0] / inwards
         found = nearest_of(point[None])
         if found is None and logit[0] <= aim + 0.1:

@@ -1,1 +1,1 @@
-"""Engines behind one face: Drake's plant and MuJoCo's, ground, obstacles, balls and pushes."""
+"""Simulated plants: Drake and MuJoCo behind one interface; ground, obstacles, balls and pushes."""

@@ -1,4 +1,4 @@
-"""Balls as free bodies that are thrown at a robot."""
+"""Balls, as free bodies, that are thrown at a robot."""
 
 import math
 from dataclasses import dataclass
@@ -16,26 +16,26 @@ from drake_safety.robots.model_files import package_parser
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 _MAX_STEPS = 30_000  # Of sphere tracing.
-_TOUCH_M = 1e-4  # Closer than this is touching, and no step is shorter.
-_BEFORE_M, _BEYOND_M = 2.0, 1.0  # Where the line of flight begins and ends, about its aim.
-_PARKED = np.array([50.0, 50.0, 0.0])  # Far from whatever happens [m].
+_TOUCH_M = 1e-4  # Contact distance and shortest step.
+_BEFORE_M, _BEYOND_M = 2.0, 1.0  # Ends of the line of flight, relative to its aim.
+_PARKED = np.array([50.0, 50.0, 0.0])  # Far from the robot [m].
 
 
 @dataclass(kw_only=True)
 class Throw:
-    """One ball: how heavy, how fast, from where."""
+    """A thrown ball."""
 
     time_s: float = 0.0
-    """When it touches the robot [s]."""
+    """Time of impact [s]."""
     mass_kg: float = 2.0
     speed_m_s: float = 6.0
     """Horizontal speed at impact [m/s]."""
     direction_rad: float = math.pi / 2
-    """Where it flies to, as an angle from the world's x axis [rad]."""
+    """Direction of flight, as an angle from the world's x axis [rad]."""
     offset_m: float = 0.0
-    """Sideways offset of its line from the base's origin [m]."""
+    """Lateral offset of the line of flight from the base's origin [m]."""
     height_m: float = 0.0
-    """Height of its line over the base's origin [m]."""
+    """Height of the line of flight over the base's origin [m]."""
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "speed_m_s"):
@@ -86,19 +86,19 @@ class Ball:
         self._plant.SetFreeBodySpatialVelocity(context, self._body, SpatialVelocity.Zero())
 
     def throw(self, context: Context, throw: Throw, lead_s: float) -> None:
-        """Puts the ball in flight so that it touches the robot after ``lead_s``.
+        """Starts the ball's flight so that it touches the robot after ``lead_s``.
 
-        The line of flight is traced to the first touch with any collision geometry of the
-        robot as it is posed now, sphere by sphere; gravity during the flight is allowed for, so
-        that the ball arrives horizontally.
+        The impact point is found by sphere tracing along the line of flight to the robot's
+        collision geometry in its present pose. The initial velocity compensates gravity, so that
+        the ball arrives horizontally.
 
         Args:
             context: The plant's Context.
-            throw: Mass, speed, direction, offsets.
-            lead_s: Time of flight until the touch [s].
+            throw: The throw.
+            lead_s: Time of flight until impact [s].
 
         Raises:
-            ValueError: The line misses the robot, or so long a flight would begin underground.
+            ValueError: The line misses the robot, or the flight would start under the ground.
         """
         if not lead_s >= 0:
             raise ValueError(f"throw: lead_s must not be negative; got {lead_s}")
@@ -119,7 +119,7 @@ class Ball:
             )
             if distance < _TOUCH_M or (p - aim) @ direction > _BEYOND_M:
                 break
-            # A line that grazes a leg would creep along it: a step has a least length.
+            # The least step length limits the number of steps along a grazed leg.
             p = p + max(distance, _TOUCH_M) * direction
         else:
             distance = math.inf

@@ -18,26 +18,25 @@ _NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
 
 
 class DivergenceError(RuntimeError):
-    """A plant's numbers ran away: what a simulation says after that means nothing."""
+    """A simulation is unstable or not finite."""
 
 
 class MujocoDynamics:
-    """One robot and its scene in MuJoCo.
+    """A robot and its scene in MuJoCo.
 
-    A state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, where its solver begins included: a step
-    depends on nothing else, so that equal arguments give equal bits. MuJoCo's free joint has the
-    position before the quaternion, the velocity of the origin in the world before the angular
-    velocity in the *body*; Drake's has quaternion before position, and angular velocity in the
-    world before that of the origin. The object keeps one scratch MjData; every method sets what it
-    needs first.
+    A state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, including the solver's warm start, so that
+    steps are deterministic. MuJoCo's free joint has the position before the quaternion, and the
+    origin's velocity in the world before the angular velocity in the *body*; Drake's has the
+    quaternion before the position, and the angular velocity in the world before the origin's. The
+    object keeps one scratch MjData, which every method overwrites.
 
     Args:
         robot: The robot.
         plant: A finalised Drake plant of the robot and its scene.
         scene_graph: The plant's scene graph.
-        variation: What differs from the published robot.
+        variation: Differences from the published robot.
         time_step_s: Step [s].
-        servos: Whether the command is a joint state for robot.yaml's servos, not torques.
+        servos: Whether the command is a joint state for robot.yaml's servos instead of torques.
 
     Raises:
         ValueError: As :func:`~drake_safety.plants.mujoco_model.build_model`.
@@ -55,7 +54,7 @@ class MujocoDynamics:
     ):
         self._mujoco = mujoco = import_mujoco()
         if mujoco.get_mju_user_warning() is None:
-            # MuJoCo would write its warnings to a file in whatever folder one is in.
+            # By default MuJoCo writes warnings to a file in the working directory.
             mujoco.set_mju_user_warning(lambda text: _LOGGER.debug("MuJoCo: %s", text))
         self.robot = robot
         self._plant = plant
@@ -69,7 +68,7 @@ class MujocoDynamics:
         model = self.model
         self.num_positions, self.num_velocities = model.nq, model.nv
         self.num_state = model.nq + 2 * model.nv
-        # The base is free and first in both; the joints' orders are each engine's own.
+        # The free base is first in both engines; the order of joints differs.
         joints = [model.joint(name) for name in self.joint_names]
         self._q_joints = np.array([joint.qposadr[0] for joint in joints], dtype=int)
         self._v_joints = np.array([joint.dofadr[0] for joint in joints], dtype=int)
@@ -79,7 +78,7 @@ class MujocoDynamics:
         return state[:n_q], state[n_q : n_q + n_v], state[n_q + n_v :]
 
     def state_from(self, plant_state: np.ndarray) -> np.ndarray:
-        """MuJoCo's state, its solver cold, of a state in Drake's convention.
+        """Converts a state from Drake's convention to MuJoCo's, without a warm start.
 
         Args:
             plant_state: Drake's ``[q; v]``, (n_q + n_v,); the quaternion need not be normalised.
@@ -97,10 +96,10 @@ class MujocoDynamics:
         return state
 
     def plant_state(self, state: np.ndarray) -> np.ndarray:
-        """A state in Drake's convention, ``[q; v]`` (n_q + n_v,).
+        """Converts a state from MuJoCo's convention to Drake's, ``[q; v]`` (n_q + n_v,).
 
         Args:
-            state: MuJoCo's, (num_state,).
+            state: MuJoCo's state, (num_state,).
         """
         qpos, qvel, _ = self._parts(state)
         plant_state = np.empty(self.num_positions + self.num_velocities)
@@ -118,17 +117,17 @@ class MujocoDynamics:
         command: np.ndarray,
         forces: Sequence[ExternallyAppliedSpatialForce] = (),
     ) -> np.ndarray:
-        """The state one step later.
+        """Computes the next state.
 
         Args:
-            state: MuJoCo's, (num_state,).
+            state: MuJoCo's state, (num_state,).
             command: Joint torques (n_j,) [N·m], or with servos joint positions and velocities
                 (2 n_j,) [rad, rad/s], in the order of ``joint_names``.
-            forces: What else acts during the step, on bodies of the Drake plant.
+            forces: External forces during the step, on bodies of the Drake plant.
 
         Raises:
             DivergenceError: The simulation is unstable, or an argument is not finite.
-            ValueError: A force acts on a body that the robot does not have.
+            ValueError: A force acts on a body that MuJoCo does not have.
         """
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
             raise DivergenceError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")

@@ -1,4 +1,4 @@
-"""A robot and what it touches as a MuJoCo model: mechanics from its URDF, contacts as in Drake."""
+"""A robot and its scene as a MuJoCo model: mechanics from the URDF, contacts as in Drake."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from drake_safety.robots.robot_model import RobotModel, by_pattern
 if TYPE_CHECKING:
     import mujoco
 
-_MECHANICS = {"link", "joint", "mujoco"}  # Of a URDF's elements, what MuJoCo is given.
+_MECHANICS = {"link", "joint", "mujoco"}  # Elements of a URDF that are passed to MuJoCo.
 _SHAPES = {
     Sphere: ("mjGEOM_SPHERE", lambda shape: [shape.radius(), 0.0, 0.0]),
     Box: ("mjGEOM_BOX", lambda shape: 0.5 * shape.size()),
@@ -37,14 +37,14 @@ _SHAPES = {
     Ellipsoid: ("mjGEOM_ELLIPSOID", lambda shape: [shape.a(), shape.b(), shape.c()]),
     HalfSpace: ("mjGEOM_PLANE", lambda _: [0.0, 0.0, 1.0]),
 }
-"""Drake's shapes as MuJoCo's: type and sizes."""
+"""MuJoCo's type and sizes of Drake's shapes."""
 
 
 def import_mujoco() -> Any:
-    """The package ``mujoco``, which only this engine needs.
+    """Imports the optional package ``mujoco``.
 
     Raises:
-        ValueError: It is not installed.
+        ValueError: The package is not installed.
     """
     try:
         import mujoco
@@ -56,7 +56,7 @@ def import_mujoco() -> Any:
 
 
 def mechanics_of_urdf(text: str) -> str:
-    """A URDF reduced to links, inertias and joints; what is seen and touched is left out.
+    """Reduces a URDF to links, inertias and joints, without visuals and collision shapes.
 
     Args:
         text: The URDF.
@@ -72,7 +72,7 @@ def mechanics_of_urdf(text: str) -> str:
 
 
 def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
-    """The robot's bodies and joints by MuJoCo's own reader, its base free."""
+    """The robot's bodies and joints as read by MuJoCo, with a free base."""
     mujoco = import_mujoco()
     path = model_file(robot.urdf, robot.source_dir)
     if path.suffix != ".urdf":
@@ -80,7 +80,7 @@ def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
             f"robot '{robot.name}': engine 'mujoco' reads models from URDF files; got '{path}'"
         )
     spec = mujoco.MjSpec.from_string(mechanics_of_urdf(path.read_text(encoding="utf-8")))
-    # Links that nothing moves keep their names: feet and hands may be among them.
+    # Keeps the names of welded links, among which feet and hands may be.
     spec.compiler.fusestatic = False
     base = spec.body(robot.base)
     roots = [body.name for body in spec.worldbody.bodies]
@@ -100,10 +100,10 @@ def _add_actuators(
     variation: PlantVariation,
     servos: bool,
 ) -> list[int]:
-    """Actuators, friction and damping of the actuated joints; returns `build_model`'s commands."""
+    """Adds actuators, friction and damping; returns the commands of `build_model`."""
     mujoco = import_mujoco()
     instance = plant.GetModelInstanceByName(robot.name)
-    # A joint's dry friction is, in Drake, a second actuator that comes after its own.
+    # Drake's plant models dry friction by a second actuator, after the joint's own.
     limits: dict[str, float] = {}
     for index in plant.GetJointActuatorIndices(instance):
         actuator = plant.get_joint_actuator(index)
@@ -124,14 +124,14 @@ def _add_actuators(
         joint = spec.joint(name)
         if joint is None:
             raise ValueError(
-                f"robot '{robot.name}': MuJoCo finds no joint '{name}'; it finds "
+                f"robot '{robot.name}': MuJoCo has no joint '{name}'; it has "
                 f"{[joint.name for joint in spec.joints if joint.name]}"
             )
         if name not in limits:
             continue
         joint.damping[0] += variation.joint_damping
         joint.frictionloss = variation.joint_friction_nm
-        # The limit is on the sum of what a joint's actuators do.
+        # The limit applies to the sum of a joint's actuators.
         is_limited = np.isfinite(limits[name])
         joint.actfrclimited = is_limited
         joint.actfrcrange = [-limits[name], limits[name]] if is_limited else [0.0, 0.0]
@@ -156,7 +156,7 @@ def _touchable(plant: MultibodyPlant) -> Iterator[tuple[RigidBody, list[Geometry
 def _add_geometries(
     spec: mujoco.MjSpec, plant: MultibodyPlant, scene_graph: SceneGraph, robot: RobotModel
 ) -> None:
-    """Collision geometry, what stands around the robot, and which pairs ignore each other."""
+    """Adds collision geometry of robot and scene, and collision filters."""
     mujoco = import_mujoco()
     inspector = scene_graph.model_inspector()
     context = plant.CreateDefaultContext()
@@ -174,7 +174,7 @@ def _add_geometries(
             mujoco_body.quat = X_WB.rotation().ToQuaternion().wxyz()
             if not plant.IsAnchored(body):
                 raise ValueError(
-                    f"engine 'mujoco' moves nothing but the robot; got '{name}', which moves too"
+                    f"engine 'mujoco' simulates no moving body but the robot; got '{name}'"
                 )
         names[body.index()] = mujoco_body.name
         for geometry in geometries:
@@ -220,7 +220,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariati
             f"robot '{robot.name}' has no body '{name}' for the payload; its bodies are "
             f"{[body.name for body in spec.bodies]}"
         )
-    # All masses are scaled after compiling; the payload's is what it is.
+    # All masses are scaled after compiling; this cancels the payload's scale.
     mass_kg = payload.mass_kg / variation.mass_scale
     inertia = 0.4 * mass_kg * PAYLOAD_RADIUS_M**2
     carrier.add_body(
@@ -242,38 +242,37 @@ def build_model(
     time_step_s: float,
     servos: bool,
 ) -> tuple[mujoco.MjModel, list[int]]:
-    """Compiles a robot and all that it touches.
+    """Compiles a robot and its scene.
 
-    Masses, inertias, joint frames, axes and stops are read from the URDF by MuJoCo. Actuators and
-    their limits are those that the Drake plant has, and so are collision shapes, coefficients of
-    friction and the pairs that ignore each other, so that both engines simulate one scene. What
-    is not said anywhere, such as how soft a contact is, is MuJoCo's default; its friction cone is
-    Coulomb's.
+    MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
+    limits, collision shapes, friction coefficients and collision filters are those of the Drake
+    plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
+    defaults, with an elliptic friction cone.
 
     Args:
         robot: The robot.
         plant: A finalised Drake plant of the robot and its scene.
         scene_graph: The plant's scene graph.
-        variation: What differs from the published robot.
+        variation: Differences from the published robot.
         time_step_s: Step [s].
-        servos: Whether joints have robot.yaml's position servos; they take torques otherwise.
+        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
 
     Returns:
-        The model, and for each of its controls the place of its value in the command: joint
+        The model, and for each of its controls the index of its value in the command: joint
         positions and velocities with servos, joint torques without, in the order of
         :func:`~drake_safety.robots.robot.servo_joints`.
 
     Raises:
-        ValueError: The robot's model is no URDF or MuJoCo cannot read it, its base is not the
-            root, a shape is unknown to MuJoCo, or something else in the scene moves.
+        ValueError: The robot's model is not a URDF or MuJoCo cannot read it, its base is not the
+            root, MuJoCo does not have a shape, or another body in the scene moves.
     """
     mujoco = import_mujoco()
     spec = _read_robot(robot)
     spec.option.timestep = time_step_s
-    # Damping, of servos too, enters implicitly, as it does in Drake.
+    # Implicit damping, including that of servos, as in Drake.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # A simulation that fails shall say so instead of beginning anew.
+    # By default a failed simulation is reset without an error.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     commands = _add_actuators(spec, plant, robot, variation, servos)
     _add_geometries(spec, plant, scene_graph, robot)

@@ -1,4 +1,4 @@
-"""MujocoPlant: a robot whose physics is MuJoCo's, in place of a MultibodyPlant."""
+"""MujocoPlant: a robot simulated by MuJoCo, in place of a MultibodyPlant."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drake_safety.plants.mujoco_dynamics import MujocoDynamics
 
 
 class MujocoPlant(LeafSystem):
-    """Steps MuJoCo; what goes in and comes out is in Drake's convention.
+    """Steps MuJoCo; all ports are in Drake's convention.
 
     .. pydrake_system::
 
@@ -23,16 +23,14 @@ class MujocoPlant(LeafSystem):
         - state
         - positions
 
-    ``command`` is what :class:`~drake_safety.plants.mujoco_dynamics.MujocoDynamics` takes: joint
-    torques, or the desired joint state ``[q; v]`` of servos, in the order of the robot's
-    velocities. ``applied_spatial_force`` is as a MultibodyPlant's. ``state`` is ``[q; v]`` as of
-    the MultibodyPlant, ``positions`` its first half. All of MuJoCo's state, its solver's start
-    included, is discrete state of the Context.
+    ``command`` has joint torques, or the desired joint state ``[q; v]`` of servos, in the order of
+    the robot's velocities. ``applied_spatial_force`` is that of a MultibodyPlant. ``state`` is the
+    MultibodyPlant's ``[q; v]``, ``positions`` its q. MuJoCo's state, including the solver's warm
+    start, is discrete state of the Context.
 
     Args:
         dynamics: The robot in MuJoCo.
-        plant: The finalised Drake plant it was made of, which gives the default state. It is not
-            simulated.
+        plant: The finalised Drake plant of the same robot, used for the default state only.
     """
 
     def __init__(self, dynamics: MujocoDynamics, plant: MultibodyPlant):

@@ -1,4 +1,4 @@
-"""Obstacles around a robot, and how far its arms and the points of a plan are from them."""
+"""Obstacles around a robot, and the distances of its arms and of points to them."""
 
 import math
 from collections.abc import Iterable
@@ -24,12 +24,12 @@ from drake_safety.robots.robot_model import RobotModel
 
 @dataclass(kw_only=True)
 class Obstacle:
-    """A model that stands in the world; one without collision geometry is only to be seen."""
+    """A static model in the world; without collision geometry it is a decoration."""
 
     model: str = ""
-    """``package://…`` or an absolute path of a model file with one link that nothing holds."""
+    """``package://…`` or an absolute path of a model file with one root link."""
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Of that link in the world, (3,) [m]."""
+    """Position of the root link in the world, (3,) [m]."""
     yaw_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -47,13 +47,13 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
 
     Args:
         plant: The plant.
-        obstacles: What stands where.
+        obstacles: The obstacles.
 
     Returns:
         Their model instances, in the same order.
 
     Raises:
-        ValueError: A model cannot be read, has not exactly one link that nothing holds, or moves.
+        ValueError: A model cannot be read, has moving joints, or more or less than one root link.
     """
     parser = package_parser(plant)
     instances = []
@@ -62,14 +62,14 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
         path = model_file(obstacle.model)
         if not (path.is_absolute() and path.is_file()):
             raise ValueError(
-                f"{who}: model must be a package:// URL or the absolute path of a file that exists"
+                f"{who}: model must be a package:// URL or the absolute path of an existing file"
             )
         try:
             found = parser.AddModels(str(path))
         except RuntimeError as error:
             raise ValueError(f"{who}: {error}") from error
         if len(found) != 1:
-            raise ValueError(f"{who}: one model is expected; the file has {len(found)}")
+            raise ValueError(f"{who}: expected one model; the file has {len(found)}")
         root = _root_link(plant, found[0], who)
         R_WO = RotationMatrix.MakeZRotation(obstacle.yaw_rad)
         X_WO = RigidTransform(R_WO, obstacle.position)
@@ -79,7 +79,7 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
 
 
 def _root_link(plant: MultibodyPlant, instance: ModelInstanceIndex, who: str) -> RigidBody:
-    """The only link of a rigid model that no joint holds."""
+    """The only root link of a rigid model."""
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
     moving = [joint.name() for joint in joints if joint.num_velocities() > 0]
     if moving:
@@ -89,8 +89,8 @@ def _root_link(plant: MultibodyPlant, instance: ModelInstanceIndex, who: str) ->
     roots = [link for link in links if link.index() not in held]
     if len(roots) != 1:
         raise ValueError(
-            f"{who}: one link that nothing holds is expected, to be put in its place; of the "
-            f"links {[link.name() for link in links]} these are {[link.name() for link in roots]}"
+            f"{who}: expected one root link; of the links {[link.name() for link in links]} these "
+            f"are {[link.name() for link in roots]}"
         )
     return roots[0]
 
@@ -98,7 +98,7 @@ def _root_link(plant: MultibodyPlant, instance: ModelInstanceIndex, who: str) ->
 def collision_geometries(
     plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]
 ) -> list[GeometryId]:
-    """Collision geometries of all bodies of some models."""
+    """Returns the collision geometries of all bodies of some models."""
     return [
         geometry
         for instance in instances
@@ -108,7 +108,7 @@ def collision_geometries(
 
 
 def arm_geometries(plant: MultibodyPlant, robot: RobotModel) -> list[GeometryId]:
-    """Collision geometries of every body that the joints of a reaching frame move."""
+    """Returns the collision geometries of all bodies moved by joints of reaching frames."""
     instance = plant.GetModelInstanceByName(robot.name)
     joints = [
         plant.GetJointByName(name, instance).index()
@@ -125,10 +125,10 @@ def filter_collisions(
     robot: RobotModel,
     obstacles: list[ModelInstanceIndex],
 ) -> None:
-    """Leaves of all contacts those of arms with obstacles and of the rest with the ground.
+    """Filters all contacts except those of arms with obstacles and of other bodies with the ground.
 
     Args:
-        plant: The plant, finalised.
+        plant: The finalised plant.
         scene_graph: Its scene graph.
         robot: The robot.
         obstacles: Model instances of the obstacles.
@@ -147,19 +147,18 @@ def filter_collisions(
 
 
 class Clearance:
-    """Signed distances from a robot's arms, and from points, to obstacles.
+    """Signed distances of a robot's arms, and of points, to obstacles.
 
-    It has a plant and scene graph of its own, without ground, and keeps one scratch Context;
-    every method sets what it needs first.
+    It has its own plant and scene graph, without ground, and one scratch Context.
 
     Args:
         robot: The robot.
-        obstacles: What stands where.
-        range_m: Distances beyond this count as this [m].
+        obstacles: The obstacles.
+        range_m: Largest distance; larger ones are clipped [m].
 
     Raises:
-        ValueError: The range is not positive, an obstacle is not to be read, or there is
-            something to touch and the arms have no collision geometry to touch it with.
+        ValueError: The range is not positive, an obstacle cannot be read, or the arms have no
+            collision geometry.
     """
 
     def __init__(self, robot: RobotModel, obstacles: list[Obstacle], *, range_m: float):
@@ -178,9 +177,9 @@ class Clearance:
         self._obstacles = set(collision_geometries(self._plant, instances))
         if self._obstacles and not arm_geometries(self._plant, robot):
             raise ValueError(
-                f"robot '{robot.name}': none of the bodies that the joints of its reaching frames "
-                f"{list(robot.reaching_frames)} move has collision geometry, so its arms could "
-                "not be told to be clear of obstacles"
+                f"robot '{robot.name}': no body moved by joints of its reaching frames "
+                f"{list(robot.reaching_frames)} has collision geometry, so its distance to "
+                "obstacles is unknown"
             )
         self.range_m = range_m
 
@@ -188,7 +187,7 @@ class Clearance:
         return self._scene_graph.get_query_output_port().Eval(self._scene_context)
 
     def of_arms(self, q: np.ndarray) -> float:
-        """Distance of the arms to the nearest obstacle, negative when they touch it [m].
+        """Returns the distance of the arms to the nearest obstacle, negative in contact [m].
 
         Args:
             q: Positions of the robot (n_q,).
@@ -196,7 +195,7 @@ class Clearance:
         Raises:
             ValueError: The positions are not finite.
         """
-        # A position that is not finite would end the process inside the plant.
+        # Drake's plant aborts the process for positions that are not finite.
         if not q.dot(q) < math.inf:
             raise ValueError(f"clearance: positions must be finite; got {q}")
         if not self._obstacles:
@@ -206,7 +205,7 @@ class Clearance:
         return min((pair.distance for pair in pairs), default=self.range_m)
 
     def of_points(self, p_WP: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-        """Distance of spheres to the nearest obstacle, (N,) [m].
+        """Returns the distance of spheres to the nearest obstacle, (N,) [m].
 
         Args:
             p_WP: Centres in the world, (N, 3) [m].

@@ -1,8 +1,7 @@
-"""The plant of a diagram, whichever engine simulates it: what goes in, what comes out, its state.
+"""The plant of a diagram, with the same interface for every physics engine.
 
-A task says what stands in its scene; the variation says whose physics moves the robot in it. With
-another engine than Drake's, a Drake plant still describes bodies, joints and shapes, for pictures
-and for the poses of geometry, but takes no step.
+The task defines the scene, the plant variation the engine. With another engine than Drake's, a
+Drake plant still describes bodies, joints and shapes, for rendering and geometry poses.
 """
 
 from __future__ import annotations
@@ -47,26 +46,26 @@ from drake_safety.robots.robot_model import RobotModel
 
 @dataclass(kw_only=True)
 class Scene:
-    """What is around a robot besides the ground."""
+    """The surroundings of a robot besides the ground."""
 
     obstacles: Sequence[Obstacle] | None = None
-    """With a list, even an empty one, arms touch obstacles alone and all else only the ground;
-    without, the model file says what touches what."""
+    """With a list, even an empty one, only contacts of arms with obstacles and of other bodies with
+    the ground are simulated; with None, those of the model file."""
     decorations: Sequence[Obstacle] = ()
-    """Models without collision geometry, to be seen."""
+    """Models without collision geometry."""
     has_ball: bool = False
-    """Whether there is a ball to throw."""
+    """Whether the scene has a ball to throw."""
 
 
 class DrakePhysics:
-    """A MultibodyPlant that simulates; see :func:`add_physics`.
+    """Physics by a MultibodyPlant; see :func:`add_physics`.
 
     Attributes:
-        plant, scene_graph, instance: The plant, its scene graph, the robot in it.
+        plant, scene_graph, instance: The plant, its scene graph and the robot's model instance.
         ball: The ball, or None.
-        state: Port of the robot's ``[q; v]``.
-        ball_state: Port of the ball's, or None.
-        applied_spatial_force: Port of forces on bodies.
+        state: Output port of the robot's ``[q; v]``.
+        ball_state: Output port of the ball's ``[q; v]``, or None.
+        applied_spatial_force: Input port of external forces.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class DrakePhysics:
         config = MultibodyPlantConfig(
             time_step=time_step_s,
             discrete_contact_approximation="lagged",
-            # What the ports say is of now, not of the last step: no copies are kept for it.
+            # Output ports are evaluated at the present state, not sampled at the last step.
             use_sampled_output_ports=False,
         )
         plant, scene_graph = AddMultibodyPlant(config, builder)
@@ -99,14 +98,14 @@ class DrakePhysics:
         self.applied_spatial_force: InputPort = plant.get_applied_spatial_force_input_port()
 
     def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
-        """Maps joint torques (n_j,) onto what :meth:`connect_torques` takes."""
+        """Returns the map from joint torques (n_j,) to the input of :meth:`connect_torques`."""
         return actuation_matrix(self.plant, self._robot, joint_names)
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
-        """Drives a robot without servos by torques that :meth:`actuation_matrix` has mapped."""
+        """Connects torques in actuator order to a robot without servos."""
         builder.Connect(torques, self.plant.get_actuation_input_port(self.instance))
         if self._variation.joint_friction_nm:
-            # Without a desired state Drake disarms the servos that are the joints' friction.
+            # Without a desired state Drake deactivates the servos that model dry friction.
             port = self.plant.get_desired_state_input_port(self.instance)
             rest = builder.AddNamedSystem("rest", ConstantVectorSource(np.zeros(port.size())))
             builder.Connect(rest.get_output_port(), port)
@@ -114,9 +113,9 @@ class DrakePhysics:
     def connect_servos(
         self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
     ) -> None:
-        """Drives a robot with servos by joint positions and velocities (2 n_j,), by name.
+        """Connects joint positions and velocities (2 n_j,) to a robot with servos.
 
-        Actuators that are the joints' dry friction hold velocity zero.
+        Actuators that model dry friction get a desired velocity of zero.
         """
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
@@ -127,7 +126,7 @@ class DrakePhysics:
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """The plant's Context, to be written; the variation's masses are in it.
+        """Context manager for writing the plant's Context, with the variation's masses set.
 
         Args:
             context: The root Context of the diagram.
@@ -138,10 +137,10 @@ class DrakePhysics:
 
 
 class MujocoPhysics:
-    """MuJoCo in place of the plant; see :func:`add_physics`, and DrakePhysics for what it offers.
+    """Physics by MuJoCo, with the interface of DrakePhysics; see :func:`add_physics`.
 
     Raises:
-        ValueError: A ball is asked for, or MuJoCo cannot simulate the robot or its scene.
+        ValueError: The scene has a ball, or MuJoCo cannot simulate the robot or its scene.
     """
 
     def __init__(
@@ -182,23 +181,23 @@ class MujocoPhysics:
         self.applied_spatial_force: InputPort = system.GetInputPort("applied_spatial_force")
 
     def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
-        """Maps joint torques (n_j,) onto what :meth:`connect_torques` takes: it is their order."""
+        """Returns the identity, as :meth:`connect_torques` has the order of the joints."""
         return np.eye(len(joint_names))
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
-        """Drives a robot without servos by joint torques."""
+        """Connects joint torques to a robot without servos."""
         builder.Connect(torques, self._system.GetInputPort("command"))
 
     def connect_servos(
         self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
     ) -> None:
-        """Drives a robot with servos by joint positions and velocities (2 n_j,)."""
-        del joint_names  # They are in the order of the velocities, as here.
+        """Connects joint positions and velocities (2 n_j,) to a robot with servos."""
+        del joint_names  # The order of the velocities.
         builder.Connect(desired_joint_state, self._system.GetInputPort("command"))
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """A Context of the Drake plant, to be written; what it then says becomes MuJoCo's state.
+        """Context manager for writing a Context of the Drake plant, copied to MuJoCo's state.
 
         Args:
             context: The root Context of the diagram.
@@ -214,7 +213,7 @@ class MujocoPhysics:
 
 Physics = DrakePhysics | MujocoPhysics
 ENGINES_WITH_BALLS = ("drake",)
-"""Engines in whose scenes a ball can be thrown."""
+"""Engines that can simulate a thrown ball."""
 _ENGINES: dict[str, type[DrakePhysics] | type[MujocoPhysics]] = {
     "drake": DrakePhysics,
     "mujoco": MujocoPhysics,
@@ -235,17 +234,17 @@ def add_physics(
     Args:
         builder: The diagram's builder.
         robot: The robot.
-        variation: The engine, and what differs from the published robot.
-        scene: What else is there.
+        variation: The engine, and differences from the published robot.
+        scene: The scene besides the ground.
         time_step_s: Step of the discrete plant [s].
-        servos: Whether the joints have robot.yaml's position servos; they take torques otherwise.
+        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
 
     Returns:
-        The plant, its ports and its state.
+        The plant and its ports.
 
     Raises:
-        ValueError: A body, joint or file that does not exist, a leg or an arm without motors, a
-            decoration that can be touched, or something that the engine cannot simulate.
+        ValueError: A body, joint or file does not exist, a leg or an arm has no motors, a
+            decoration has collision geometry, or the engine cannot simulate the scene.
     """
     physics = _ENGINES[variation.engine]
     return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
@@ -256,9 +255,9 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
 
     Args:
         plant: The plant.
-        friction: Coulomb's coefficient, static and dynamic.
+        friction: Friction coefficient, static and dynamic.
     """
-    # What is seen; what is stood on is the half space, which has no edge.
+    # The URDF is the visual; the collision shape is an infinite half space.
     package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ground.urdf")
     plant.RegisterCollisionGeometry(
         plant.world_body(),
@@ -280,8 +279,7 @@ def _furnish(
 ) -> tuple[ModelInstanceIndex, ModelInstanceIndex | None]:
     """Fills and finalises a plant; returns the model instances of robot and ball."""
     plant.set_name("plant")
-    # By default shapes are prepared for deformable contact too, and Drake warns that the ground's
-    # half space takes no part in it. Nothing here is deformable.
+    # Disables preparation for deformable contact, which warns about the half space.
     config = scene_graph.get_config()
     config.default_proximity_properties.resolution_hint = None
     scene_graph.set_config(config)
@@ -295,8 +293,8 @@ def _furnish(
     for decoration, model in zip(scene.decorations, decorations, strict=True):
         if collision_geometries(plant, [model]):
             raise ValueError(
-                f"decoration '{decoration.model}' has collision geometry, which no margin would "
-                "tell of; list it under 'obstacles'"
+                f"decoration '{decoration.model}' has collision geometry, which no margin covers; "
+                "list it under 'obstacles'"
             )
     if scene.obstacles is not None:
         filter_collisions(plant, scene_graph, robot, obstacles)

@@ -1,4 +1,4 @@
-"""Pushes: forces that act on a body of a robot for a while."""
+"""Pushes: constant forces on a body of a robot for a limited time."""
 
 from dataclasses import dataclass, field
 
@@ -7,16 +7,16 @@ import numpy as np
 
 @dataclass(kw_only=True)
 class Push:
-    """One push: where, how hard, when."""
+    """A push on a body."""
 
     body: str = ""
-    """The robot's body that is pushed, at its centre of mass."""
+    """The robot's body; the force acts at its centre of mass."""
     force_n: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """The force in the world, (3,) [N]."""
     time_s: float = 1.0
-    """When it begins [s]."""
+    """Start [s]."""
     duration_s: float = 0.1
-    """How long it lasts [s]."""
+    """Duration [s]."""
 
     def __post_init__(self) -> None:
         if len(self.force_n) != 3 or not np.isfinite(self.force_n).all():
@@ -34,18 +34,18 @@ class Push:
 
 @dataclass(kw_only=True)
 class RandomPushes:
-    """Pushes that episodes may begin with: only what follows them is learned from."""
+    """Random pushes at the start of episodes; only the rows after a push are training data."""
 
     share: float = 0.0
-    """Share of the episodes that begin with one."""
+    """Share of the episodes with a push."""
     body: str = ""
-    """The robot's body that is pushed; its base by default."""
+    """The pushed body; the robot's base by default."""
     force_n: list[float] = field(default_factory=lambda: [100.0, 800.0])
-    """Lowest and highest, in any horizontal direction [N]."""
+    """Lowest and highest force, in a random horizontal direction [N]."""
     time_s: list[float] = field(default_factory=lambda: [0.1, 1.5])
-    """Earliest and latest begin [s]."""
+    """Earliest and latest start [s]."""
     duration_s: float = 0.2
-    """How long each lasts [s]."""
+    """Duration [s]."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:
@@ -60,20 +60,20 @@ class RandomPushes:
             raise ValueError(f"random pushes: duration_s must be positive; got {self.duration_s}")
 
     def sample(self, rng: np.random.Generator, body: str) -> Push | None:
-        """The push of an episode, or None for an episode without.
+        """Samples the push of an episode, or None with probability 1 - ``share``.
 
         Args:
-            rng: Source of every draw.
-            body: The body that is pushed when :attr:`body` names none.
+            rng: Random generator.
+            body: The pushed body if :attr:`body` is empty.
         """
         return None if rng.random() >= self.share else self.draw(rng, body)
 
     def draw(self, rng: np.random.Generator, body: str) -> Push:
-        """A push, whatever the share of episodes that begin with one.
+        """Samples a push.
 
         Args:
-            rng: Source of every draw.
-            body: The body that is pushed when :attr:`body` names none.
+            rng: Random generator.
+            body: The pushed body if :attr:`body` is empty.
         """
         direction = rng.uniform(-np.pi, np.pi)
         strength = rng.uniform(self.force_n[0], self.force_n[1])

@@ -1,1 +1,1 @@
-"""What a robot is: ``robot.yaml`` and its model file, meshes, postures, and what ``new`` writes."""
+"""Robot descriptions: ``robot.yaml``, model files, meshes, postures, and new robots from a URDF."""

@@ -1,4 +1,4 @@
-"""Meshes in formats that Drake does not show, converted once and kept in the user's cache."""
+"""A cache of meshes converted from formats that Drake does not render."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     import trimesh
 
 SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
-"""Formats that Drake shows as they are."""
+"""Formats that Drake renders."""
 CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
-"""Environment variable that names the cache's folder."""
-_TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # Of an MTL file.
+"""Environment variable with the cache's folder."""
+_TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
 _GREY = [0.6, 0.6, 0.6, 1.0]
-_VERSION = b"3"  # Of the conversion: another one converts again.
+_VERSION = b"3"  # Version of the conversion, part of the cache's keys.
 
 
 def cache_folder() -> Path:
-    """``$DRAKE_SAFETY_CACHE``; else ``drake_safety`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    """Returns ``$DRAKE_SAFETY_CACHE``, else ``drake_safety`` in ``$XDG_CACHE_HOME`` or ~/.cache."""
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE])
     base = os.environ.get("XDG_CACHE_HOME")
@@ -35,10 +35,9 @@ def cache_folder() -> Path:
 
 
 def is_shown(path: Path) -> bool:
-    """Whether Drake shows a mesh as it is.
+    """Whether Drake renders a mesh without conversion.
 
-    An OBJ file of MeshLab's may call its materials wholly transparent where it means opaque; Drake
-    takes it at its word.
+    OBJ files by MeshLab may declare opaque materials fully transparent, and Drake renders them so.
 
     Args:
         path: The mesh.
@@ -49,7 +48,7 @@ def is_shown(path: Path) -> bool:
 
 
 def has_own_colours(path: Path) -> bool:
-    """Whether a mesh that Drake shows as it is brings its materials along.
+    """Whether a mesh that Drake renders without conversion has materials of its own.
 
     Args:
         path: The mesh.
@@ -59,7 +58,7 @@ def has_own_colours(path: Path) -> bool:
 
 @lru_cache(maxsize=1024)
 def _is_transparent(materials: Path) -> bool:
-    """Whether none of the materials of an MTL file lets anything be seen."""
+    """Whether all materials of an MTL file are fully transparent."""
     if not materials.is_file():
         return False
     found = _TRANSPARENCY.findall(materials.read_text("utf-8", "replace"))
@@ -67,14 +66,14 @@ def _is_transparent(materials: Path) -> bool:
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:
-    """A mesh in a format that Drake shows: the file itself, or a glTF file in the cache.
+    """Returns a mesh that Drake renders: the file itself, or a glTF file in the cache.
 
     Args:
         path: The mesh.
-        rgba: Colour of a mesh that has none of its own, "r g b a".
+        rgba: Colour of a mesh without materials, "r g b a".
 
     Raises:
-        MissingExtraError: There is something to convert, and nothing to convert it with.
+        MissingExtraError: The mesh needs a conversion whose packages are not installed.
         ValueError: The file does not exist or cannot be read.
     """
     if is_shown(path):
@@ -90,12 +89,12 @@ def shown_mesh(path: Path, rgba: str = "") -> Path:
 
 @lru_cache(maxsize=1024)
 def _digest(path: Path, changed_ns: int, rgba: str) -> str:
-    del changed_ns  # A file that has changed is another key.
+    del changed_ns  # Part of the cache key only.
     return hashlib.sha256(_VERSION + rgba.encode() + path.read_bytes()).hexdigest()
 
 
 def _write(target: Path, content: bytes) -> None:
-    """Under another name first: a process beside this one never reads half a file."""
+    """Writes atomically, as other processes may read the cache."""
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=target.parent, suffix=".part")
     try:
@@ -108,13 +107,13 @@ def _write(target: Path, content: bytes) -> None:
 
 
 def mesh_box(path: Path) -> np.ndarray:
-    """Lowest and highest corner of the box around a mesh, (2, 3), in the mesh's units.
+    """Returns lowest and highest corner of a mesh's bounding box, (2, 3), in the mesh's units.
 
     Args:
         path: The mesh.
 
     Raises:
-        MissingExtraError: There is nothing to read it with.
+        MissingExtraError: The packages that read it are not installed.
         ValueError: The file cannot be read, or is empty.
     """
     return np.array(_scene(path).bounds, dtype=float)
@@ -128,15 +127,15 @@ def _scene(path: Path) -> trimesh.Scene:
             import collada  # noqa: F401  # trimesh reads this format through it.
     except ImportError as error:
         raise MissingExtraError(
-            f"mesh '{path}': Drake does not show {path.suffix} files, and '{error.name}', which "
-            "would convert it, is not installed: pip install 'drake_safety[robots]'"
+            f"mesh '{path}': Drake does not render {path.suffix} files, and '{error.name}', which "
+            "converts them, is not installed: pip install 'drake_safety[robots]'"
         ) from error
     try:
         scene = trimesh.load_scene(path)
-    except Exception as error:  # trimesh's readers raise whatever they stumble on.
+    except Exception as error:  # trimesh's readers raise many kinds of exceptions.
         raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
     if scene.bounds is None:
-        raise ValueError(f"mesh '{path}' is empty, or holds no surface that trimesh can read")
+        raise ValueError(f"mesh '{path}' is empty, or has no surface that trimesh can read")
     return scene
 
 
@@ -152,7 +151,7 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
                     baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8
                 )
             )
-    # A robot's z axis points up, a glTF file's y axis: Drake turns it back.
+    # In glTF the y axis points up; Drake rotates it back to z.
     X_YZ = np.eye(4)
     X_YZ[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     scene.apply_transform(X_YZ)

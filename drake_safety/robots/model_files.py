@@ -1,4 +1,4 @@
-"""Where model files are: in this package, in one that pip installed, or beside a YAML file."""
+"""Model files: in this package, in one installed by pip, or beside a YAML file."""
 
 from __future__ import annotations
 
@@ -17,23 +17,18 @@ _EXTRAS = {"example-robot-data": "robots"}
 
 
 class MissingExtraError(ValueError):
-    """A model is in a package that is not installed, and an extra would install it."""
-
-
-def models_package_xml() -> Path:
-    """The ``package.xml`` behind ``package://drake_safety_models/``."""
-    return Path(str(files("drake_safety.models"))) / "package.xml"
+    """A model needs a package that an extra installs."""
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
-    """Makes ``package://drake_safety_models/…`` known to a parser's package map.
+    """Adds ``package://drake_safety_models/…`` to a package map.
 
     Args:
-        package_map: The parser's.
-        url: A ``package://NAME/…`` whose package, installed by pip, becomes known too.
+        package_map: The package map, such as a parser's.
+        url: A ``package://NAME/…`` whose package, installed by pip, is added too.
     """
     if not package_map.Contains("drake_safety_models"):
-        package_map.AddPackageXml(str(models_package_xml()))
+        package_map.AddPackageXml(str(files("drake_safety.models") / "package.xml"))
     parts = urlparse(url)
     if parts.scheme == "package" and not package_map.Contains(parts.netloc):
         folder = _installed_folder(parts.netloc)
@@ -42,13 +37,13 @@ def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
 
 
 def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
-    """A parser that knows the packages of :func:`add_to_package_map`.
+    """Returns a parser with the packages of :func:`add_to_package_map`.
 
-    Models of a name that the plant has already are renamed.
+    The parser renames models whose name the plant already has.
 
     Args:
-        plant: Where models go, before ``Finalize``.
-        url: As there.
+        plant: A plant before ``Finalize``.
+        url: See :func:`add_to_package_map`.
     """
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
@@ -58,7 +53,7 @@ def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
 
 @lru_cache
 def _installed_folder(name: str) -> Path | None:
-    """Where pip put the files of a package: its ``share/NAME``, or else the Python package."""
+    """Folder of an installed package: its ``share/NAME``, else the Python package."""
     try:
         distribution = importlib.metadata.distribution(name)
     except importlib.metadata.PackageNotFoundError:
@@ -73,12 +68,12 @@ def _installed_folder(name: str) -> Path | None:
 
 
 def model_file(url: str, folder: str = "") -> Path:
-    """The file behind a ``package://…`` URL, or behind a path that starts in ``folder``.
+    """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
-    A package is this one's (``drake_safety_models``), Drake's, or one that pip installed.
+    Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
 
     Raises:
-        MissingExtraError: The package is one that an extra installs, and is not installed.
+        MissingExtraError: An extra installs the package, and it is not installed.
         ValueError: The package is unknown.
     """
     parts = urlparse(url)
@@ -93,11 +88,11 @@ def model_file(url: str, folder: str = "") -> Path:
             f"'{url}': the package '{parts.netloc}' is not installed: "
             f"pip install 'drake_safety[{_EXTRAS[parts.netloc]}]'"
         )
-    raise ValueError(f"'{url}': no package '{parts.netloc}'; add its files by path")
+    raise ValueError(f"'{url}': no package '{parts.netloc}'; use a path instead")
 
 
 def is_installed(url: str) -> bool:
-    """Whether the package of a ``package://…`` URL can be found; of a path it is always so.
+    """Whether the package of a ``package://…`` URL is installed; true for a path.
 
     Args:
         url: The URL, or a path.

@@ -1,4 +1,4 @@
-"""How a robot.yaml enters a MultibodyPlant, and what may differ from the published robot."""
+"""Adds a robot to a MultibodyPlant, with plant variations that model a reality gap."""
 
 import re
 from dataclasses import dataclass, field
@@ -20,9 +20,6 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
-from drake_safety.robots.model_files import add_to_package_map as add_to_package_map
-from drake_safety.robots.model_files import model_file as model_file
-from drake_safety.robots.model_files import models_package_xml as models_package_xml
 from drake_safety.robots.robot_description import (
     add_description,
     add_stated_shapes,
@@ -46,13 +43,13 @@ class ObservationNoise:
 
 @dataclass(kw_only=True)
 class Payload:
-    """A small mass fastened to a body of the robot."""
+    """A small mass fixed to a body of the robot."""
 
     mass_kg: float = 1.0
     position_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Its centre in the body's frame, (3,)."""
     body: str = ""
-    """The body that carries it; the robot's base by default."""
+    """The body it is fixed to; the robot's base by default."""
 
     def __post_init__(self) -> None:
         if not self.mass_kg > 0:
@@ -63,10 +60,10 @@ class Payload:
 
 @dataclass(kw_only=True)
 class PlantVariation:
-    """How one plant differs from the published robot: a reality gap, as data."""
+    """Differences of a plant from the published robot."""
 
     engine: str = "drake"
-    """Whose physics: ``drake`` or ``mujoco``."""
+    """Physics engine: ``drake`` or ``mujoco``."""
     mass_scale: float = 1.0
     """Factor on every body's spatial inertia."""
     joint_friction_nm: float = 0.0
@@ -74,13 +71,13 @@ class PlantVariation:
     joint_damping: float = 0.0
     """Viscous damping added to every actuated joint [N·m·s/rad]."""
     foot_friction: float | None = None
-    """Friction coefficient of the feet in place of the robot's own."""
+    """Friction coefficient of the feet; the robot's own by default."""
     observation_noise: ObservationNoise = field(default_factory=ObservationNoise)
-    """Noise on what the controllers and the assessor measure."""
+    """Noise on the measurements of controllers and assessor."""
     input_noise: ObservationNoise = field(default_factory=ObservationNoise)
-    """Noise on the assessor's inputs alone; the closed loop's motion never sees it."""
+    """Noise on the assessor's inputs alone; the motion does not depend on it."""
     payload: Payload | None = None
-    """What the robot carries and its controllers know nothing of."""
+    """A mass that the controllers do not model."""
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -99,7 +96,7 @@ class PlantVariation:
 
 
 PAYLOAD_RADIUS_M = 0.05
-_FRICTION_SUFFIX = "_friction"  # Of the actuator that holds a joint by dry friction.
+_FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
@@ -109,9 +106,9 @@ def _require(robot: RobotModel, what: str, name: str, known: list[str]) -> None:
 
 
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
-    """Names of the robot's one-degree-of-freedom joints.
+    """Returns the names of the robot's one-degree-of-freedom joints.
 
-    Of a finalised plant they are in the order of its positions and of its velocities.
+    For a finalised plant they are in the order of its positions and of its velocities.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
@@ -161,18 +158,17 @@ def add_robot(
     Args:
         plant: A plant before ``Finalize``.
         robot: The robot.
-        variation: What differs from the published robot; nothing by default.
-        scene_graph: Where the feet's friction is assigned; without it friction is left alone.
-        servos: Whether the joints get robot.yaml's position servos. A robot under torques must
-            have none: in Drake 1.51 an actuator with gains whose desired state is not connected
-            takes no torque either, although it should be as if it had no gains.
+        variation: Differences from the published robot; none by default.
+        scene_graph: Assigns the feet's friction here; None keeps the model file's friction.
+        servos: Whether the joints get robot.yaml's position servos. Torque control needs False: in
+            Drake 1.51 an actuator with gains whose desired state is not connected ignores its
+            torque input.
 
     Returns:
         The model instance.
 
     Raises:
-        ValueError: A body or joint that robot.yaml names does not exist, or a pattern is
-            ambiguous.
+        ValueError: A body or joint in robot.yaml does not exist, or a pattern is ambiguous.
     """
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
@@ -187,7 +183,7 @@ def add_robot(
     if robot.collision == "stated" and plant.geometry_source_is_registered():
         add_stated_shapes(plant, robot, instance)
 
-    # Per model instance the plant lists actuators only once it is finalised.
+    # Before Finalize, the plant cannot list actuators by model instance.
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     actuated = {one.joint().name(): one for one in actuators if one.model_instance() == instance}
     for name in servo_joints(plant, robot):
@@ -227,34 +223,34 @@ def add_robot(
 
 
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
-    """Refuses a robot that could not carry itself: every joint of legs and arms has a motor.
+    """Checks that every joint of legs and arms has a motor.
 
     Args:
-        plant: The finalised plant, with the robot in it.
+        plant: The finalised plant with the robot.
         robot: The robot.
 
     Raises:
-        ValueError: Joints have none. Drake gives a joint one if the model file has a transmission
-            and an effort limit for it, and :func:`add_robot` if ``effort_limits`` names it.
+        ValueError: A joint has no motor. Drake adds one for a transmission with an effort limit in
+            the model file, and :func:`add_robot` for a joint in ``effort_limits``.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     driven = {
         plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(instance)
     }
     names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
-    # A foot need not say what moves it.
+    # Limbs may leave out their joints; then all joints are checked.
     without = [name for name in names or servo_joints(plant, robot) if name not in driven]
     if without:
         raise ValueError(
             f"robot '{robot.name}': joints {without} have no motor: '{robot.urdf}' has no "
             "transmission with an effort limit for them, and effort_limits in robot.yaml is "
-            f"{robot.effort_limits}; write there the largest torque of each [N·m], such as "
+            f"{robot.effort_limits}; add the largest torque of each [N·m], such as "
             f"effort_limits: {{{without[0]}: 40.0}}"
         )
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
-    """The standing position [rad] of every servo joint; zero where robot.yaml names none.
+    """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none.
 
     Raises:
         ValueError: A posture pattern matches no joint, or two match one.
@@ -273,10 +269,10 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
 def actuation_matrix(
     plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
 ) -> np.ndarray:
-    """Maps joint values onto the robot's actuators, by name; friction actuators get none.
+    """Returns the map from joint values to the robot's actuators; friction actuators get zero.
 
-    A plant with dry joint friction needs its desired state connected too, zero for a robot
-    without servos: friction is a servo of its own, disarmed otherwise.
+    A plant with dry joint friction needs a connected desired state, zero for a robot without
+    servos: friction is modelled by a servo, which is inactive otherwise.
 
     Args:
         plant: The finalised plant.
@@ -303,16 +299,16 @@ def actuation_matrix(
 def apply_masses(
     plant: MultibodyPlant, context: Context, robot: RobotModel, variation: PlantVariation
 ) -> None:
-    """Gives ``robot`` the masses of a variation in a plant's Context: its scale, its payload.
+    """Sets a robot's masses in a plant's Context to those of a variation, with its payload.
 
     Args:
         plant: The finalised plant.
         context: The plant's Context, whose parameters change.
         robot: The robot.
-        variation: What differs from the published robot.
+        variation: Differences from the published robot.
 
     Raises:
-        ValueError: The robot has no such body for the payload.
+        ValueError: The payload's body does not exist.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]

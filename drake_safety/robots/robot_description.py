@@ -1,4 +1,4 @@
-"""A robot's model file as it enters a plant: what robot.yaml says instead of it, stands."""
+"""Adds a robot's model file to a plant, with the overrides of robot.yaml."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_patte
 from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
 
 _logger = logging.getLogger("drake_safety")
-_SHAPE_FRICTION = 0.2  # Of what is no foot: a robot slides on its belly.
+_SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
 
 
 def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
-    """Adds a robot's bodies, joints and shapes to a plant, as its model file and robot.yaml say.
+    """Adds a robot's bodies, joints and shapes to a plant.
 
     Args:
         plant: A plant before ``Finalize``. Without a scene graph, geometry is left out.
@@ -46,8 +46,8 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
         The model instance, named as the robot.
 
     Raises:
-        ValueError: The file is no URDF though its name says so, its package is not installed, or
-            a mesh cannot be converted.
+        ValueError: A ``.urdf`` file is not a URDF, its package is not installed, or a mesh cannot
+            be converted.
     """
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir)
@@ -72,10 +72,10 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
 
 
 def _shown(urdf: UrdfCopy, robot: RobotModel) -> UrdfCopy:
-    """The URDF with visual meshes that Drake shows, the robot's ``visuals`` where they can be had.
+    """The URDF with visual meshes that Drake renders, from ``visuals`` if they are installed.
 
     Raises:
-        ValueError: A mesh cannot be converted, or the frames of ``visuals`` are others.
+        ValueError: A mesh cannot be converted, or the frames of ``visuals`` differ.
     """
     if robot.visuals and is_installed(robot.visuals):
         dressed = copy.deepcopy(urdf)
@@ -83,7 +83,7 @@ def _shown(urdf: UrdfCopy, robot: RobotModel) -> UrdfCopy:
         try:
             dressed.convert_visual_meshes()
         except MissingExtraError as error:
-            _logger.debug("%s keeps its own looks: %s", robot.name, error)
+            _logger.debug("%s keeps its own visuals: %s", robot.name, error)
         else:
             return dressed
     urdf.convert_visual_meshes()
@@ -92,9 +92,9 @@ def _shown(urdf: UrdfCopy, robot: RobotModel) -> UrdfCopy:
 
 @contextmanager
 def _quiet_about(robot: RobotModel) -> Iterator[None]:
-    """Says what the parser has to say of another's published file at the level of debugging.
+    """Logs the parser's warnings about files of other packages at debug level.
 
-    A user can change nothing about it, and every worker process would repeat it.
+    Users cannot change these files, and every worker process would repeat the warnings.
     """
     drake = logging.getLogger("drake")
     is_own = not robot.urdf.startswith("package://")
@@ -115,11 +115,11 @@ def _quiet_about(robot: RobotModel) -> Iterator[None]:
 def add_stated_shapes(
     plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
 ) -> None:
-    """Gives a robot the collision geometry of robot.yaml: its contact points and its shapes.
+    """Adds the collision geometry of robot.yaml: contact points and shapes.
 
     Args:
-        plant: A plant before ``Finalize``, with a scene graph.
-        robot: The robot; its bodies are in the plant.
+        plant: A plant before ``Finalize``, with a scene graph and the robot's bodies.
+        robot: The robot.
         instance: Its model instance.
 
     Raises:
@@ -162,10 +162,9 @@ def add_stated_shapes(
 def ignore_neighbours(
     plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
 ) -> None:
-    """Links that a joint connects do not collide, nor do those that are welded to them.
+    """Filters collisions of links connected by a joint, and of links welded to them.
 
-    Drake itself ignores the two bodies of a joint, but not a foot or a motor's housing that its
-    model file welds to one of them.
+    Drake filters the two bodies of a joint, but not bodies that are welded to them.
 
     Args:
         plant: A plant before ``Finalize``.

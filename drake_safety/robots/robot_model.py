@@ -1,4 +1,4 @@
-"""A robot as data: the schema of ``robot.yaml`` and how it is read."""
+"""The schema of ``robot.yaml`` and its loader."""
 
 import math
 import re
@@ -16,7 +16,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(kw_only=True)
 class Foot:
-    """One foot: the points that touch the ground, and the joints of its leg."""
+    """A foot: its contact points with the ground, and the joints of its leg."""
 
     body: str = ""
     """Body that carries the contact points."""
@@ -30,7 +30,7 @@ class Foot:
 
 @dataclass(kw_only=True)
 class JointGains:
-    """Gains of a joint's position servo, which Drake integrates implicitly."""
+    """Gains of a joint's position servo."""
 
     stiffness: float = 0.0
     """Proportional gain [N·m/rad]."""
@@ -40,7 +40,7 @@ class JointGains:
 
 @dataclass(kw_only=True)
 class TaskGains:
-    """How much a task of the whole-body controller counts, and how it follows its reference."""
+    """Weight and feedback gains of a task of the whole-body controller."""
 
     weight: float = 1.0
     """Weight of the squared error of the task's acceleration."""
@@ -52,12 +52,12 @@ class TaskGains:
 
 @dataclass(kw_only=True)
 class ReachingFrame:
-    """A hand: the point that reaches, the sphere around it, and the joints of its arm."""
+    """A hand: its reaching point, its collision sphere and the joints of its arm."""
 
     body: str = ""
-    """Body that carries the point."""
+    """Body of the point."""
     point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """The reaching point, centre of the hand's sphere, in the body's frame, (3,) [m]."""
+    """Reaching point and centre of the collision sphere in the body's frame, (3,) [m]."""
     radius_m: float = 0.0
     """Radius of the hand's collision sphere [m]."""
     joints: list[str] = field(default_factory=list)
@@ -70,18 +70,18 @@ class WholeBody:
 
     center_of_mass: TaskGains = field(default_factory=lambda: TaskGains(weight=10.0))
     orientation: dict[str, TaskGains] = field(default_factory=dict)
-    """By body; each keeps the orientation of its reference."""
+    """Orientation tasks by body."""
     reaching: TaskGains = field(default_factory=lambda: TaskGains(weight=50.0))
     posture: TaskGains = field(default_factory=lambda: TaskGains(weight=0.1))
     contact_damping: float = 40.0
-    """Gain K_d of the rows that keep a contact point still, J v̇ = -J̇v - K_d J v [1/s]."""
+    """Gain K_d of the contact constraints, J v̇ = -J̇v - K_d J v [1/s]."""
     regularization: float = 1e-4
-    """Weight of squared accelerations, of the base too."""
+    """Weight of squared accelerations, including the base's."""
     force_regularization: float = 1e-2
-    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]: it shares the load
-    out evenly and makes the solution unique; far heavier, and the robot sags."""
+    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]: it distributes the
+    load evenly and makes the solution unique; too large a weight lets the robot sag."""
     friction: float = 0.5
-    """Friction coefficient that the planned contact forces respect; below the ground's own."""
+    """Friction coefficient of the planned contact forces, below the ground's own."""
 
     def __post_init__(self) -> None:
         for task, gains in self.tasks().items():
@@ -94,7 +94,7 @@ class WholeBody:
                 raise ValueError(f"whole_body.{name} must be finite and positive; got {value}")
 
     def tasks(self) -> dict[str, TaskGains]:
-        """Every task by its name, ``orientation.BODY`` for the bodies."""
+        """Returns all tasks by name, ``orientation.BODY`` for the bodies."""
         bodies = {f"orientation.{body}": gains for body, gains in self.orientation.items()}
         return {
             "center_of_mass": self.center_of_mass,
@@ -123,10 +123,10 @@ class CollisionShape:
     """Centre of a capsule's other end, (3,)."""
 
     def check(self, who: str) -> None:
-        """Refuses what is no shape, or more than one.
+        """Checks that the fields define exactly one shape.
 
         Raises:
-            ValueError: Numbers are missing, or say two things.
+            ValueError: Fields are missing or contradict each other.
         """
         for name in ("position_m", "box_m", "to_m"):
             values = getattr(self, name)
@@ -145,47 +145,47 @@ class CollisionShape:
 
 
 COLLISIONS = ("model_file", "stated")
-"""Whose collision geometry a robot has."""
+"""Sources of collision geometry."""
 
 
 @dataclass(kw_only=True)
 class RobotModel:
-    """The schema of ``robot.yaml``: all that controllers and safe sets need to know of a robot."""
+    """The schema of ``robot.yaml``."""
 
     name: str = ""
     urdf: str = ""
-    """``package://…`` (ours, Drake's or a pip package's) or a path beside the YAML file; any
+    """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file; any
     format that Drake's Parser reads."""
     visuals: str = ""
-    """A URDF that says what the links look like, those of the same names, when its package is
-    installed: ``package://…``. Their frames must be those of ``urdf``, itself a URDF. Nothing that
-    is simulated depends on it."""
+    """``package://…`` of a URDF whose visuals replace those of links with the same names, if its
+    package is installed. Its frames must equal those of ``urdf``, itself a URDF. Simulations do not
+    depend on it."""
     base: str = ""
     """Floating base body."""
     posture: dict[str, float] = field(default_factory=dict)
     """Standing joint positions [rad], by regular expression over joint names."""
     feet: dict[str, Foot] = field(default_factory=dict)
     reaching_frames: dict[str, ReachingFrame] = field(default_factory=dict)
-    """By name of the hand."""
+    """By hand."""
     mirror: dict[str, str] = field(default_factory=dict)
-    """Joints on the other side: regular expression over joint names -> its partner's name."""
+    """Mirrored joints: regular expression over joint names -> name of the partner."""
     whole_body: WholeBody = field(default_factory=WholeBody)
     joint_gains: dict[str, JointGains] = field(default_factory=dict)
     """Position servo gains, by regular expression over joint names."""
     effort_limits: dict[str, float] = field(default_factory=dict)
-    """Effort limits [N·m] of actuators that the model file lacks, or that have none there, by
-    regular expression."""
+    """Effort limits [N·m] of actuators that the model file lacks or leaves unlimited, by regular
+    expression."""
     velocity_limits: dict[str, float] = field(default_factory=dict)
-    """Joint speed limits [rad/s] in place of the model file's, by regular expression."""
+    """Joint speed limits [rad/s] that replace the model file's, by regular expression."""
     collision: str = "model_file"
-    """``model_file``: the model file's collision geometry. ``stated``: the contact points of the
-    feet and ``shapes`` alone, where the file has meshes or none (URDF only)."""
+    """``model_file``: the model file's collision geometry. ``stated``: only the contact points of
+    the feet and ``shapes``, for files with meshes or without shapes (URDF only)."""
     shapes: dict[str, list[CollisionShape]] = field(default_factory=dict)
-    """With ``stated`` collisions, by regular expression over body names."""
+    """Shapes for ``stated`` collisions, by regular expression over body names."""
     foot_friction: float = 0.8
     """Coulomb friction coefficient of the contact points."""
     source_dir: str = ""
-    """Folder of the YAML file; filled in by the loader."""
+    """Folder of the YAML file; set by the loader."""
 
     def __post_init__(self) -> None:
         for name, foot in self.feet.items():
@@ -230,14 +230,14 @@ class RobotModel:
             )
 
     def limbs(self) -> list[Foot | ReachingFrame]:
-        """Legs and arms, by what is at their ends."""
+        """Returns all feet and reaching frames."""
         return [*self.feet.values(), *self.reaching_frames.values()]
 
     def reaching_frame(self, hand: str) -> ReachingFrame:
-        """The reaching frame of a hand.
+        """Returns the reaching frame of a hand.
 
         Raises:
-            ValueError: There is none of that name.
+            ValueError: The hand does not exist.
         """
         if hand not in self.reaching_frames:
             raise ValueError(
@@ -247,13 +247,12 @@ class RobotModel:
         return self.reaching_frames[hand]
 
     def mirror_partners(self, joint_names: Iterable[str]) -> dict[str, str]:
-        """Each joint's partner on the other side; joints that no pattern names are their own.
+        """Returns each joint's mirrored joint; joints without a pattern map to themselves.
 
-        A pattern pairs both ways, so that one side's names are enough.
+        Patterns hold in both directions, so one side's names suffice.
 
         Raises:
-            ValueError: A pattern matches no joint, or pairs a joint with one that does not
-                exist or with two.
+            ValueError: A pattern matches no joint, or maps a joint to a missing one or to two.
         """
         names = list(joint_names)
         partners: dict[str, str] = {}
@@ -288,31 +287,31 @@ class RobotModel:
 
 
 def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
-    """Reads a YAML mapping into a dataclass of dataclasses, every one of them validated.
+    """Reads a YAML mapping into a dataclass of dataclasses and validates each.
 
-    Drake's loader assigns a file's values to an object made of defaults, so that
-    ``__post_init__`` never sees them: it runs again here, innermost dataclass first.
+    Drake's loader assigns values to a default object, after ``__post_init__``: it is run again
+    here, innermost dataclass first.
 
     Args:
         schema: The dataclass.
-        raw: What the YAML holds.
-        who: Whose data it is, for messages.
+        raw: The parsed YAML.
+        who: Prefix of error messages.
 
     Raises:
-        ValueError: An unknown key, a value of another type, or one that validation refuses.
+        ValueError: An unknown key, a value of a wrong type, or a failed validation.
     """
     for misfit in _misfits(schema, raw, ()):
         raise ValueError(f"{who}: {misfit}")
     try:
         value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw, sort_keys=False))
         _validate(value)
-    except Exception as error:  # Drake's loader raises RuntimeError and bare Exceptions alike.
+    except Exception as error:  # Drake's loader raises RuntimeError and bare Exception.
         raise ValueError(f"{who}: {error}") from error
     return value
 
 
 def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
-    """:func:`load_typed` of a YAML file.
+    """Reads a YAML file by :func:`load_typed`.
 
     Raises:
         ValueError: The file does not exist, is not YAML, or does not fit the schema.
@@ -327,7 +326,7 @@ def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
 
 
 def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
-    """What a schema of nested dataclasses does not know, with what it knows there."""
+    """Messages about keys that a schema of nested dataclasses does not have."""
     optional = get_args(schema)
     if len(optional) == 2 and optional[1] is type(None):
         if raw is None:
@@ -385,7 +384,7 @@ def load_robot_file(path: str | Path) -> RobotModel:
 def by_pattern(
     patterns: dict[str, _Value], name: str, what: str, robot_name: str, kind: str = "joint"
 ) -> _Value | None:
-    """The value of the only pattern that matches ``name`` in full; None when none does.
+    """Returns the value of the only pattern that fully matches ``name``; None without a match.
 
     Raises:
         ValueError: Two patterns match.

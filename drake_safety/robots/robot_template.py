@@ -1,4 +1,4 @@
-"""A robot's folder and its first scenario, written from a URDF as far as that tells."""
+"""Writes a robot's folder and its first scenario from a URDF."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.standing_posture import solve_standing_posture
-from drake_safety.robots.urdf_copy import JointLimits, UrdfCopy
+from drake_safety.robots.urdf_copy import UrdfCopy
 from drake_safety.robots.urdf_survey import Limb, Survey
 
-# Servo gains of the balancing task's defaults, whose robot weighs 25.4 kg and stands 0.42 m high:
-# a torque in proportion to mass times height.
+# Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
 _DAMPING_S = 0.027
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
@@ -27,14 +26,14 @@ _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), (
 
 @dataclass(kw_only=True)
 class NewRobot:
-    """What was written.
+    """Result of `write_robot`.
 
     Attributes:
-        folder: Where.
-        files: The files.
-        asked: What the URDF does not tell and the user is asked for.
-        left_out: Visuals of the URDF that the copy lacks, and why.
-        sizes: Of the robot as it stands.
+        folder: The robot's folder.
+        files: The files in it.
+        asked: Values that the URDF lacks and the user must supply.
+        left_out: Visuals of the URDF that the copy lacks, with the reasons.
+        sizes: Sizes of the standing robot.
     """
 
     folder: Path
@@ -52,7 +51,7 @@ class _Findings:
     legs: list[Limb]
     arms: list[Limb]
     posture: dict[str, float]
-    limits: dict[str, JointLimits]
+    limits: dict[str, float]
     sizes: Sizes
     asked: list[str] = field(default_factory=list)
 
@@ -60,18 +59,17 @@ class _Findings:
 def write_robot(
     name: str, urdf: Path, task: str, folder: Path, *, feet: list[str] | None = None
 ) -> NewRobot:
-    """Writes a robot's folder: its URDF as Drake simulates it, robot.yaml, README, a scenario.
+    """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         urdf: Its URDF.
         task: ``balancing`` or ``reaching``.
-        folder: Where to; it must not exist yet.
+        folder: The folder, which must not exist yet.
         feet: Links that touch the ground; found by their height by default.
 
     Raises:
-        ValueError: A name that is none, an unknown task, a folder that exists, or a URDF of which
-            no legged robot can be made.
+        ValueError: Invalid name, unknown task, existing folder, or a URDF without a legged robot.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")
@@ -81,7 +79,7 @@ def write_robot(
         raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
     with tempfile.TemporaryDirectory() as scratch:
         found = _survey(name, urdf, task, Path(scratch) / f"{name}.urdf", feet)
-        # Only what is whole is moved to where the user looks.
+        # Copied to the target only when complete.
         staged = Path(scratch) / "robot"
         staged.mkdir()
         found.copy.write(staged / f"{name}.urdf")
@@ -110,8 +108,8 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
     arms = survey.arms(legs)
     if task == "reaching" and not arms:
         raise ValueError(
-            f"new: '{urdf}' has no arm, a limb of four joints or more that is no leg, so it cannot "
-            "reach; use --task balancing"
+            f"new: '{urdf}' has no arm (a limb of four joints or more that is not a leg) to reach "
+            "with; use --task balancing"
         )
     used = {joint for limb in (*legs, *arms) for joint in survey.chain(limb.body)}
     idle = [joint.name() for joint in survey.joints if joint.name() not in used]
@@ -122,7 +120,7 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
         copy.fix_joints(idle)
         copy.write(scratch)
         survey = Survey(scratch)
-    # A ball that is thrown aims at the base.
+    # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
     if is_base_bare and any([copy.restore_boxes(link) for link in survey.welded(survey.base)]):
         is_base_bare = False
@@ -138,7 +136,7 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
         legs=legs,
         arms=arms,
         posture=posture,
-        limits=copy.joint_limits(),
+        limits=copy.effort_limits(),
         sizes=_sizes(survey, legs, arms, copy),
     )
     found.asked += [
@@ -189,8 +187,8 @@ def _robot_yaml(found: _Findings, task: str) -> str:
     names = [joint.name() for joint in survey.joints]
     unit = sizes.mass_kg * sizes.height_m
     lines = [
-        f"# {found.name}: written from {found.copy.source.name}. Lines marked ASK hold what a URDF",
-        "# does not tell: look them up, and say in README.md where the figures come from.",
+        f"# {found.name}: written from {found.copy.source.name}. Lines marked ASK have values that",
+        "# the URDF lacks: look them up, and state their sources in README.md.",
         f"name: {found.name}",
         f"urdf: {found.name}.urdf",
         f"base: {survey.base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
@@ -200,7 +198,7 @@ def _robot_yaml(found: _Findings, task: str) -> str:
     ]
     for limb in found.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
-        ask = "  # ASK where it touches [m]" if limb.is_guess else ""
+        ask = "  # ASK its contact points [m]" if limb.is_guess else ""
         lines += [
             f"  {limb.name}:{ask}",
             f"    body: {limb.body}",
@@ -215,7 +213,7 @@ def _robot_yaml(found: _Findings, task: str) -> str:
             f"  {limb.name}:",
             f"    body: {limb.body}",
             "    point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
-            "    radius_m: 0.05  # ASK the sphere around the hand that must not touch [m]",
+            "    radius_m: 0.05  # ASK the radius of the hand's collision sphere [m]",
             f"    joints: [{', '.join(limb.joints)}]",
         ]
         found.asked.append(f"the point of hand '{limb.name}' that reaches, and its size [m]")
@@ -252,7 +250,7 @@ def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
     for name in names:
         if name in motors:
             continue
-        effort = found.limits[name].effort
+        effort = found.limits[name]
         if effort > 0 and math.isfinite(effort):
             lines.append(f"  {name}: {effort:g}")
         else:
@@ -267,7 +265,7 @@ def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
 
 
 def _mirror(names: list[str]) -> dict[str, str]:
-    """Joints of one side and their partners, by the usual words for left and right."""
+    """Joints of one side and their partners, by common names for left and right."""
     pairs: dict[str, str] = {}
     for name in names:
         for left, right in _SIDES:
@@ -291,7 +289,7 @@ def _readme(found: _Findings) -> str:
 {len(found.legs)} feet.
 
 ## Where the figures come from
-Fill in: whoever reads this must be able to look every figure up.
+Fill in the sources, so that every figure can be looked up.
 
 | figure | source |
 |---|---|
@@ -300,12 +298,12 @@ Fill in: whoever reads this must be able to look every figure up.
 | servo gains | estimated from mass and height; replace them by ... |
 | friction of the feet | assumed; replace it by ... |
 
-## What the URDF does not tell
+## Values that the URDF lacks
 {asked}
 
-## What was changed in the URDF
+## Changes of the URDF
 {notes}
 
-## Licence
-Of the URDF: ...
+## Licence of the URDF
+...
 """

@@ -1,38 +1,25 @@
-"""First scenarios for a new robot: the tasks' defaults, scaled to its mass and its height."""
+"""First scenarios for a new robot: the tasks' defaults, scaled to its size."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-# The robot that the balancing task's defaults suit.
-_MASS_KG = 25.433
-_HEIGHT_M = 0.4245
-_HALF_LENGTH_M = 0.21
-_HALF_WIDTH_M = 0.1245
+from drake_safety.robots.robot_size import BALANCING_REFERENCE, RobotSize
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sizes:
-    """A robot as it stands.
+class Sizes(RobotSize):
+    """Sizes of a standing robot, as far as scenarios need them.
 
     Attributes:
-        mass_kg: Of all bodies.
-        height_m: Of the base over the ground.
-        half_length_m: Of the feet's contact points about their centroid, along x.
-        half_width_m: The same along y.
-        lateral_m: Least distance of a foot from the midline.
-        reach_m: Length of an arm; 0 without.
-        shoulder_m: Where that arm begins, over the feet's centroid on the ground, (3,).
+        lateral_m: Smallest distance of a foot from the midline.
+        reach_m: Length of an arm; 0 without arms.
+        shoulder_m: First joint of that arm, relative to the feet's centroid on the ground, (3,).
         base: Name of the base.
-        joint_friction_nm: Dry friction of a joint by the URDF; None where it tells none.
+        joint_friction_nm: Median dry friction of the joints; None if the URDF has none.
     """
 
-    mass_kg: float
-    height_m: float
-    half_length_m: float
-    half_width_m: float
     lateral_m: float
     reach_m: float
     shoulder_m: list[float]
@@ -41,11 +28,11 @@ class Sizes:
 
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
-    """The scenario of a task, as commented YAML.
+    """Writes the scenario of a task as commented YAML.
 
     Args:
         task: One of `TASKS`.
-        sizes: Of the robot.
+        sizes: Sizes of the robot.
     """
     return TASKS[task](sizes)
 
@@ -64,10 +51,11 @@ def _ball(time_s: float, mass_kg: float, speed_m_s: float, direction_rad: float)
 def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: float) -> str:
     friction = sizes.joint_friction_nm
     if friction is None:
-        friction = 0.4 * sizes.mass_kg * sizes.height_m / (_MASS_KG * _HEIGHT_M)
+        scale = sizes.factors(BALANCING_REFERENCE)
+        friction = 0.4 * scale["mass"] * scale["height"]
     noise = f"{{position: {position:g}, velocity: {velocity:g}}}  # of your sensors [m, rad; 1/s]"
     return f"""variations:
-  nominal:  # what Γ learns from: the model, believed
+  nominal:  # the model that Γ is trained on
     mass_scale: {mass_scale:g}
     input_noise: {noise}
   actual:  # ASK how the real robot differs from its URDF
@@ -78,10 +66,10 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
 
 def _balancing(sizes: Sizes) -> str:
     h = sizes.height_m
-    # Times go with the square root of the height: so does a pendulum.
-    tall, slow = h / _HEIGHT_M, math.sqrt(h / _HEIGHT_M)
-    length, width = sizes.half_length_m / _HALF_LENGTH_M, sizes.half_width_m / _HALF_WIDTH_M
-    heavy = sizes.mass_kg / _MASS_KG
+    # Every value scales as with `scale_to_robot`, so that both give the same scenario.
+    scale = sizes.factors(BALANCING_REFERENCE)
+    tall, length, width = scale["height"], scale["length"], scale["width"]
+    slow, heavy, sideways = scale["duration"], scale["mass"], scale["speed_y"]
     return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high.
 task: drake_safety.diagrams.balancing:Balancing
 robot: robot.yaml
@@ -91,22 +79,23 @@ robot: robot.yaml
     fall_height_m: {0.47 * h:.3g}  # below it, it has fallen [m]
     support_clearance_m: {0.03 * tall:.3g}  # a foot lower than this carries [m]
   start:  # where episodes begin, and where their plans lead; widen for more unsafe ones
-    foot_offset_m: {0.02 * tall:.3g}
+    foot_offset_m: {0.02 * width:.3g}
     base_offset_m: {_numbers([0.08 * length, 0.05 * width])}  # x, y [m]
     base_height_m: {_numbers([0.85 * h, 1.06 * h])}  # [m]
-    velocity_std_m_s: {_numbers([0.5 * length / slow, 0.35 * width / slow, 0.1 * slow])}
+    velocity_std_m_s: {_numbers([0.5 * length / slow, 0.35 * sideways, 0.1 * tall / slow])}
     angular_velocity_std_rad_s: {0.4 / slow:.3g}
     target_offset_m: {_numbers([0.2 * length, 0.11 * width])}  # x, y [m]
     target_height_m: {_numbers([0.8 * h, 1.08 * h])}  # [m]
+    plan_duration_s: {_numbers([0.8 * slow, 1.6 * slow])}  # [s]
   push:  # ASK the balls that are thrown at it
     share: 0.35
     mass_kg: {_numbers([2 * heavy, 4 * heavy])}  # [kg]
-    speed_m_s: {_numbers([2 * slow, 11 * slow])}  # [m/s]
+    speed_m_s: {_numbers([2 * sideways, 11 * sideways])}  # [m/s]
     height_m: {0.03 * tall:.3g}
     target_offset_m: {_numbers([0.05 * length, 0.03 * width])}
   demonstration:  # the balls of `run --push ball`: a weak one and a strong one, towards [rad]
-    - {_ball(0.6, 2.0 * heavy, 3.5 * slow, 1.5708)}
-    - {_ball(1.68, 3.0 * heavy, 9.0 * slow, -1.2)}
+    - {_ball(0.6, 2.0 * heavy, 3.5 * sideways, 1.5708)}
+    - {_ball(1.68, 3.0 * heavy, 9.0 * sideways, -1.2)}
   recovery:
     threshold: 0.4
     step:
@@ -118,6 +107,7 @@ robot: robot.yaml
       min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]
       settle_margin_m: {0.08 * width:.3g}
       resume_margin_m: {0.02 * width:.3g}
+      return_duration_s: {0.5 * slow:.3g}  # [s]
 """
 
 
@@ -149,4 +139,4 @@ parameters:
 
 
 TASKS: dict[str, Callable[[Sizes], str]] = {"balancing": _balancing, "reaching": _reaching}
-"""What a scenario can be written for."""
+"""Writers of scenarios by task."""

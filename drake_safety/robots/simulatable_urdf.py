@@ -1,4 +1,4 @@
-"""Any URDF made fit for Drake, as `drake-safety new` writes it; every change is written down."""
+"""Converts a URDF for Drake, as `drake-safety new` does, and records every change."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from drake_safety.robots.model_files import MissingExtraError, model_file
 from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
-"""Of a joint, what Drake ignores with a warning each time that a robot is built."""
+"""Elements of a joint that Drake ignores with a warning."""
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
-    """Reads a URDF, changes what Drake would refuse, and gathers the meshes that go along.
+    """Reads a URDF, replaces what Drake rejects, and collects its meshes.
 
-    Visual meshes that Drake does not show are converted; see
-    :func:`~drake_safety.robots.mesh_cache.shown_mesh`. Those that cannot be are left out, as are
-    collision meshes that Drake does not read.
+    Visual meshes that Drake does not render are converted, see
+    :func:`~drake_safety.robots.mesh_cache.shown_mesh`, or left out if that fails. Collision meshes
+    that Drake does not read are left out.
 
     Args:
         path: The URDF.
 
     Raises:
-        ValueError: It does not exist, or is no URDF.
+        ValueError: The file does not exist or is not a URDF.
     """
     copy = read_urdf(path)
     for element in copy.root.findall("gazebo"):
@@ -45,7 +45,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     _gather_collision_meshes(copy)
     for link in copy.root.findall("link"):
         if link.find("visual") is None:
-            # Something to look at: the shapes that touch.
+            # Links without visuals show their collision shapes.
             for shape in link.findall("collision"):
                 visual = ET.SubElement(link, "visual")
                 visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
@@ -53,7 +53,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
 
 
 def _drop_friction(copy: UrdfCopy) -> None:
-    """Takes out dry friction, which Drake does not simulate from a URDF."""
+    """Removes dry friction, which Drake does not simulate from a URDF."""
     for joint in copy.root.iter("joint"):
         dynamics = joint.find("dynamics")
         if dynamics is not None:
@@ -63,13 +63,13 @@ def _drop_friction(copy: UrdfCopy) -> None:
                 copy.joint_friction[joint.get("name", "")] = friction
     if copy.joint_friction:
         copy.notes.append(
-            f"the dry friction of {len(copy.joint_friction)} joints is left out; a scenario states "
-            "it, as joint_friction_nm"
+            f"the dry friction of {len(copy.joint_friction)} joints is left out; the scenario sets "
+            "it as joint_friction_nm"
         )
 
 
 def _mend_inertias(copy: UrdfCopy) -> None:
-    """Takes out products of inertia that no body can have, and inertias of bodies without mass."""
+    """Removes impossible products of inertia, and inertias of bodies without mass."""
     for link in copy.root.iter("link"):
         inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
         if inertial is None or inertia is None:
@@ -82,25 +82,25 @@ def _mend_inertias(copy: UrdfCopy) -> None:
         )
         moments = np.nan_to_num([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         principal = np.linalg.eigvalsh(moments)
-        # A flat or a thin body is allowed, one without extent in some direction is not.
+        # Flat and thin bodies are allowed.
         if principal[0] < 1e-6 * principal[2] and np.any([xy, xz, yz]):
             for key in ("ixy", "ixz", "iyz"):
                 inertia.set(key, "0")
             copy.notes.append(
-                f"link '{link.get('name')}' has an inertia that no body can have; its products of "
-                "inertia are taken to be zero"
+                f"link '{link.get('name')}' has an impossible inertia; its products of inertia are "
+                "set to zero"
             )
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
-    """Gives materials of one name and several colours several names."""
+    """Renames materials that share a name but not a colour."""
     seen: dict[str, list[tuple[str, ...]]] = {}
     for material in copy.root.iter("material"):
         content = tuple(
             _plain(value) for part in material for value in " ".join(part.attrib.values()).split()
         )
         if not content:
-            continue  # It only mentions a material.
+            continue  # A reference to a material.
         name = material.get("name", "")
         known = seen.setdefault(name, [])
         if content not in known:
@@ -116,7 +116,7 @@ def _tell_materials_apart(copy: UrdfCopy) -> None:
 
 
 def _plain(value: str) -> str:
-    """A number as it is mostly written, so that 0 and 0.0 are the same."""
+    """Canonical form of a number, so that 0 and 0.0 are equal."""
     try:
         return f"{float(value):g}"
     except ValueError:
@@ -125,8 +125,8 @@ def _plain(value: str) -> str:
 
 def _gather_visual_meshes(copy: UrdfCopy) -> None:
     missing: list[str] = []
-    wanting: list[str] = []  # What would convert them.
-    unreadable: list[str] = []  # Why.
+    wanting: list[str] = []  # Meshes whose converter is not installed.
+    unreadable: list[str] = []  # Error messages.
     converted: list[str] = []
 
     def shown(url: str, rgba: str) -> str:
@@ -156,9 +156,8 @@ def _gather_visual_meshes(copy: UrdfCopy) -> None:
         )
     if wanting:
         copy.left_out.append(
-            f"visual meshes that Drake does not show are left out: {_listed(wanting)}; "
-            "`pip install 'drake_safety[robots]'` brings what converts them, then write the folder "
-            "anew"
+            f"visual meshes that Drake does not render are left out: {_listed(wanting)}; install "
+            "their converter by `pip install 'drake_safety[robots]'` and write the folder again"
         )
     copy.left_out += [f"a visual is left out: {why}" for why in dict.fromkeys(unreadable)]
     copy.notes += copy.left_out
@@ -190,7 +189,7 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
 
 
 def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
-    """The name in the copy of a mesh that goes along; namesakes get folders of their own."""
+    """Adds a mesh to the copy and returns its name; equal names get separate folders."""
     index = 0
     while True:
         target = f"meshes/{index}/{name}" if index else f"meshes/{name}"
@@ -204,7 +203,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _box_in_link(box: np.ndarray, shape: ET.Element, mesh: ET.Element) -> np.ndarray:
-    """The box around a mesh's box, scaled and posed as a shape is, (2, 3) [m]."""
+    """Bounding box in the link's frame of a mesh's box, (2, 3) [m]."""
     scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
     origin = origin_of(shape)
     X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
@@ -213,10 +212,7 @@ def _box_in_link(box: np.ndarray, shape: ET.Element, mesh: ET.Element) -> np.nda
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
-    """The file behind a mesh's URL, looked for around the URDF as ROS lays packages out.
-
-    What is not there may be in a package that pip has installed.
-    """
+    """The file of a mesh's URL: in a ROS package around the URDF, or in an installed package."""
     scheme, _, rest = url.rpartition("://")
     if scheme not in ("", "package", "file", "model"):
         return None
@@ -236,7 +232,7 @@ def _mesh_file(url: str, source: Path) -> Path | None:
 
 
 def _box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a mesh, (2, 3); binary STL needs no other package."""
+    """Lowest and highest corner of a mesh, (2, 3); binary STL is read without trimesh."""
     box = _stl_box(file)
     if box is None:
         with contextlib.suppress(ValueError):

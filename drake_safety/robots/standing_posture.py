@@ -1,4 +1,4 @@
-"""A standing posture from a URDF alone: feet under the hips, all as low as each other."""
+"""A standing posture from a URDF: feet under the hips, on level ground."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from pydrake.math import RotationMatrix
 
 from drake_safety.robots.urdf_survey import Limb, Survey
 
-_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Of the leg's length.
+_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Hip height / leg length.
 _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
 _TOLERANCE_M = 1e-3
-_STOP_RAD = 0.05  # Distance that the posture keeps from a joint's stops.
+_STOP_RAD = 0.05  # Distance of the posture from joint stops.
 _NUM_GUESSES = 10
-_ENOUGH = 5  # Solutions to choose from.
-_FREE_RAD = 2.5  # Of a joint without stops.
+_ENOUGH = 5  # Number of solutions to choose from.
+_FREE_RAD = 2.5  # Range of a joint without stops.
 
 
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
-    """Joint positions in which the robot can stand.
+    """Solves for joint positions in which the robot can stand.
 
-    Every foot stands under its hip, the joint where the long links begin, as far to the side as
-    where the straight leg ends, and is level if it has
-    more than one contact point; the base stands four fifths of a leg's length over the ground, or
-    what is nearest to that. Legs that spread at zero, as a spider's, keep half of their spread.
-    Of several solutions for a leg it takes one that bends the knee as most robots do (backwards;
-    forwards on two legs; upwards where legs spread), with small angles.
+    Every foot is under its hip (the joint where the long links begin), with the lateral offset of
+    the straight leg, and level if it has more than one contact point. The height of the hips is
+    four fifths of a leg's length, or the nearest feasible share. Legs that spread at zero, as a
+    spider's, keep half of their spread. Of several solutions for a leg, the one with small angles
+    and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used.
 
     Args:
         survey: The robot.
@@ -34,7 +33,7 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
         Positions of the legs' joints by name [rad].
 
     Raises:
-        ValueError: No such posture is within the joints' stops.
+        ValueError: No posture is within the joints' stops.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
@@ -53,8 +52,8 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
             survey.set_joints(solved)
             return {name: round(value, 4) for name, value in solved.items()}
     raise ValueError(
-        f"no standing posture found: the feet {list(reach)} cannot be put under their hips, as low "
-        "as the others, within their joints' stops. Are these all feet (--feet)?"
+        f"no standing posture found: the feet {list(reach)} cannot reach the ground under their "
+        "hips within their joints' stops. Are these all feet (--feet)?"
     )
 
 
@@ -70,7 +69,7 @@ class _Leg:
         foot = survey.positions(limb).mean(axis=0)
         hops = np.linalg.norm(np.diff([*neutral, foot], axis=0), axis=1)
         self._hip_index = int(np.argmax(hops > 0.6 * hops.max()))
-        # A knee is where the first long link ends.
+        # The knee is the joint after the hip.
         self._knee_index = min(self._hip_index + 1, len(neutral) - 1)
         self.hip = neutral[self._hip_index]
         self.length = float(hops[self._hip_index :].sum())
@@ -87,7 +86,7 @@ class _Leg:
         self._survey.set_joints(dict(zip(self.limb.joints, angles.tolist(), strict=True)))
 
     def solve(self, ground: float) -> np.ndarray | None:
-        """Angles that put the spheres' lowest points on the ground, under the hip."""
+        """Solves for angles that put the spheres' lowest points on the ground, under the hip."""
         from scipy.optimize import least_squares
 
         def errors(angles: np.ndarray) -> np.ndarray:
@@ -96,7 +95,7 @@ class _Leg:
             heights = points[:, 2] - self.limb.radius_m - ground
             parts = [points[:, :2].mean(axis=0) - self.target, heights]
             if len(points) > 1:
-                # Level, and turned as it is at zero.
+                # The orientation at zero keeps the foot level.
                 R_FF = self._R_BF.inverse() @ self._survey.pose(self.limb.body).rotation()
                 yaw = RotationMatrix(R_FF).ToAngleAxis()
                 parts.append(0.1 * yaw.angle() * np.asarray(yaw.axis()))

@@ -1,4 +1,4 @@
-"""A URDF as Drake can take it: what it cannot is changed or taken out, and written down."""
+"""An editable copy of a URDF, with a record of its changes."""
 
 from __future__ import annotations
 
@@ -18,32 +18,19 @@ from drake_safety.robots.model_files import model_file
 _DRAKE = "http://drake.mit.edu"
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointLimits:
-    """What a URDF says of a joint; NaN where it says nothing.
-
-    Attributes:
-        effort: [N·m].
-        velocity: [rad/s].
-    """
-
-    effort: float
-    velocity: float
-
-
 @dataclass(kw_only=True)
 class UrdfCopy:
-    """A URDF that is being made fit for simulation; the file that it was read from stays as it is.
+    """An editable copy of a URDF file.
 
     Attributes:
-        source: The file that it was read from.
-        root: Its outermost element, which is changed.
-        notes: What was changed, one sentence each.
-        left_out: Those of the notes that tell of shapes which can no longer be seen.
-        lost_shapes: Boxes around collision meshes that were taken out, by link: lowest and highest
-            corner in the link's frame, (2, 3) [m] each.
-        joint_friction: Dry friction that was taken out, by joint [N·m].
-        meshes: Meshes that go along: file name in the copy, and the file.
+        source: The original file.
+        root: The root element, which is edited.
+        notes: Descriptions of the changes, one sentence each.
+        left_out: Notes about visuals that were removed.
+        lost_shapes: Boxes around removed collision meshes by link: lowest and highest corner in the
+            link's frame, (2, 3) [m] each.
+        joint_friction: Removed dry friction by joint [N·m].
+        meshes: Meshes of the copy: name relative to the copy -> original file.
     """
 
     source: Path
@@ -58,7 +45,7 @@ class UrdfCopy:
         self._as_read = self.text()
 
     def text(self) -> str:
-        """The URDF as it is now."""
+        """Returns the edited URDF."""
         return ET.tostring(self.root, encoding="unicode")
 
     @property
@@ -67,38 +54,35 @@ class UrdfCopy:
         return self.text() != self._as_read
 
     def link(self, name: str) -> ET.Element:
-        """A link's element."""
+        """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
 
-    def joint_limits(self) -> dict[str, JointLimits]:
-        """Limits of every joint that moves, by name."""
-        found = {}
-        for joint in self.root.findall("joint"):
-            if joint.get("type") in ("revolute", "continuous", "prismatic"):
-                limit = joint.find("limit")
-                found[joint.get("name", "")] = JointLimits(
-                    effort=number(limit, "effort"), velocity=number(limit, "velocity")
-                )
-        return found
+    def effort_limits(self) -> dict[str, float]:
+        """Returns the effort limits of all movable joints by name [N·m]; NaN without a limit."""
+        return {
+            joint.get("name", ""): number(joint.find("limit"), "effort")
+            for joint in self.root.findall("joint")
+            if joint.get("type") in ("revolute", "continuous", "prismatic")
+        }
 
     def free_fixed_joints(self) -> None:
-        """A fixed joint mimics no other: Drake refuses one that says it does."""
+        """Removes <mimic> from fixed joints, where Drake rejects it."""
         for joint in self.root.findall("joint[@type='fixed']"):
             _remove(joint, "mimic")
 
     def drop_collisions(self) -> None:
-        """Takes out all collision shapes."""
+        """Removes all collision shapes."""
         for link in self.root.findall("link"):
             _remove(link, "collision")
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
-        """Puts meshes that Drake shows in the place of those to be seen.
+        """Replaces visual meshes.
 
-        A mesh whose colours are its own by then needs no material: Drake warns of two.
+        The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
 
         Args:
-            shown: From a mesh's URL, as the URDF has it, and its colour ("r g b a" or "") to the
-                URL of one that Drake shows, or the same; "" takes the visual out.
+            shown: Function of a mesh's URL in the URDF and its colour ("r g b a" or "") that
+                returns the new URL, or "" to remove the visual.
         """
         colours = {one.get("name", ""): one for one in self.root.findall("material")}
         for link in self.root.findall("link"):
@@ -118,15 +102,15 @@ class UrdfCopy:
                     visual.remove(material)
 
     def take_visuals(self, other: UrdfCopy) -> None:
-        """Puts what another URDF's links look like in the place of what those of this one do.
+        """Replaces the visuals of links by those of another URDF's links of the same name.
 
-        Links that have no visual shape there keep their own.
+        Links without visuals in the other URDF keep their own.
 
         Args:
-            other: The other URDF; its frames must be these.
+            other: The other URDF, with the same frames.
 
         Raises:
-            ValueError: A joint that leads to such a link lies elsewhere there.
+            ValueError: The origins of a replaced link's joint differ.
         """
         own_joints, their_joints = (
             {
@@ -137,7 +121,7 @@ class UrdfCopy:
             for urdf in (self, other)
         )
         for colour in other.root.iter("material"):
-            # A colour of the same name may be another one here.
+            # Both URDFs may use one name for different colours.
             if colour.get("name"):
                 colour.set("name", f"visuals_{colour.get('name')}")
         self.root.extend(other.root.findall("material"))
@@ -149,8 +133,8 @@ class UrdfCopy:
             here, there = own_joints.get(name), their_joints.get(name)
             if here is not None and there is not None and not np.allclose(here, there, atol=1e-6):
                 raise ValueError(
-                    f"'{other.source}' cannot say what link '{name}' of '{self.source}' looks "
-                    f"like: its joint's origin is {there} there, and {here} here"
+                    f"the visuals of link '{name}' in '{other.source}' do not fit '{self.source}': "
+                    f"its joint's origin is {there}, expected {here}"
                 )
             _remove(links[name], "visual")
             for visual in visuals:
@@ -158,16 +142,16 @@ class UrdfCopy:
                 if mesh is not None:
                     path = model_file(mesh.get("filename", ""), str(other.source.parent))
                     mesh.set("filename", str(path.resolve()))
-                    # A mesh with colours of its own needs none: Drake warns of two.
+                    # Drake warns of a second material.
                     if material is not None and has_own_colours(path):
                         visual.remove(material)
                 links[name].append(visual)
 
     def convert_visual_meshes(self) -> None:
-        """Puts glTF files of the user's cache in the place of visual meshes Drake does not show.
+        """Replaces visual meshes that Drake does not render by glTF files in the user's cache.
 
         Raises:
-            ValueError: A mesh does not exist, or cannot be converted.
+            ValueError: A mesh does not exist or cannot be converted.
         """
         folder = str(self.source.parent)
 
@@ -178,17 +162,17 @@ class UrdfCopy:
         self.replace_visual_meshes(shown)
 
     def anchor_meshes(self) -> None:
-        """Makes relative names of meshes absolute: text has no folder that they could start in."""
+        """Makes relative mesh paths absolute, as URDF text has no folder."""
         for mesh in self.root.iter("mesh"):
             url = mesh.get("filename", "")
             if "://" not in url:
                 mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
     def fix_joints(self, names: Iterable[str]) -> None:
-        """Makes joints rigid, at zero.
+        """Fixes joints at zero.
 
         Args:
-            names: Which.
+            names: Names of the joints.
         """
         fixed = set(names)
         for joint in self.root.findall("joint"):
@@ -205,7 +189,7 @@ class UrdfCopy:
             )
 
     def replace_collisions(self, link_name: str, points: np.ndarray, radius_m: float) -> None:
-        """Gives a link spheres in place of all its collision shapes.
+        """Replaces all collision shapes of a link by spheres.
 
         Args:
             link_name: The link.
@@ -218,18 +202,18 @@ class UrdfCopy:
             name = f"{link_name}_contact_{index}"
             _add_collision(link, name, point, "sphere", radius=f"{radius_m:.5g}")
         self.notes.append(
-            f"link '{link_name}' touches the ground with {len(points)} spheres in place of its "
-            "own collision shapes"
+            f"the collision shapes of link '{link_name}' are replaced by {len(points)} spheres on "
+            "the ground"
         )
 
     def restore_boxes(self, link_name: str) -> bool:
-        """Gives a link the boxes around the collision meshes that it has lost.
+        """Adds boxes in place of a link's removed collision meshes.
 
         Args:
             link_name: The link.
 
         Returns:
-            Whether there are any.
+            Whether the link had any.
         """
         boxes = self.lost_shapes.get(link_name, [])
         link = self.link(link_name)
@@ -238,12 +222,12 @@ class UrdfCopy:
             _add_collision(link, name, (low + high) / 2, "box", size=_numbers(high - low))
         if boxes:
             self.notes.append(
-                f"link '{link_name}' collides as the box around each mesh that it had"
+                f"the collision meshes of link '{link_name}' are replaced by their bounding boxes"
             )
         return bool(boxes)
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
-        """Lets pairs of links pass through each other.
+        """Filters collisions between pairs of links.
 
         Args:
             pairs: Names of links.
@@ -257,10 +241,10 @@ class UrdfCopy:
             ET.SubElement(
                 group, f"{{{_DRAKE}}}ignored_collision_filter_group", name=f"overlap_{index}"
             )
-            self.notes.append(f"links '{one}' and '{other}' overlap, so they ignore each other")
+            self.notes.append(f"collisions of the overlapping links '{one}' and '{other}' are off")
 
     def write(self, path: Path) -> None:
-        """Writes the copy, and beside it the meshes that it needs.
+        """Writes the copy and its meshes.
 
         Args:
             path: The URDF to write.
@@ -272,19 +256,19 @@ class UrdfCopy:
             target = path.parent / name
             target.parent.mkdir(parents=True, exist_ok=True)
             for file in mesh.parent.glob(f"{mesh.stem}.*"):
-                # A material file or a texture of the same stem is part of the mesh.
+                # Material files and textures have the mesh's stem.
                 if file.suffix in (mesh.suffix, ".mtl", ".png", ".bin"):
                     shutil.copyfile(file, target.with_suffix(file.suffix))
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF, to be changed.
+    """Reads a URDF as an editable copy.
 
     Args:
         path: The file.
 
     Raises:
-        ValueError: It does not exist, or is no URDF.
+        ValueError: The file does not exist or is not a URDF.
     """
     path = Path(path)
     if not path.is_file():
@@ -295,8 +279,8 @@ def read_urdf(path: Path) -> UrdfCopy:
         raise ValueError(f"'{path}' is not XML: {error}") from error
     if root.tag != "robot":
         raise ValueError(
-            f"'{path}' is no URDF: its outermost element is <{root.tag}>, not <robot>. Convert it "
-            "first, or write robot.yaml by hand: Drake itself reads SDFormat and MJCF, too"
+            f"'{path}' is not a URDF: its root element is <{root.tag}>, expected <robot>. Convert "
+            "it first, or write robot.yaml by hand: Drake also reads SDFormat and MJCF"
         )
     if any("xacro" in element.tag for element in root.iter()):
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
@@ -306,7 +290,7 @@ def read_urdf(path: Path) -> UrdfCopy:
 
 
 def _parsed(content: bytes) -> ET.Element:
-    """The outermost element; elements that Drake knows by their prefix keep it."""
+    """The root element; Drake's own elements keep their prefix."""
     root = None
     prefixes = {"drake": _DRAKE}
     parser = ET.iterparse(io.BytesIO(content), events=("start-ns", "start"))
@@ -316,7 +300,7 @@ def _parsed(content: bytes) -> ET.Element:
         elif root is None:
             root = value
     assert root is not None  # There is no XML without an element.
-    # Drake looks at the prefix alone, whatever address a file gives it.
+    # Drake identifies its elements by prefix, whatever the namespace's address.
     own = f"{{{prefixes.pop('drake')}}}"
     for element in root.iter():
         if element.tag.startswith(own):
@@ -328,7 +312,7 @@ def _parsed(content: bytes) -> ET.Element:
 
 
 def _remove(element: ET.Element, tag: str) -> None:
-    """Takes the parts of a kind out of an element."""
+    """Removes all children with a tag."""
     for part in element.findall(tag):
         element.remove(part)
 
@@ -346,7 +330,7 @@ def _add_collision(
 
 
 def origin_of(element: ET.Element) -> list[float]:
-    """Where an element lies in its parent: xyz [m] and rpy [rad], (6,)."""
+    """Returns an element's origin in its parent: xyz [m] and rpy [rad], (6,)."""
     origin = element.find("origin")
     texts = [("" if origin is None else origin.get(key)) or "0 0 0" for key in ("xyz", "rpy")]
     return [float(word) for word in " ".join(texts).split()]
@@ -363,7 +347,7 @@ def _colour(material: ET.Element | None, colours: dict[str, ET.Element]) -> str:
 
 
 def number(element: ET.Element | None, key: str) -> float:
-    """An attribute of an element; NaN where there is none, or no number."""
+    """Returns an attribute as a number; NaN if it is missing or not a number."""
     try:
         return math.nan if element is None else float(element.get(key, "nan"))
     except ValueError:

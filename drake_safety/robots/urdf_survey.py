@@ -1,4 +1,4 @@
-"""What a URDF tells of a robot: its base, its legs and arms, and where its feet touch."""
+"""Identifies a robot's base, legs, arms and contact points from its URDF."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.robots.model_files import package_parser
 
-_CORNER_RADIUS_M = 0.005  # Of the spheres at the corners of a flat foot.
+_CORNER_RADIUS_M = 0.005  # Radius of spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
-_LEVEL_M = 0.005  # Spheres that lie this much higher than the lowest still touch.
+_LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 
 
 @dataclass(kw_only=True)
@@ -25,13 +25,13 @@ class Limb:
     """A leg or an arm.
 
     Attributes:
-        name: That of its last body.
+        name: Name of its last body.
         body: The body at its end, which touches the ground or reaches.
-        joints: Its own joints, from the base on.
-        points: Where it touches: centres of spheres in the body's frame, (n, 3) [m].
-        radius_m: Of the spheres.
+        joints: Its own joints, starting at the base.
+        points: Centres of contact spheres in the body's frame, (n, 3) [m].
+        radius_m: Radius of the spheres.
         is_own_shape: Whether the URDF has these spheres.
-        is_guess: Whether the URDF says nothing of what touches.
+        is_guess: Whether the URDF has no collision shape at the end.
     """
 
     name: str
@@ -44,15 +44,15 @@ class Limb:
 
 
 class Survey:
-    """A URDF, read by Drake, its base at the world's origin and its joints as near zero as can be.
+    """A URDF in a plant, with the base at the world's origin and all joints at or near zero.
 
     Args:
         path: The URDF.
-        lost_shapes: Boxes around collision meshes that the URDF has lost, by link.
+        lost_shapes: Boxes around removed collision meshes by link.
 
     Raises:
-        ValueError: Drake cannot read it, it has no floating base, or a joint has more than one
-            degree of freedom.
+        ValueError: Drake cannot read the URDF, it has no floating base, or a joint has more than
+            one degree of freedom.
     """
 
     def __init__(self, path: Path, lost_shapes: dict[str, list[np.ndarray]] | None = None):
@@ -76,8 +76,8 @@ class Survey:
         ]
         if len(floating) != 1:
             raise ValueError(
-                f"'{path}' must have one body that nothing holds, its base; got "
-                f"{floating or 'none'}. Take a link 'world' out, with its joint"
+                f"'{path}' must have exactly one floating body, its base; got "
+                f"{floating or 'none'}. Remove a link 'world' and its joint"
             )
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
@@ -100,14 +100,14 @@ class Survey:
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
 
     def set_joints(self, values: dict[str, float]) -> None:
-        """Sets the joints [rad]: those that are not named as near zero as their limits allow."""
+        """Sets joint positions [rad]; other joints are as close to zero as their limits allow."""
         q = self._neutral.copy()
         for name, value in values.items():
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
 
     def chain(self, body: str) -> list[str]:
-        """Joints that move a body, from the base on."""
+        """Returns the joints that move a body, starting at the base."""
         found: list[str] = []
         while body in self._above:
             joint = self._above[body]
@@ -117,20 +117,20 @@ class Survey:
         return found[::-1]
 
     def pose(self, body: str) -> RigidTransform:
-        """Pose of a body in the base's frame."""
+        """Returns the pose of a body in the base's frame."""
         return self.plant.GetBodyByName(body, self.instance).EvalPoseInWorld(self.context)
 
     def joint_origin(self, joint: str) -> np.ndarray:
-        """Where a joint is, in the base's frame, (3,) [m]."""
+        """Returns the position of a joint in the base's frame, (3,) [m]."""
         frame = self.plant.GetJointByName(joint, self.instance).frame_on_child()
         return frame.CalcPoseInWorld(self.context).translation()
 
     def positions(self, limb: Limb) -> np.ndarray:
-        """Centres of a limb's contact spheres in the base's frame, (n, 3) [m]."""
+        """Returns a limb's contact points in the base's frame, (n, 3) [m]."""
         return (self.pose(limb.body) @ limb.points.T).T
 
     def leaves(self) -> list[list[str]]:
-        """Groups of bodies, welded to each other, beyond which nothing moves."""
+        """Returns groups of welded bodies at the ends of the kinematic tree."""
         carries = {
             name for joint in self.joints for name in self.welded(joint.parent_body().name())
         }
@@ -142,31 +142,32 @@ class Survey:
         return groups
 
     def welded(self, body: str) -> list[str]:
-        """Bodies that are rigidly one with a body, itself among them."""
+        """Returns the bodies welded to a body, including itself."""
         one = self.plant.GetBodyByName(body, self.instance)
         return [b.name() for b in self.plant.GetBodiesWeldedTo(one)]
 
     def collides(self, body: str) -> bool:
-        """Whether a body, or one that is welded to it, has collision geometry."""
+        """Whether a body or one welded to it has collision geometry."""
         return any(
             self.plant.GetCollisionGeometriesForBody(self.plant.GetBodyByName(name, self.instance))
             for name in self.welded(body)
         )
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
-        """The limbs that reach lowest, or those that end in the given links.
+        """Returns the limbs that reach lowest, or those that end in the given links.
 
         Args:
             feet: Links that touch the ground; found by their height by default.
 
         Raises:
-            ValueError: There is no such link, it ends no limb, or there are fewer than two feet.
+            ValueError: A link does not exist or is not the end of a limb, or there are fewer than
+                two feet.
         """
         groups = self.leaves()
         if feet is None:
             lowest = [self._lowest(group) for group in groups]
             floor = min(lowest, default=0.0)
-            # Arms that hang end well above the ground.
+            # Hanging arms end well above the ground.
             groups = [
                 group
                 for group, z in zip(groups, lowest, strict=True)
@@ -182,21 +183,21 @@ class Survey:
             groups = [group for group in groups if set(group) & set(feet)]
         if len(groups) < 2:
             raise ValueError(
-                f"found {len(groups)} feet, of at least 2: name the links that touch the ground by "
-                f"--feet; limbs end in {[name for g in self.leaves() for name in g]}"
+                f"found {len(groups)} feet, expected at least 2: name the links that touch the "
+                f"ground by --feet; limbs end in {[name for g in self.leaves() for name in g]}"
             )
         limbs = [self._leg(group) for group in groups]
         shared = set.intersection(*(set(limb.joints) for limb in limbs))
         for limb in limbs:
             limb.joints = [name for name in limb.joints if name not in shared]
-        # Those in front first, and of those the right one: the order is for people alone.
+        # Front to back, then right to left, for readability.
         limbs.sort(
             key=lambda limb: tuple(np.round(self.positions(limb).mean(axis=0), 1) * [-1, 1, 0])
         )
         return limbs
 
     def arms(self, legs: list[Limb]) -> list[Limb]:
-        """Other limbs of four joints or more; fingers belong to the body that carries them.
+        """Returns other limbs of four joints or more; a hand's fingers are no limbs.
 
         Args:
             legs: The legs.
@@ -223,14 +224,14 @@ class Survey:
                 joint = self.plant.GetJointByName(shared[-1], self.instance)
                 body = joint.child_body().name()
             limb = Limb(name=body, body=body, joints=shared)
-            # Arms hang on a torso that is not theirs.
+            # Joints of the torso are shared between arms.
             others = [set(c[0][0]) for key, c in arms.items() if key != tuple(shared[:4])]
             limb.joints = [name for name in shared if not any(name in other for other in others)]
             found.append(limb)
         return found
 
     def overlaps(self) -> set[tuple[str, str]]:
-        """Pairs of links that touch each other as the joints stand."""
+        """Returns pairs of links that overlap in the present posture."""
         query = self._scene_graph.get_query_output_port().Eval(
             self._scene_graph.GetMyContextFromRoot(self._root)
         )
@@ -254,7 +255,7 @@ class Survey:
     def _leg(self, group: list[str]) -> Limb:
         joints = self.chain(group[0])
         shapes = self._shapes(group)
-        # The body that is named foot, or the one farthest out.
+        # A body whose name contains "foot", or the last one.
         body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
         if not shapes:
             return Limb(name=body, body=body, joints=joints)
@@ -285,7 +286,7 @@ class Survey:
         )
 
     def _shapes(self, group: list[str]) -> list[tuple[str, np.ndarray, float, bool]]:
-        """Shapes of bodies: body, where spheres stand for it (n, 3), their radius, is it one."""
+        """Shapes of bodies as (body, sphere centres (n, 3), sphere radius, whether a sphere)."""
         inspector = self._scene_graph.model_inspector()
         found: list[tuple[str, np.ndarray, float, bool]] = []
         for name in group:
@@ -313,7 +314,7 @@ class Survey:
 
 
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spheres in place of a box: at its corners, or one below where it is small."""
+    """Spheres that replace a box: at its corners, or one below a small box."""
     if np.sort(half)[:2].max() < 0.035 and np.linalg.norm(half) < 0.12:
         radius = float(np.sort(half)[0])
         down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]

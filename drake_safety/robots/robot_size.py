@@ -1,8 +1,7 @@
-"""Numbers that were chosen on one robot, carried over to another of the same build by its size.
+"""Scaling of parameters from one robot to another of the same build.
 
-Lengths are in proportion to the standing height or to the spacing of the feet, durations to
-√(height), as a pendulum's are (equal Froude numbers), speeds to a length over a duration, and the
-masses of what is thrown to the robot's own.
+Lengths scale with the standing height or the foot spacing, durations with √height (equal Froude
+numbers), speeds with length over duration, and the masses of balls with the robot's mass.
 """
 
 import math
@@ -10,46 +9,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
-import numpy as np
-
-from drake_safety.control.kinematics import RobotKinematics
-
-_DIGITS = 4  # Significant ones: no sampling range is worth more, and the file stays readable.
+_DIGITS = 4  # Significant digits of scaled values.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSize:
-    """How large a robot is, as far as standing and stepping go."""
+    """Size of a standing robot."""
 
     height_m: float
-    """Of the base, standing."""
+    """Height of the base."""
     half_length_m: float
-    """Of the feet's rectangle, along x."""
+    """Largest distance of a contact point from the feet's centroid along x."""
     half_width_m: float
-    """Of the feet's rectangle, along y."""
+    """Largest distance of a contact point from the feet's centroid along y."""
     mass_kg: float
 
-    @classmethod
-    def of(cls, kinematics: RobotKinematics) -> "RobotSize":
-        """The size of a robot in its standing posture."""
-        half_length_m, half_width_m = np.abs(kinematics.nominal_contacts).max(axis=0).tolist()
-        return cls(
-            height_m=kinematics.standing_height,
-            half_length_m=half_length_m,
-            half_width_m=half_width_m,
-            mass_kg=kinematics.total_mass,
-        )
-
     def factors(self, reference: "RobotSize") -> dict[str, float]:
-        """What to multiply a quantity of the reference robot by, by the quantity's name.
+        """Returns scale factors by the name of the quantity.
 
         Args:
-            reference: The robot that numbers were chosen on.
+            reference: The robot that the parameters were chosen for.
 
         Returns:
-            ``height``, ``length``, ``width`` for lengths upwards, along x and along y;
-            ``duration``; ``speed_x``, ``speed_y``, ``speed_z``, ``rate`` for speeds and turning;
-            ``mass``; ``one``.
+            ``height``, ``length``, ``width`` for lengths along z, x and y; ``duration``;
+            ``speed_x``, ``speed_y``, ``speed_z``, ``rate`` for linear and angular speeds; ``mass``;
+            ``one``.
         """
         height = self.height_m / reference.height_m
         length = self.half_length_m / reference.half_length_m
@@ -69,19 +53,25 @@ class RobotSize:
         }
 
 
+BALANCING_REFERENCE = RobotSize(
+    height_m=0.4245, half_length_m=0.2194, half_width_m=0.1245, mass_kg=25.43
+)
+"""The robot that the defaults of the balancing task were chosen for."""
+
+
 def scaled_defaults(
     defaults: Any, quantities: Mapping[str, Any], factors: Mapping[str, float]
 ) -> dict[str, Any]:
-    """The defaults of a dataclass of dataclasses, scaled.
+    """Scales the defaults of nested dataclasses.
 
     Args:
         defaults: The dataclass.
-        quantities: For each field that is scaled its quantity, a list of them for a list of
-            different ones, or such a mapping for a dataclass.
-        factors: By quantity.
+        quantities: Quantity of each scaled field: a name, a list of names for the entries of a
+            list, or such a mapping for a dataclass.
+        factors: Scale factors by quantity.
 
     Returns:
-        The scaled fields alone, nested as they are.
+        The scaled fields, nested alike.
 
     Raises:
         ValueError: The dataclass has no such field.
@@ -103,7 +93,7 @@ def scaled_defaults(
 
 
 def overlaid(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Two nested mappings as one; where both say something, what lies above stands."""
+    """Merges two nested mappings; values of ``above`` take precedence."""
     merged = dict(below)
     for name, value in above.items():
         lower = merged.get(name)
