@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection, Sequence
+
 import numpy as np
 
 NO_CAUSE = -1
@@ -36,3 +39,36 @@ def likely_causes(
     has_margins = np.isfinite(relative).any(axis=1)
     by_margin = np.where(np.isfinite(relative), relative, np.inf).argmin(axis=1)
     return np.where(has_margins, by_margin, by_mass)
+
+
+def likely_cause(
+    names: Sequence[str],
+    cause_probability: np.ndarray,
+    predicted_margins: np.ndarray,
+    margin_unit: float | np.ndarray = 1.0,
+) -> str:
+    """Name of the constraint that is most likely to be violated first; "" without evidence.
+
+    Args:
+        names: The n_c constraints.
+        cause_probability: b_unsafe split by constraint, (n_c,).
+        predicted_margins: Smallest margin predicted for each [m, rad], (n_c,), or NaN.
+        margin_unit: See :func:`likely_causes`.
+    """
+    (column,) = likely_causes(cause_probability[None], predicted_margins[None], margin_unit)
+    return "" if column == NO_CAUSE else names[column]
+
+
+def describe_margin(name: str, margin: float, angular_constraints: Collection[str]) -> str:
+    """Text of a constraint and its margin, such as ``collision, -1.2 cm``.
+
+    Args:
+        name: The constraint.
+        margin: Its margin [m, rad]; the text is the name alone if it is not finite.
+        angular_constraints: Names of the constraints whose margins are angles.
+    """
+    if not math.isfinite(margin):
+        return name
+    if name in angular_constraints:
+        return f"{name}, {math.degrees(margin):+.1f}°"
+    return f"{name}, {100 * margin:+.1f} cm"
