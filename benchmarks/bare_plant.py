@@ -1,4 +1,4 @@
-"""A loop's plant alone, driven from C++ by the commands that an episode was seen to give it."""
+"""A loop's plant alone, driven by the logged commands of an episode."""
 
 import time
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class BarePlant:
         self._diagram: Diagram = builder.Build()
 
     def follow(self, motion: Motion) -> np.ndarray:
-        """Simulates the motion; its last state."""
+        """Simulates the motion and returns its last state."""
         self._source.UpdateTrajectory(motion.commands)
         simulator = Simulator(self._diagram)
         context = simulator.get_mutable_context()
@@ -64,7 +64,7 @@ class BarePlant:
 
 
 def log_motion(loop: ClosedLoop, index: int, port: InputPort) -> Motion:
-    """Runs an episode again and logs what comes in at a port of its plant, whenever it changes."""
+    """Simulates an episode again and logs each change of an input port of its plant."""
     duration_s = float(run_episode(loop, index, seed=SEED).time_s[-1])
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()

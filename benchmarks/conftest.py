@@ -1,4 +1,4 @@
-"""Figures of the benchmarks: each with its limit and its peers, all in one table at the end."""
+"""Results of the benchmarks, with limits and peers, in one table at the end."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -15,7 +15,7 @@ SCENARIO = "laikago_balancing"
 
 @dataclass(kw_only=True)
 class Figure:
-    """A measured value beside its limit and the same work done by peers."""
+    """A measured value with its limit and the values of peers."""
 
     name: str
     value: float
@@ -112,7 +112,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="session")
 def episodes_folder(pytestconfig: pytest.Config, scenario: Scenario) -> Iterator[Path]:
-    """A folder that holds at least the wanted number of nominal episodes of the scenario."""
+    """A folder with at least the given number of nominal episodes of the scenario."""
     wanted = pytestconfig.getoption("num_episodes")
     chosen = pytestconfig.getoption("episodes")
     folder = chosen or pytestconfig.rootpath / "runs" / "laikago" / "episodes"

@@ -1,4 +1,4 @@
-"""What an update from feedback costs, and taking its result over in a running diagram."""
+"""Cost of an update from feedback, and of adopting it in a running diagram."""
 
 import dataclasses
 import statistics

@@ -1,4 +1,4 @@
-"""What one tick of the whole-body controller costs, beside an interior-point solver's."""
+"""Cost of an update of the whole-body controller, compared with an interior-point solver."""
 
 import time
 from collections.abc import Callable
@@ -29,8 +29,8 @@ from drake_safety.systems.whole_body_controller import WholeBodyController
 
 ROBOT, HAND = "atlas", "left"
 TIME_STEP_S, PERIOD_S, DURATION_S = 0.002, 0.004, 3.0
-OFFSET_M = [0.15, -0.25, 0.15]  # Of the target from where the hand stands.
-ROUNDS = 10  # The quickest counts: what else runs on the machine only ever adds.
+OFFSET_M = [0.15, -0.25, 0.15]  # Of the target from the hand's initial position.
+ROUNDS = 10  # The quickest counts: other processes can only add time.
 PEER_STRIDE, PEER_ROUNDS = 10, 3  # The peer solves every tenth program.
 TOLERANCE_NM = 1e-3
 
@@ -94,11 +94,12 @@ class Reach:
         return (time.process_time() - started) / DURATION_S
 
     def inputs(self) -> dict[str, np.ndarray]:
-        """What each input was at every tick, (ticks, size), of a reach that succeeded."""
+        """Inputs of every update, (updates, size), of a successful reach."""
         root = self.simulator.get_context()
         q = self._plant.GetPositions(self._plant.GetMyContextFromRoot(root))
         assert np.linalg.norm(self.model.reaching_position(q) - self.target) < 0.02
-        assert self._controller.num_failures(self._controller.GetMyContextFromRoot(root)) == 0
+        context = self._controller.GetMyContextFromRoot(root)
+        assert self._controller.GetOutputPort("num_failures").Eval(context)[0] == 0
         return {name: log.FindLog(root).data().T.copy() for name, log in self._logs.items()}
 
     def program(self, inputs: dict[str, np.ndarray], tick: int) -> WholeBodyQP:
@@ -124,7 +125,7 @@ def tick_costs_us(controller: WholeBodyController, inputs: dict[str, np.ndarray]
         actuation = torques.Eval(context)
         costs.append(1e6 * (time.process_time() - started))
         assert actuation.any()
-    assert controller.num_failures(context) == 0
+    assert controller.GetOutputPort("num_failures").Eval(context)[0] == 0
     return np.array(costs)
 
 

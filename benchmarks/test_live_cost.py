@@ -1,4 +1,4 @@
-"""How fast the live pages run: simulating, Γ and drawing, against the clock."""
+"""Real-time factor of the live sessions: simulation, Γ and drawing."""
 
 import time
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 DURATION_S, ROUNDS = 3.0, 3
-BALL = Throw(mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.3)  # One that it has to step for.
+BALL = Throw(mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.3)  # Requires recovery steps.
 TARGET = np.array([0.7, 0.3, 1.0])
 
 
@@ -58,7 +58,7 @@ def test_live_page_keeps_up_with_the_clock(
         meshcat = Meshcat()
         loop, session = begin(meshcat, scenario_name)
         start_s = session.context.get_time()
-        # The same motion, with neither Γ's board nor controls.
+        # The same motion without panel and controls.
         bare = Simulator(loop, session.context.Clone())
         start = time.perf_counter()
         bare.AdvanceTo(start_s + DURATION_S)

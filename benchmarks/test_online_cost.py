@@ -1,4 +1,4 @@
-"""What one evaluation of Γ costs inside a running diagram."""
+"""Cost of an evaluation of Γ in a running diagram."""
 
 import copy
 import statistics
@@ -44,7 +44,7 @@ MAX_US = TICK_US / 50.0
 
 
 class EmptySystem(LeafSystem):
-    """The ports, the state and the events of a system, and nothing behind them."""
+    """The ports, state and events of a system, without computation."""
 
     def __init__(self, other: LeafSystem):
         super().__init__()
@@ -69,7 +69,7 @@ class EmptySystem(LeafSystem):
 
 
 class Running:
-    """A system with constant inputs in a diagram of its own, simulated on and on."""
+    """A system with constant inputs in its own diagram, simulated continuously."""
 
     def __init__(self, system: LeafSystem, inputs: dict[str, np.ndarray]):
         builder = DiagramBuilder()

@@ -1,4 +1,4 @@
-"""What reaching costs beside its bare plant, and whether finer steps would tell otherwise."""
+"""Cost of reaching compared with its bare plant, and convergence with finer steps."""
 
 import copy
 import time

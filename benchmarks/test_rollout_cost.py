@@ -1,4 +1,4 @@
-"""What a rollout costs beside its bare plant, and what a second worker gains."""
+"""Cost of a rollout compared with its bare plant, and speed-up by a second worker."""
 
 import statistics
 import time

@@ -1,4 +1,4 @@
-"""What it costs to learn Γ from the nominal episodes, and its first stages beside other packages.
+"""Cost of training Γ, and of its first stages compared with other packages.
 
 Every measurement has a fresh process, so that its peak memory is its own.
 """
@@ -28,10 +28,10 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def peak_memory_gb() -> float:
-    """The most memory this process has held at once."""
+    """Peak memory of this process."""
     status = Path("/proc/self/status")
     if status.is_file():
-        # getrusage would count what the parent held when it started this process.
+        # getrusage would count the parent's memory at the time of the fork.
         fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
         return int(fields["VmHWM"].split()[0]) / 1024**2
     unit = 1 if sys.platform == "darwin" else 1024
@@ -45,7 +45,7 @@ def load(folder: Path, num_episodes: int) -> Any:
 
 
 def paper_segments(folder: Path, num_episodes: int, num_segments: int | None) -> Any:
-    """The segments of whole episodes, as many as are wanted; all by default."""
+    """The segments of whole episodes, at most a given number; all by default."""
     from drake_safety.learning.assessment import AssessmentParameters
     from drake_safety.learning.segments import split
 

@@ -1,4 +1,4 @@
-"""Balancing: a legged robot keeps its base over its feet along a plan, and steps when it must."""
+"""Balancing: a legged robot moves its base over its feet along a plan, with recovery steps."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,6 +16,7 @@ from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
+from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.sampling import calm_start
@@ -24,8 +25,8 @@ from drake_safety.systems.inverse_kinematics_controller import InverseKinematics
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from drake_safety.systems.trajectory_planner import interpolate
 
-_NUM_OUTLOOK = 5  # Samples of the plan from now to its end that the features see.
-_LATEST_HIT_S = 1.5  # Of a calm motion, in episodes that begin with a hit.
+_NUM_OUTLOOK = 5  # Samples of the plan from now to its end, for the features.
+_LATEST_HIT_S = 1.5  # Latest time of an initial impact in the undisturbed motion.
 
 
 class Balancing(LeggedLoop):
@@ -34,20 +35,20 @@ class Balancing(LeggedLoop):
     Args:
         scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Γ; adds the assessor.
+        assessment: Adds an assessor.
         meshcat: Adds a visualiser.
-        recovery: Whether there are recovery steps; by default there are when there is Γ to
-            trigger them. Without Γ the diagram has an input port ``safety_probability``.
-        ball: Whether the plant has a ball; by default it has when pushes are sampled.
+        recovery: Whether to add recovery steps; by default if there is an assessment to trigger
+            them. Without one the diagram has an input port ``safety_probability``.
+        ball: Whether the plant has a ball; by default if pushes are sampled.
 
     Raises:
         ValueError: A robot without feet or gains, an assessment of another diagram, or a ball
-            with an engine that has none.
+            with an engine that does not support it.
     """
 
     Parameters = BalancingParameters
     online_parameters = ("recovery", "demonstration")
-    plan_variety = "its parameter 'start' says at what heights and after what durations plans end"
+    plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
     def __init__(
         self,
@@ -62,7 +63,7 @@ class Balancing(LeggedLoop):
         super().__init__(scenario, variation, assessment)
         recovery = assessment is not None if recovery is None else recovery
         parameters = scenario.parameters
-        # Γ, trigger, step planner and controller tick one after the other within a plant step.
+        # Assessor, trigger, step planner and controller update in this order in one plant step.
         tick_offset_s = 0.25 * scenario.time_step_s
         builder = DiagramBuilder()
 
@@ -74,10 +75,8 @@ class Balancing(LeggedLoop):
         planner = self._add_planner(
             builder, outlook_s=scenario.episode_duration_s, num_outlook=_NUM_OUTLOOK
         )
-        desired_output = planner.GetOutputPort("desired_output")
-        desired_preview = planner.GetOutputPort("desired_preview")
-        # The features see the whole plan: where it ends decides, and H steps do not reach it.
-        desired_outlook = planner.GetOutputPort("desired_outlook")
+        names = ("desired_output", "desired_preview", "desired_outlook")
+        desired = {name: planner.GetOutputPort(name) for name in names}
 
         self._recovery_switch = None
         if recovery:
@@ -95,15 +94,12 @@ class Balancing(LeggedLoop):
             )
             self._recovery_switch = switch
             builder.Connect(measured, switch.GetInputPort("plant_state"))
-            builder.Connect(desired_output, switch.GetInputPort("nominal_desired_output"))
-            builder.Connect(desired_preview, switch.GetInputPort("nominal_desired_preview"))
-            builder.Connect(desired_outlook, switch.GetInputPort("nominal_desired_outlook"))
+            for name, port in desired.items():
+                builder.Connect(port, switch.GetInputPort(f"nominal_{name}"))
             builder.Connect(
                 switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
             )
-            desired_output = switch.GetOutputPort("desired_output")
-            desired_preview = switch.GetOutputPort("desired_preview")
-            desired_outlook = switch.GetOutputPort("desired_outlook")
+            desired = {name: switch.GetOutputPort(name) for name in names}
             builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
 
         robot = self.robot
@@ -122,7 +118,7 @@ class Balancing(LeggedLoop):
         )
         self._controller = controller
         builder.Connect(measured, controller.GetInputPort("plant_state"))
-        builder.Connect(desired_output, controller.GetInputPort("desired_output"))
+        builder.Connect(desired["desired_output"], controller.GetInputPort("desired_output"))
         if recovery:
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
@@ -131,12 +127,12 @@ class Balancing(LeggedLoop):
         )
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
-        self._watch(builder, safe_set, outlook=desired_outlook)
+        self._watch(builder, safe_set, outlook=desired["desired_outlook"])
         assessor = self._export_robot(
             builder,
             assessment_period_s=parameters.recovery.assessment_period_s,
-            desired_output=desired_output,
-            desired_preview=desired_preview,
+            desired_output=desired["desired_output"],
+            desired_preview=desired["desired_preview"],
             meshcat=meshcat,
         )
         if assessor is not None and recovery:
@@ -150,38 +146,38 @@ class Balancing(LeggedLoop):
 
     @classmethod
     def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
-        """Scales defaults to the robot where the scenario asks for it."""
+        """Scales defaults to the robot's size if the scenario has ``scale_to_robot``."""
         if stated.get("scale_to_robot") is not True:
             return stated
         return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
     @classmethod
-    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, bool]:
-        """Without a ball on either side where the variation's engine has none."""
+    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+        """Removes the ball from both diagrams if the variation's engine does not support it."""
         if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
             return {}
         return {"ball": False}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
-        """Samples an initial state and a plan; some episodes begin as a ball hits."""
+        """Samples an initial state and a plan; some episodes begin with the impact of a ball."""
         parameters = self.scenario.parameters
         is_push = self.ball is not None and rng.random() < parameters.push.share
         if not is_push:
             self._begin(context, rng, parameters.start.sample(self.kinematics, rng))
             return 0
-        # The ball hits at any moment of a calm motion, not only as it starts.
+        # The impact is at any time of an undisturbed motion, not only at its start.
         self._start_calm(context, rng, elapsed_s=rng.uniform(0.0, _LATEST_HIT_S))
-        # The first row after the hit sees it between 0 and one assessment step ago.
+        # The impact is up to one assessment step before the first row after it.
         lead_s = rng.uniform(0.0, 1.0) * self.scenario.step_s
         self.throw_ball(context, parameters.push.sample(rng, lead_s), lead_s)
         return 1
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
-        """Starts a calm motion near the stance, as it is when a ball is thrown."""
+        """Samples an undisturbed motion near the stance, for throws."""
         self._start_calm(context, rng, elapsed_s=0.0)
 
     def _start_calm(self, context: Context, rng: np.random.Generator, elapsed_s: float) -> None:
-        """Enters a calm motion ``elapsed_s`` after its start, as if it had been tracked well."""
+        """Starts ``elapsed_s`` [s] into an undisturbed motion, without tracking error."""
         parameters = self.scenario.parameters
         start = calm_start(
             self.kinematics,
@@ -193,7 +189,7 @@ class Balancing(LeggedLoop):
         self._begin(context, rng, start)
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with."""
+        """State, plan and foot positions of a Context, as a start."""
         controller_context = self._controller.GetMyContextFromRoot(context)
         feet = self._controller.foot_positions(controller_context).copy()
         return replace(super().start_of(context), foot_positions=feet)
@@ -220,9 +216,9 @@ class Balancing(LeggedLoop):
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
     ) -> list[PiecewisePolynomial]:
-        """Plans that end over the same point, at other heights and after other durations.
+        """Plans to the same horizontal point with other final heights and durations.
 
-        Both as training draws them. A motion that is under way goes on as it was planned.
+        Both are drawn as in training. A plan that has begun is not changed.
         """
         planned = self._plan_of(context)
         if planned.start_time() < context.get_time():
@@ -241,16 +237,16 @@ class Balancing(LeggedLoop):
 
     @property
     def trigger_port(self) -> str:
-        """Name of the output port that recovery is triggered by."""
+        """Name of the output port that triggers recovery."""
         is_normalized = self.scenario.parameters.recovery.is_normalized
         return "normalized_safety_probability" if is_normalized else "safety_probability"
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """A random ball; touching at ``time_s`` [s]."""
+        """Samples a ball with its impact at ``time_s`` [s]."""
         return self.scenario.parameters.push.sample(rng, time_s)
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets the ball in flight, and says when it touches [s]."""
+        """Sets the ball in flight and returns the time of impact [s]."""
         if self.ball is None:
             raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
         with self._physics.edited(context) as plant_context:

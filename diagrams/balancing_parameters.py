@@ -1,4 +1,4 @@
-"""What a scenario file says of balancing, and defaults that fit the robot's size."""
+"""Parameters of the balancing task, with defaults that scale with the robot's size."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,12 +20,12 @@ from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 @dataclass(kw_only=True)
 class RecoveryParameters:
-    """When the robot steps, and how."""
+    """Parameters of trigger and recovery steps."""
 
     threshold: float = 0.6
     """Γ_thre."""
     is_normalized: bool = True
-    """Whether the threshold is on b_safe / (1 - μ) or, literally, on b_safe."""
+    """Whether the threshold is on b_safe / (1 - μ), or on b_safe as in the paper."""
     assessment_period_s: float = 0.02
     """Time between two evaluations of Γ [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
@@ -36,14 +36,14 @@ class BalancingParameters:
     """The task's part of the scenario file."""
 
     scale_to_robot: bool = False
-    """Whether defaults are scaled to the robot's standing height, foot spacing and mass; what the
-    file states is taken as it is. By default they are those of a robot 0.42 m high, of 25 kg."""
+    """Whether defaults are scaled to the robot's standing height, foot spacing and mass; values in
+    the file are not. Unscaled, they are those of a robot 0.42 m high, of 25 kg."""
     safe_set: BalanceLimits = field(default_factory=BalanceLimits)
     start: StartSampling = field(default_factory=StartSampling)
     push: PushSampling = field(default_factory=PushSampling)
     recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
     demonstration: list[Throw] = field(default_factory=list)
-    """The balls of ``drake-safety run --push ball``."""
+    """Balls of ``drake-safety run --push ball``."""
 
 
 _QUANTITIES: dict[str, Any] = {
@@ -78,11 +78,11 @@ _QUANTITIES: dict[str, Any] = {
         }
     },
 }
-"""What each parameter that depends on the robot's size is."""
+"""Physical quantity of each parameter that scales with the robot's size."""
 
 
 def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict[str, Any]:
-    """What the file states, over defaults that are scaled to the robot.
+    """Merges the file's parameters with defaults scaled to the robot.
 
     Args:
         stated: The task's part of the scenario file.

@@ -1,4 +1,4 @@
-"""Pendulum: an inverted pendulum with a weak motor follows a point; its true safe set is known."""
+"""Pendulum: an inverted pendulum with a limited torque, whose true safe set can be computed."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.trajectory_planner import interpolate
 
-_NUM_OUTLOOK = 41  # Samples of the plan from now to its end that the features see.
+_NUM_OUTLOOK = 41  # Samples of the plan from now to its end, for the features.
 _GRAVITY = 9.81  # [m/s^2].
 
 
@@ -46,7 +46,7 @@ class PendulumParameters:
             limit = f"largest_angle_rad {self.largest_angle_rad}"
             expected = f"start_angle_rad must not exceed {limit}, or episodes begin unsafe"
         elif self.effort_share >= 1:
-            expected = "effort_share must be below 1, or nothing can go wrong"
+            expected = "effort_share must be below 1, or every episode is safe"
         else:
             return
         raise ValueError(f"pendulum: {expected}; got {self}")
@@ -58,15 +58,15 @@ class PendulumParameters:
 
 
 class PendulumSafeSet:
-    """The pendulum leans less than its largest angle to the front and to the back.
+    """Bounds of the pendulum's angle to the front and to the back.
 
-    The capture angle φ + φ̇ √(l/g) is where a small pendulum that is left alone goes to; beyond the
-    angle that the motor can hold there is no way back. Following the plan takes the torque
-    (l/g) φ̈ - sin φ, in units of what holds the pendulum when it is horizontal.
+    The features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
+    pendulum cannot return. Following the plan takes the torque (l/g) φ̈ - sin φ, in units of the
+    torque that holds the pendulum horizontally.
 
     Args:
-        parameters: The task's numbers.
-        preview_step_s: Time between two points that the features are given of a plan [s].
+        parameters: The task's parameters.
+        preview_step_s: Time between two samples of the outlook [s].
     """
 
     names = ("front", "back")
@@ -80,22 +80,22 @@ class PendulumSafeSet:
         self.feature_names += ["tracking_error", "goal_from_capture"]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Angle left to either side (2,) [rad] of an angle (1,) [rad]; its rate is not used."""
+        """Margins to either side (2,) [rad] of an angle (1,) [rad]; its rate is not used."""
         del v
         return _reserves(self._parameters.largest_angle_rad, q)
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins now, and what the motor has in reserve along the plan, (n_f,).
+        """The margins now, and the reserves of angle and torque along the plan, (n_f,).
 
-        Of the angle (1,) [rad], its rate (1,) [rad/s] and the points that are to be followed, from
-        now to the end, (M, 3) [m]; in [rad], those of the effort in its unit.
+        Inputs are the angle (1,) [rad], its rate (1,) [rad/s] and the plan's points from now to
+        its end, (M, 3) [m]. Reserves are in [rad], those of the effort in its unit.
         """
         hold, capture = self._parameters.hold_angle_rad, q + self._time_s * v
         planned = np.arctan2(preview[:, 0], preview[:, 2])
         rate = np.gradient(planned, self._step_s)
         plan_capture = planned + self._time_s * rate
         reserves = [_reserves(hold, x) for x in (capture, planned[-1:], planned, plan_capture)]
-        # What keeps it from falling to the front pulls it to the back.
+        # The torque to the back balances the weight of a pendulum in front of upright.
         pull = np.sin(planned) - self._time_s**2 * np.gradient(rate, self._step_s)
         reserves.append(_reserves(self._parameters.effort_share, pull))
         errors = [planned[:1] - q, planned[-1:] - capture]
@@ -107,12 +107,12 @@ def _reserves(limit: float, values: np.ndarray) -> np.ndarray:
 
 
 def bob_position(angle: float, length_m: float) -> np.ndarray:
-    """The bob over the hinge, (3,) [m]; an angle to the front is positive."""
+    """Position of the bob relative to the hinge, (3,) [m]; an angle to the front is positive."""
     return length_m * np.array([math.sin(angle), 0.0, math.cos(angle)])
 
 
 class PendulumObserver(LeafSystem):
-    """Tells the pendulum's state from upright, and where the bob is.
+    """Computes the pendulum's state relative to upright, and the bob's position.
 
     .. pydrake_system::
 
@@ -124,7 +124,7 @@ class PendulumObserver(LeafSystem):
         - output
 
     ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
-    rad/s], and ``output`` the bob over the hinge, (3,) [m], ``length_m`` from it.
+    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m].
     """
 
     def __init__(self, length_m: float):
@@ -142,7 +142,7 @@ class PendulumObserver(LeafSystem):
 
 
 class PendulumController(LeafSystem):
-    """A PD controller on the angle, with the weight compensated and the torque limited.
+    """A PD controller of the angle with gravity compensation and limited torque.
 
     .. pydrake_system::
 
@@ -154,7 +154,7 @@ class PendulumController(LeafSystem):
         output_ports:
         - torque
 
-    Inputs as in the loop, ``torque`` (1,) [N·m]; it is held for ``period_s`` [s].
+    ``torque`` (1,) [N·m] is held for ``period_s`` [s].
     """
 
     def __init__(self, parameters: PendulumParameters, period_s: float):
@@ -179,14 +179,14 @@ class PendulumController(LeafSystem):
 
 
 class Pendulum(PlannedLoop):
-    """The diagram of the pendulum: Drake's plant behind a controller with a limited torque.
+    """The diagram of the pendulum: Drake's plant and a controller with limited torque.
 
-    The output is the position of the bob over the hinge, and plans are points for it to follow.
+    The output is the bob's position relative to the hinge, which follows a plan of points.
 
     Args:
         scenario: The scenario.
-        variation: Name of the plant variation; masses and damping can vary.
-        assessment: Γ; adds the assessor.
+        variation: Name of the plant variation; mass and damping can vary.
+        assessment: Adds an assessor.
         meshcat: Adds a visualiser.
     """
 
@@ -243,9 +243,9 @@ class Pendulum(PlannedLoop):
 
     @property
     def state_planes(self) -> dict[str, StatePlane]:
-        """Nearly all starts, for a plan that holds still and for two that move."""
+        """Planes of 95 % of the starts' ranges, for a constant plan and two that move."""
         parameters = self.scenario.parameters
-        # The border of the starts may be the safe set's own, where rounding decides.
+        # The bounds of the starts may be those of the safe set, where rounding decides.
         angle, rate = 0.95 * parameters.start_angle_rad, 0.95 * parameters.start_rate_rad_s
         duration_s = float(np.mean(parameters.plan_duration_s))
 

@@ -1,6 +1,7 @@
-"""Reaching: a robot stands and moves a hand to a target, if it can do so safely."""
+"""Reaching: a standing robot moves a hand to a target."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -12,9 +13,9 @@ from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import fit_stance
+from drake_safety.control.mirror import Mirror
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
-from drake_safety.diagrams.reaching_side import ReachingSide
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.plants.obstacles import Clearance
@@ -29,28 +30,27 @@ from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
-_NUM_OUTLOOK = 31  # Samples of the whole plan: a board must not fit between two of them.
+_NUM_OUTLOOK = 31  # Samples of the whole plan: dense enough for thin obstacles.
 
 
 class Reaching(LeggedLoop):
     """The diagram of the reaching task, for any robot.yaml with feet and reaching frames.
 
-    The other hand is the trained one in the mirror: ``state``, ``desired_preview`` and
-    ``features`` are then those of the mirror image, so that one assessment serves both. All else
-    is as it is.
+    For the other hand, ``state``, ``desired_preview`` and ``features`` are those of the mirror
+    image, so that one assessment applies to both hands. All other ports are not mirrored.
 
     Args:
         scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Γ; adds the assessor.
+        assessment: Adds an assessor.
         meshcat: Adds a visualiser.
-        hand: Which hand reaches; the scenario's by default.
-        exploring: Whether episodes without a goal of their own also make detours and are pushed,
-            as the scenario says; else every plan is the straight one, undisturbed.
+        hand: The hand that reaches; the scenario's by default.
+        exploring: Whether episodes with random goals have the scenario's random detours and pushes;
+            otherwise every plan is straight and undisturbed.
 
     Raises:
         ValueError: A robot without feet or reaching frames, an unknown hand, one that is neither
-            the trained hand nor its mirror image, a decoration that can be touched, or an
+            the trained hand nor its mirror image, a decoration with collision geometry, or an
             assessment of another diagram.
     """
 
@@ -64,7 +64,7 @@ class Reaching(LeggedLoop):
         "assessment_period_s",
         "view",
     )
-    plan_variety = "its parameter 'detours' says how far plans may lead around, in training too"
+    plan_variety = "its parameter 'detours' bounds the detours of plans, in training too"
 
     def __init__(
         self,
@@ -84,8 +84,8 @@ class Reaching(LeggedLoop):
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
         self._is_exploring = exploring
         trained_hand = parameters.hand or next(iter(robot.reaching_frames))
-        self._side = ReachingSide(kinematics, trained_hand, hand, scenario_name=scenario.name)
-        self.hand, self.mirror = self._side.hand, self._side.mirror
+        self.hand = trained_hand if hand is None else hand
+        self.mirror = self._mirror_to(trained_hand)
         self.named_targets, self.pushes = parameters.named_targets, parameters.pushes
         self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
         builder = DiagramBuilder()
@@ -117,7 +117,7 @@ class Reaching(LeggedLoop):
                 hand=self.hand,
                 actuation_matrix=physics.actuation_matrix(kinematics.joint_names),
                 period_s=scenario.control_period_s,
-                # After the noise of its instant was drawn, within the plant's step.
+                # After the update of the noise, within the plant's step.
                 offset_s=0.5 * scenario.time_step_s,
             ),
         )
@@ -143,37 +143,61 @@ class Reaching(LeggedLoop):
             meshcat=meshcat,
         )
         builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
+        builder.ExportOutput(controller.GetOutputPort("num_failures"), "num_controller_failures")
         self.finish(builder)
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
-        """The robot's YAML and model file, and the obstacles' files."""
+        """The robot's YAML and model file, and the obstacles' model files."""
         files = [model_file(obstacle.model) for obstacle in scenario.parameters.obstacles]
         return [*super().model_files(scenario), *files]
 
     @property
     def target_box(self) -> np.ndarray:
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
-        return np.sort(self._side.points(self.scenario.parameters.target.box), axis=0)
+        return np.sort(self._reflected(self.scenario.parameters.target.box), axis=0)
 
     @property
     def fair_box(self) -> np.ndarray:
         """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
         parameters = self.scenario.parameters
-        return np.sort(self._side.points(parameters.fair.box(parameters.target)), axis=0)
+        return np.sort(self._reflected(parameters.fair.box(parameters.target)), axis=0)
 
     @property
     def mirror_options(self) -> dict[str, str]:
-        """The hand on the other side, if the robot has one there."""
-        other = self._side.other_hand
-        return {} if other is None else {"hand": other}
+        """The option of the other hand; empty if the robot is not symmetric or has none."""
+        try:
+            return {"hand": Mirror(self.kinematics).hand(self.hand)}
+        except ValueError:
+            return {}
+
+    def _mirror_to(self, trained_hand: str) -> Mirror | None:
+        """The reflection to the trained hand's side; None for the trained hand."""
+        for name in (trained_hand, self.hand):
+            self.robot.reaching_frame(name)
+        if self.hand == trained_hand:
+            return None
+        mirror = Mirror(self.kinematics)
+        if (image := mirror.hand(trained_hand)) != self.hand:
+            raise ValueError(
+                f"reaching: hands of scenario '{self.scenario.name}' are '{trained_hand}' of robot "
+                f"'{self.robot.name}' and its mirror image '{image}'; got '{self.hand}'"
+            )
+        return mirror
+
+    def _reflected(self, points: np.ndarray) -> np.ndarray:
+        """Reflects points (..., 3) from the trained hand's side, or to it."""
+        return points if self.mirror is None else self.mirror.points(points)
+
+    def _reflected_push(self, push: Push) -> Push:
+        return replace(push, force_n=self._reflected(np.array(push.force_n)).tolist())
 
     def goal_of(self, episode: Episode) -> np.ndarray:
-        """The target of an episode in the world, (3,) [m], as exact as feet are placed."""
+        """The target of an episode in the world, (3,) [m], up to errors of the feet's placement."""
         return self._shape_of_plan(episode)[1]
 
     def is_fair(self, episode: Episode) -> bool:
-        """Whether the target is in the fair box, and the plan leads through no obstacle."""
+        """Whether the target is in the fair box, and the plan crosses no obstacle."""
         path = points_of_plan(self._shape_of_plan(episode), _NUM_OUTLOOK)
         radius_m = self.robot.reaching_frame(self.hand).radius_m
         is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
@@ -181,17 +205,13 @@ class Reaching(LeggedLoop):
 
     def _shape_of_plan(self, episode: Episode) -> np.ndarray:
         """Start, goal and detour of the hand's motion in the world, (3, 3) [m]."""
-        # The preview carries no noise, but it may end before the motion does.
+        # The preview has no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        shape = self._side.points(plan_shape(preview, self.scenario.step_s, duration_s))
+        shape = self._reflected(plan_shape(preview, self.scenario.step_s, duration_s))
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape
-
-    def num_controller_failures(self, context: Context) -> int:
-        """Ticks whose quadratic program had no solution."""
-        return self._controller.num_failures(self._controller.GetMyContextFromRoot(context))
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
@@ -199,11 +219,11 @@ class Reaching(LeggedLoop):
         """Samples a standing posture and a target, and plans the hand's motion between them.
 
         Returns:
-            0, or the first step after the push that an episode begins with.
+            The first step after the initial push; 0 without one.
 
         Raises:
             ValueError: The goal is not three finite numbers.
-            RuntimeError: No posture that is drawn is in the safe set.
+            RuntimeError: No sampled posture is in the safe set.
         """
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
@@ -211,22 +231,22 @@ class Reaching(LeggedLoop):
         detour = push = None
         noise_rng = rng.spawn(1)[0]
         if goal is None:
-            goal = self._side.points(drawn)
+            goal = self._reflected(drawn)
             if self._is_exploring:
                 push = parameters.random_pushes.sample(rng, self.robot.base)
                 detour = parameters.detours.sample(rng)
         if detour is not None:
-            detour = self._side.points(detour)
+            detour = self._reflected(detour)
         self._set(context, q, goal, detour)
         self._observers.reseed(context, noise_rng)
         if push is None:
             return 0
-        self.set_push(context, self._side.push(push))
+        self.set_push(context, self._reflected_push(push))
         end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Plans a push on a body of the robot, in the run that was reset.
+        """Sets a push on a body of the robot; call it after a reset.
 
         Raises:
             ValueError: The robot has no such body.
@@ -240,14 +260,14 @@ class Reaching(LeggedLoop):
         )
 
     def sample_push(self, rng: np.random.Generator) -> Push:
-        """A push as episodes begin with it, whatever their share."""
+        """Samples a push from the distribution of the episodes' initial pushes."""
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
-        return self._side.push(push)
+        return self._reflected_push(push)
 
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
     ) -> list[PiecewisePolynomial]:
-        """The plan that there is, and ones that make detours as training has drawn them."""
+        """Returns the present plan, and plans with detours from the distribution of training."""
         planned, detours = self._plan_of(context), self.scenario.parameters.detours
         if not detours.share or planned.start_time() < context.get_time():
             return [planned]
@@ -255,14 +275,14 @@ class Reaching(LeggedLoop):
         ends = [planned.value(time).ravel() for time in (start, end)]
         plans = [planned]
         for _ in range(num_plans - 1):
-            detour = self._side.points(detours.draw(rng))
+            detour = self._reflected(detours.draw(rng))
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts in the standing posture towards a target; its first instant is without noise.
+        """Starts in the standing posture with a plan to a target; without initial noise.
 
         Raises:
             ValueError: The goal is not three finite numbers.

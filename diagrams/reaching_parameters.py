@@ -1,4 +1,4 @@
-"""What a scenario file says of reaching: its part of the YAML, validated."""
+"""Parameters of the reaching task."""
 
 from dataclasses import dataclass, field
 
@@ -21,32 +21,32 @@ class ReachingParameters:
     """The task's part of the scenario file."""
 
     hand: str = ""
-    """The hand that episodes are recorded of, a reaching frame of the robot; its first one by
+    """The hand of the training episodes, a reaching frame of the robot; the first one by
     default."""
     plan_duration_s: float = 3.0
     """Duration of the planned motion [s]."""
     monitor_period_s: float = 0.02
-    """Time between two looks at the margins [s]."""
+    """Sampling period of the safe set [s]."""
     clearance_range_m: float = 0.1
-    """Distances to obstacles beyond this count as this [m]."""
+    """Distances to obstacles are clipped to this [m]."""
     safe_set: ReachingLimits = field(default_factory=ReachingLimits)
     start: PostureSampling = field(default_factory=PostureSampling)
     target: TargetSampling = field(default_factory=TargetSampling)
     random_pushes: RandomPushes = field(default_factory=RandomPushes)
-    """Pushes that episodes begin with, so that Γ knows what follows one."""
+    """Initial pushes of training episodes."""
     detours: Detours = field(default_factory=Detours)
     fair: FairTargets = field(default_factory=FairTargets)
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
-    """Models without collision geometry, to be seen."""
+    """Models without collision geometry, for visualisation."""
     named_targets: dict[str, list[float]] = field(default_factory=dict)
-    """Targets in the world that can be asked for by name, (3,) [m] each."""
+    """Named targets in the world, (3,) [m] each."""
     pushes: dict[str, Push] = field(default_factory=dict)
-    """Pushes that a run can be disturbed with, by name."""
+    """Named pushes for single runs."""
     assessment_period_s: float = 0.02
     """Time between two evaluations of Γ [s]."""
     view: View = field(default_factory=View)
-    """Where pictures are taken from when the trained hand reaches."""
+    """The camera's pose when the trained hand reaches."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -59,8 +59,8 @@ class ReachingParameters:
                 raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
         if not self.start.clearance_m <= self.clearance_range_m:
             raise ValueError(
-                f"reaching: start.clearance_m must not exceed clearance_range_m, beyond which "
-                f"distances count as {self.clearance_range_m}; got {self.start.clearance_m}"
+                f"reaching: start.clearance_m must not exceed clearance_range_m, "
+                f"{self.clearance_range_m}; got {self.start.clearance_m}"
             )
         for name, target in self.named_targets.items():
             if len(target) != 3 or not np.isfinite(target).all():

@@ -52,6 +52,10 @@ class Shuttle(LeafSystem):
             "margins": (2, lambda p, v, left_s: self.margins(p)),
             "safe": (1, lambda p, v, left_s: [float(min(self.margins(p)) >= 0)]),
             "plant_state": (6, lambda p, v, left_s: np.append(p, v)),
+            "num_controller_failures": (
+                1,
+                lambda p, v, left_s: [float(v[2] * self.duration_s > FAILING_Z_M)],
+            ),
         }
         for name, (size, calc) in ports.items():
             self.DeclareVectorOutputPort(
@@ -174,10 +178,6 @@ class Shuttling(ClosedLoop):
 
     def is_fair(self, episode):
         return is_in_box(self.goal_of(episode), self.fair_box)
-
-    def num_controller_failures(self, context):
-        _, velocity, _ = self.shuttle.read(self.shuttle.GetMyContextFromRoot(context))
-        return int(velocity[2] * self.scenario.episode_duration_s > FAILING_Z_M)
 
 
 SCENARIO = """

@@ -71,12 +71,14 @@ def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
 def test_what_a_task_lacks_is_told_with_what_was_asked_and_what_it_has(capability, lacked):
     with pytest.raises(ValueError, match=f"^run: task 'Shuttling' has no {lacked}; it has plans "):
         require(Shuttling(shuttling()), capability, "run")
-    with pytest.raises(ValueError, match=f"^task 'Gliding' has no {lacked}; it has nothing"):
+    with pytest.raises(
+        ValueError, match=f"^task 'Gliding' has no {lacked}; it has no optional features"
+    ):
         require(Gliding(gliding()), capability)
 
 
-def test_every_capability_that_a_user_asks_for_has_its_words():
-    assert set(ASKED) == set(capabilities._WORDS)
+def test_every_required_capability_has_a_description():
+    assert set(ASKED) == set(capabilities._DESCRIPTIONS)
 
 
 def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():

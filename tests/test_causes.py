@@ -1,6 +1,6 @@
 import numpy as np
 
-from drake_safety.learning.prediction import NO_CAUSE, likely_causes
+from drake_safety.learning.causes import NO_CAUSE, likely_causes
 
 UNKNOWN = [np.nan, np.nan]
 

@@ -47,9 +47,9 @@ def test_the_pendulum_of_the_package_keeps_it():
 
 
 def test_a_port_of_another_size_than_its_names_is_refused_when_the_task_is_built():
-    with pytest.raises(ValueError, match="'state' has 2 and not 1"):
+    with pytest.raises(ValueError, match="'state' has size 2, expected 1"):
         Constant(WHOLE | {"state": 2})
-    with pytest.raises(ValueError, match="'desired_preview' has 9 and not 10"):
+    with pytest.raises(ValueError, match="'desired_preview' has size 9, expected 10"):
         Constant({"desired_preview": 9})
 
 

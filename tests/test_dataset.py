@@ -262,7 +262,9 @@ def test_different_episodes_of_one_index_are_refused_with_both_shards_named(tmp_
         writer.append(make_episode(0, num_rows=4))
     other = (tmp_path / "b" / "episodes-00000.parquet").read_bytes()
     (tmp_path / "a" / "episodes-00001.parquet").write_bytes(other)
-    with pytest.raises(ValueError, match=r"episodes-00000\.parquet and in episodes-00001\.parquet"):
+    with pytest.raises(
+        ValueError, match=r"episodes-00000\.parquet differs from that of episodes-00001\.parquet"
+    ):
         load_episodes(tmp_path / "a")
 
 

@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli import main
-from drake_safety.live.panel import UNSAFE_RGB, LivePanel, picture_board, words_picture
+from drake_safety.live.panel import UNSAFE_RGB, LivePanel, picture_board, text_picture
 from drake_safety.live.session import (
     PROBABILITY,
     STOP,
@@ -112,7 +112,7 @@ def test_a_click_throws_the_ball_of_the_sliders_once(throws):
     throws.tick()
     state = ball.Eval(throws.context)
     assert state[-3:-1] == pytest.approx([0.0, 4.0], abs=1e-6)
-    assert throws.panel.words[1] == "ball of 2 kg at 4 m/s towards 90°"
+    assert throws.panel.text[1] == "ball of 2 kg at 4 m/s towards 90°"
     was = state[4:7]
     throws.tick()
     assert ball.Eval(throws.context)[5] - was[1] == pytest.approx(4.0 * TICK_S, rel=0.05)
@@ -127,7 +127,7 @@ def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
     plant.SetPositionsAndVelocities(plant_context, throws.loop.robot_instance, state)
     throws.tick()
     assert throws.has_fallen
-    assert throws.panel.words[0] == "fell"
+    assert throws.panel.text[0] == "fell"
     for _ in range(round(1.5 / TICK_S) + 1):
         throws.tick()
     assert not throws.has_fallen
@@ -162,11 +162,11 @@ def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
     move(goals, NEAR)
     assert not goals.tick()
     assert goals.verdict.is_accepted
-    assert goals.panel.words[0] == f"accepted: Γ {goals.verdict.safety_probability:.2f}"
+    assert goals.panel.text[0] == f"accepted: Γ {goals.verdict.safety_probability:.2f}"
     move(goals, FAR)
     assert not goals.tick()
     assert not goals.verdict.is_accepted
-    assert goals.panel.words[0].startswith("refused")
+    assert goals.panel.text[0].startswith("refused")
     assert goals.context.get_time() == 0.0
 
 
@@ -177,7 +177,7 @@ def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told
     assert goals.context.get_time() == 0.0
     assert goals.nearest is not None
     distance_cm = 100 * np.linalg.norm(goals.nearest.goal - goals.verdict.goal)
-    assert f"accepted {distance_cm:.0f} cm away" in goals.panel.words[1]
+    assert f"accepted {distance_cm:.0f} cm away" in goals.panel.text[1]
 
 
 @pytest.mark.parametrize(("target", "button"), [(NEAR, "GO"), (FAR, "FORCE")])
@@ -261,7 +261,7 @@ def test_long_words_are_made_to_fit_their_board():
     from matplotlib.image import imread
 
     size = {"width": 1.0, "height": 0.17, "rgb": (1, 1, 1), "ground": UNSAFE_RGB}
-    picture = imread(BytesIO(words_picture("fell", "a very long remark " * 8, **size)))
+    picture = imread(BytesIO(text_picture("fell", "a very long remark " * 8, **size)))
     edges = picture[:, [0, 1, -2, -1], :3]
     assert edges == pytest.approx(np.broadcast_to(UNSAFE_RGB, edges.shape), abs=0.01)
     assert np.ptp(picture[..., 0]) > 0.1
@@ -287,7 +287,7 @@ def test_a_browser_shows_the_board_and_its_button_throws_the_ball(throws, tmp_pa
         while throws.meshcat.GetButtonClicks(throws.THROW) == 0 and time.monotonic() < end:
             page.wait_for_timeout(100)
         throws.tick()
-        assert throws.panel.words[1].startswith("ball of 3 kg at 8 m/s")
+        assert throws.panel.text[1].startswith("ball of 3 kg at 8 m/s")
         throws.meshcat.Flush()
         share, end = 0.0, time.monotonic() + 30
         while not 0.004 < share < 0.2 and time.monotonic() < end:

@@ -75,7 +75,7 @@ def test_a_humanoid_under_torques_stands_for_a_second_within_a_centimetre():
     after = advanced(loop, context, 1.0)
     np.testing.assert_allclose(after[4:7], before[4:7], atol=0.01)
     assert read(loop, context, "safe")[0] == 1
-    assert loop.num_controller_failures(context) == 0
+    assert loop.GetOutputPort("num_controller_failures").Eval(context)[0] == 0
 
 
 def test_what_reset_sets_is_what_the_state_port_says():

@@ -121,7 +121,7 @@ def test_a_variation_that_asks_for_what_a_pendulum_has_not_is_refused():
         "variations: {nominal: {foot_friction: 0.3}}\n"
     )
     scenario = parse_scenario(text, name="slippery", folder=None)
-    with pytest.raises(ValueError, match="'nominal' sets foot_friction, which this plant has not"):
+    with pytest.raises(ValueError, match="'nominal' sets foot_friction; entries of this plant are"):
         scenario.make_loop()
 
 

@@ -252,7 +252,7 @@ def test_the_mirror_image_moves_as_the_mirrored_robot():
     ("options", "message"),
     [
         ({"hand": "tail"}, r"'porter' has no reaching frame 'tail'; it has \['head', 'left', 'r"),
-        ({"hand": "head"}, "about hand 'left' of robot 'porter' and its mirror image 'right'; got"),
+        ({"hand": "head"}, "are 'left' of robot 'porter' and its mirror image 'right'; got"),
     ],
 )
 def test_a_hand_that_is_neither_the_trained_one_nor_its_image_is_refused(

@@ -205,4 +205,4 @@ def test_ticks_without_a_solution_are_counted():
     controller = loop.GetSubsystemByName("whole_body_controller")
     values = controller.GetMyMutableContextFromRoot(context).get_mutable_discrete_state()
     values.set_value(values.num_groups() - 1, [3])
-    assert loop.num_controller_failures(context) == 3
+    assert loop.GetOutputPort("num_controller_failures").Eval(context)[0] == 3

@@ -155,7 +155,7 @@ def test_a_reset_that_fails_names_its_episode():
     ("options", "message"),
     [
         ({"ports": {}}, r"exports no port \['state'\] for \['state'\]; it exports .*'margins'"),
-        ({"ports": {"where": "output"}}, r"ports has \['where'\]; the contract's are"),
+        ({"ports": {"where": "output"}}, r"ports has \['where'\]; expected some of"),
         (
             {"ports": {"state": "output", "safe": "nowhere"}},
             r"no port \['nowhere'\] for \['safe'\]",
@@ -166,7 +166,7 @@ def test_a_reset_that_fails_names_its_episode():
         ),
         ({"ports": {"state": "output", "output": "margins"}}, "size 5; expected H times .* 2"),
         ({"constraint_names": ["wall"]}, "constraint_names has 1 names, the port has 2"),
-        ({"duration_s": 0.01}, "an episode lasts a step at least"),
+        ({"duration_s": 0.01}, "an episode has at least one step"),
         ({"monitor_period_s": 0.0}, "monitor_period_s must be positive"),
     ],
 )

@@ -384,8 +384,8 @@ def test_an_episode_with_a_goal_is_the_same_alone_as_in_a_set():
 @pytest.mark.parametrize(
     ("goals", "message"),
     [
-        (np.zeros((2, 1)), r"one row an episode, of 3 episodes; got shape \(2, 1\)"),
-        (np.zeros(3), r"one row an episode, of 3 episodes; got shape \(3,\)"),
+        (np.zeros((2, 1)), r"one row per episode, 3 in all; got shape \(2, 1\)"),
+        (np.zeros(3), r"one row per episode, 3 in all; got shape \(3,\)"),
         ([[0.0], [np.nan], [0.1]], r"goals must be finite; goal 1 is \[nan\]"),
     ],
 )
@@ -395,9 +395,9 @@ def test_goals_that_are_not_one_finite_row_an_episode_are_refused(goals, message
 
 
 def test_a_task_whose_plans_have_no_goal_says_so():
-    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has nothing"):
+    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has no opt"):
         run_episode(gliding().make_loop(), goal=np.zeros(1))
-    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has nothing"):
+    with pytest.raises(ValueError, match="task 'Gliding' has no plans with a goal; it has no opt"):
         run_episodes(gliding(), 1, goals=np.zeros((1, 1)), num_workers=1)
 
 
@@ -415,7 +415,7 @@ def test_an_episode_from_the_standing_posture_starts_there_whatever_its_number()
         np.testing.assert_allclose(shuttling().make_loop().goal_of(episode), goal)
     sampled = run_episodes(shuttling(), 2, goals=goals, num_workers=1)
     assert all(episode.state[0, :3].any() for episode in sampled)
-    with pytest.raises(ValueError, match="from the standing posture takes a goal"):
+    with pytest.raises(ValueError, match="from the standing posture requires a goal"):
         run_episode(shuttling().make_loop(), is_standing=True)
 
 

@@ -185,14 +185,14 @@ def test_an_input_that_is_not_finite_keeps_the_last_good_command(how):
     bench.advance(3)
     assert bench.status() == NOT_FINITE
     np.testing.assert_array_equal(bench.actuation(), good)
-    num_failures = bench.controller.num_failures(bench.context)
+    num_failures = bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0]
     assert num_failures >= 3
     bench.set_state(bench.q)
     bench.fix("desired_output", reaching)
     bench.fix("desired_output_rate", np.zeros(3))
     bench.advance()
     assert bench.status() == 0
-    assert bench.controller.num_failures(bench.context) == num_failures
+    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == num_failures
 
 
 def test_a_program_without_solution_keeps_the_last_good_command():
@@ -204,7 +204,7 @@ def test_a_program_without_solution_keeps_the_last_good_command():
     bench.set_state(bench.q, v)
     bench.advance()
     assert bench.status() < 0
-    assert bench.controller.num_failures(bench.context) >= 1
+    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] >= 1
     np.testing.assert_array_equal(bench.actuation(), good)
 
 
@@ -215,11 +215,11 @@ def test_nothing_of_an_earlier_episode_is_left_after_the_initialisation():
     bench.advance(2)
     bench.simulator.Initialize()
     np.testing.assert_array_equal(bench.actuation(), 0.0)  # No command of this episode is good.
-    assert bench.controller.num_failures(bench.context) == 1
+    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == 1
     bench.set_state(bench.q)
     bench.simulator.Initialize()
     assert bench.status() == 0
-    assert bench.controller.num_failures(bench.context) == 0
+    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == 0
 
 
 @pytest.mark.parametrize("name", NAMES)

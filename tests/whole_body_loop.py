@@ -89,7 +89,7 @@ class WholeBodyLoop:
         return self.plant.GetVelocities(self.plant_context)
 
     def num_failures(self):
-        return self.controller.num_failures(self.context)
+        return self.controller.GetOutputPort("num_failures").Eval(self.context)[0]
 
     def follow(self, trajectory, until_s):
         """Simulates with the hand (or the centre of mass) led along a trajectory."""

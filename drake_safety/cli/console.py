@@ -6,7 +6,7 @@ import contextlib
 import math
 import shlex
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -91,39 +91,25 @@ def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
     return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
 
 
-def margin_words(name: str, margin: float, angular_constraints: Collection[str]) -> str:
-    """A constraint and its margin as one reads them: ``collision, -1.2 cm``.
-
-    Args:
-        name: The constraint.
-        margin: Its margin [m, rad].
-        angular_constraints: Names of those whose margins are angles.
-    """
-    if name in angular_constraints:
-        return f"{name}, {math.degrees(margin):+.1f}°"
-    return f"{name}, {100 * margin:+.1f} cm"
-
-
 def cause_words(
     loop: ClosedLoop, assessment: SafetyAssessment, masses: np.ndarray, margins: np.ndarray
 ) -> str:
-    """The constraint that is most likely to be violated, and its margin where one is predicted.
+    """The constraint most likely to be violated, with its predicted margin if there is one.
 
     Args:
-        loop: Whose constraints they are.
-        assessment: What said so.
+        loop: The closed loop with the constraints.
+        assessment: The assessment that predicted them.
         masses: b_unsafe split by constraint, (n_c,).
         margins: Predicted margins, (n_c,) [m, rad].
     """
-    from drake_safety.learning.prediction import NO_CAUSE, likely_causes
+    from drake_safety.learning.causes import describe_margin, likely_cause
     from drake_safety.simulation.capabilities import angular_constraints
 
-    (cause,) = likely_causes(masses[None], margins[None], assessment.parameters.margin_unit)
-    if cause == NO_CAUSE:
+    names = loop.constraint_names
+    cause = likely_cause(names, masses, margins, assessment.parameters.margin_unit)
+    if not cause:
         return "unknown"
-    if not math.isfinite(margins[cause]):
-        return loop.constraint_names[cause]
-    return margin_words(loop.constraint_names[cause], margins[cause], angular_constraints(loop))
+    return describe_margin(cause, margins[names.index(cause)], angular_constraints(loop))
 
 
 def print_path(what: str, path: Path) -> None:

@@ -83,13 +83,13 @@ def evaluate_monitoring(
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.monitoring_figure import monitoring_figure
     from drake_safety.evaluation.monitoring_study import evaluate_alarms
-    from drake_safety.simulation.capabilities import HasWatchedFeatures
+    from drake_safety.simulation.capabilities import CanFall
 
     if all(motion.has_left for motion in calibration):
         # Nobody could be allowed the same share of false alarms: thresholds need calm motions.
         return Findings()
     loop = judged.scenario.make_loop()
-    watched = loop.watched_features if isinstance(loop, HasWatchedFeatures) else {}
+    watched = loop.watched_features if isinstance(loop, CanFall) else {}
     alarms = [
         *assessment_alarms("sharpened", judged.sharpened),
         *assessment_alarms("paper", judged.paper),

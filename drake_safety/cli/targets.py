@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from typer.core import TyperCommand
 
-from drake_safety.cli.console import console, margin_words
+from drake_safety.cli.console import console
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -133,11 +133,12 @@ def print_verdict(
 
 
 def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None) -> dict[str, str]:
+    from drake_safety.learning.causes import describe_margin
     from drake_safety.simulation.capabilities import angular_constraints
 
     lines = {}
     if np.isfinite(verdict.cause_margin):
-        lines["likely cause"] = margin_words(
+        lines["likely cause"] = describe_margin(
             verdict.cause, verdict.cause_margin, angular_constraints(loop)
         )
     elif verdict.cause:

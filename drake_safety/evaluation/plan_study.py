@@ -19,7 +19,7 @@ from drake_safety.learning.calibration import (
     least_miss_rate,
     score_threshold,
 )
-from drake_safety.learning.prediction import likely_causes
+from drake_safety.learning.causes import likely_causes
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -347,7 +347,7 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
     """The cause that Γ would name for each plan, as a column of the constraints, (N,).
 
     Returns:
-        "right_cause", by the rule of :func:`~drake_safety.learning.prediction.likely_causes`, and
+        "right_cause", by the rule of :func:`~drake_safety.learning.causes.likely_causes`, and
         to compare with "by_cause_probability", the constraint with most of the unsafe mass.
     """
     first = plans.first

@@ -14,8 +14,6 @@ LOGIT_LIMIT = 8.0
 """Heads' logits are clipped to this magnitude."""
 SHIFT_LIMIT = 100.0
 """Largest shift of the base logit, which keeps exp from overflowing."""
-NO_CAUSE = -1
-"""Cause where no constraint is likely to be violated."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -178,36 +176,6 @@ def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
 def sigmoid(z: np.ndarray) -> np.ndarray:
     """Returns 1 / (1 + exp(-z)) for logits of moderate magnitude."""
     return 1.0 / (1.0 + np.exp(-z))
-
-
-def likely_causes(
-    cause_probability: np.ndarray,
-    predicted_margins: np.ndarray,
-    margin_unit: float | np.ndarray = 1.0,
-) -> np.ndarray:
-    """Returns the constraint that is most likely to be violated first.
-
-    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
-    the paper's mode, the one with the largest unsafe mass. Cells contain segments that end alike
-    for different reasons, so for a single motion the margins are more specific than the mass.
-
-    Args:
-        cause_probability: b_unsafe split by constraint, (N, n_c).
-        predicted_margins: Predicted smallest margin of each constraint [m, rad], (N, n_c); NaN
-            where none is predicted.
-        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
-
-    Returns:
-        Columns of the constraints, (N,); `NO_CAUSE` without margins and mass.
-    """
-    probability = np.asarray(cause_probability, dtype=float)
-    relative = np.asarray(predicted_margins, dtype=float) / margin_unit
-    if probability.shape[1] == 0:
-        return np.full(len(probability), NO_CAUSE)
-    by_mass = np.where(probability.max(axis=1) > 0.0, probability.argmax(axis=1), NO_CAUSE)
-    has_margins = np.isfinite(relative).any(axis=1)
-    by_margin = np.where(np.isfinite(relative), relative, np.inf).argmin(axis=1)
-    return np.where(has_margins, by_margin, by_mass)
 
 
 def predict(

@@ -1,1 +1,1 @@
-"""The live page: a robot in Meshcat, in real time, beside what is said of it."""
+"""Live sessions: a robot in Meshcat, in real time, with Γ and the verdict beside it."""

@@ -1,7 +1,7 @@
-"""What a live page shows beside the robot: Γ over time, the belief, and the verdict in words.
+"""The panel of a live session: Γ over time, the belief, and the verdict as text.
 
-Meshcat shows geometry, buttons and sliders, but no text and no plots. Words are therefore a picture
-on a board, drawn anew only when they change; the belief is a bar of three boxes, and Γ a line.
+Meshcat shows geometry, buttons and sliders, but no text and no plots. Text is therefore a picture
+on a board, drawn only when it changes; the belief is a bar of three boxes, and Γ a line.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ INK_RGB = (0.133, 0.149, 0.169)
 
 _PATH = "/assessment"
 _PARTS = ("safe", "unsafe", "unknown")
-# Lengths on the board, whose width is one, from its lower edge upwards.
+# Lengths in widths of the board, from its lower edge upwards.
 _WIDTH, _MARGIN = 1.0, 0.04
-_WORDS_HEIGHT = 0.17
+_TEXT_BOARD_HEIGHT = 0.17
 _BAR_Z, _BAR_HEIGHT = 0.20, 0.07
 _LEGEND_Z = 0.305
 _PLOT_Z, _PLOT_HEIGHT = 0.37, 0.34
 _TITLE_Z, _HEIGHT = 0.75, 0.79
-_LAYER = 0.004  # Between what lies on top of each other.
+_LAYER = 0.004  # Between layers of the board.
 _PIXELS_PER_UNIT = 700
 _TEXT_HEIGHT = 0.034
 _HISTORY_S = 6.0
-_NUM_BOARDS = 12  # That are kept.
+_NUM_BOARDS = 12  # Kept in the scene.
 _DPI = 100
 _EMPTY = np.array([0.0, 0.0, 1.0])
 
 
 class LivePanel:
-    """A board in the world that turns to the camera: words, a bar of beliefs, and Γ over time.
+    """A board in the world that faces the camera: text, a bar of the belief, and Γ over time.
 
     Args:
-        meshcat: Where to draw.
-        view: Where the camera stands.
-        threshold: Γ below this line is what the task reacts to, or refuses.
+        meshcat: The Meshcat server.
+        view: The camera's pose.
+        threshold: Γ at which the curve's threshold line is drawn.
         width_m: Width of the board [m].
     """
 
@@ -63,49 +63,49 @@ class LivePanel:
         self._view = view
         self._scale = width_m
         self._history: deque[tuple[float, float]] = deque()
-        self._words: tuple[str, ...] = ()
+        self._text: tuple[str, ...] = ()
         self._boards: list[tuple[object, ...]] = []
         self._belief = np.full(3, np.nan)
         meshcat.Delete(_PATH)
         size = (_WIDTH, _HEIGHT)
         self._put_picture("ground", ground_picture(threshold), size, z=0.0, forward=0.0)
         for name, rgb in zip(_PARTS, (SAFE_RGB, UNSAFE_RGB, UNKNOWN_RGB), strict=True):
-            colour = words_picture("", rgb=rgb, ground=rgb, width=0.02, height=0.02)
+            colour = text_picture("", rgb=rgb, ground=rgb, width=0.02, height=0.02)
             self._put_picture(f"belief/{name}/colour", colour, (1.0, _BAR_HEIGHT), z=_BAR_Z)
 
     def place(self, p_WP: np.ndarray) -> None:
-        """Puts the middle of the board's lower edge somewhere, turned to the camera.
+        """Places the board.
 
         Args:
-            p_WP: In the world, (3,) [m].
+            p_WP: Middle of its lower edge in the world, (3,) [m].
         """
         turn = RotationMatrix.MakeZRotation(self._view.azimuth_rad + 0.5 * math.pi)
         X_WP = RigidTransform(turn, p_WP).GetAsMatrix4()
         self._meshcat.SetTransform(_PATH, X_WP @ np.diag([self._scale] * 3 + [1.0]))
 
-    def say(self, *lines: str, rgb: tuple[float, float, float] = INK_RGB) -> None:
-        """Shows words, the first line large; drawn only when they differ from those shown.
+    def show_text(self, *lines: str, rgb: tuple[float, float, float] = INK_RGB) -> None:
+        """Shows text, the first line large; draws only what differs from the text shown.
 
         Args:
-            *lines: At most two.
-            rgb: Colour of the board behind them.
+            *lines: At most two lines.
+            rgb: Background colour.
         """
         key = (lines, rgb)
         if self._boards and key == self._boards[-1]:
             return
-        self._words = lines
+        self._text = lines
         if self._boards:
             self._show_board(self._boards[-1], False)
         if key in self._boards:
             self._boards.remove(key)
         else:
-            picture = words_picture(
-                *lines, ground=rgb, rgb=(1.0, 1.0, 1.0), width=_WIDTH, height=_WORDS_HEIGHT
+            picture = text_picture(
+                *lines, ground=rgb, rgb=(1.0, 1.0, 1.0), width=_WIDTH, height=_TEXT_BOARD_HEIGHT
             )
-            self._put_picture(_board_name(key), picture, (_WIDTH, _WORDS_HEIGHT), z=0.0)
+            self._put_picture(_board_name(key), picture, (_WIDTH, _TEXT_BOARD_HEIGHT), z=0.0)
         self._boards.append(key)
         self._show_board(key, True)
-        # A browser fetches a picture after it was told of it: the last few must stay.
+        # A browser fetches a picture some time after it was set: the last few must stay.
         if len(self._boards) > _NUM_BOARDS:
             self._meshcat.Delete(f"{_PATH}/{_board_name(self._boards.pop(0))}")
 
@@ -113,16 +113,16 @@ class LivePanel:
         self._meshcat.SetProperty(f"{_PATH}/{_board_name(key)}", "visible", is_visible)
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """The lines that are shown."""
-        return self._words
+    def text(self) -> tuple[str, ...]:
+        """The lines shown."""
+        return self._text
 
     def show_belief(self, belief: np.ndarray) -> None:
         """Shows a belief as a bar of three parts.
 
         Args:
-            belief: (safe, unsafe, don't know), (3,), of sum one; what is not finite is shown as
-                "don't know".
+            belief: (safe, unsafe, don't know), (3,), of sum one; one that is not finite is shown
+                as "don't know".
         """
         belief = belief if np.isfinite(belief).all() else _EMPTY
         if np.abs(belief - self._belief).max() < 1e-3:
@@ -131,21 +131,21 @@ class LivePanel:
         room = _WIDTH - 2 * _MARGIN
         left = -0.5 * room
         for name, share in zip(_PARTS, belief.tolist(), strict=True):
-            share = max(share, 1e-4)  # A box of no width has no inverse.
+            share = max(share, 1e-4)  # A transform of zero width has no inverse.
             X = np.diag([share * room, 1.0, 1.0, 1.0])
             X[0, 3] = left + 0.5 * share * room
             self._meshcat.SetTransform(f"{_PATH}/belief/{name}", X)
             left += share * room
 
-    def forget(self) -> None:
-        """Begins the curve of Γ anew."""
+    def clear_history(self) -> None:
+        """Clears the curve of Γ."""
         self._history.clear()
 
     def add(self, time_s: float, probability: float) -> None:
-        """Goes on with the curve of Γ.
+        """Appends a point to the curve of Γ.
 
         Args:
-            time_s: Later than what was added before [s].
+            time_s: Later than the previous point [s].
             probability: Γ, in [0, 1].
         """
         self._history.append((time_s, min(max(probability, 0.0), 1.0)))
@@ -166,23 +166,23 @@ class LivePanel:
 
 
 def _board_name(key: tuple[object, ...]) -> str:
-    """A name of its own for what a board says, in the scene tree."""
-    return "words/" + hashlib.sha256(repr(key).encode()).hexdigest()[:12]
+    """A unique name of the board with this text and colour in the scene tree."""
+    return "text/" + hashlib.sha256(repr(key).encode()).hexdigest()[:12]
 
 
 def ground_picture(threshold: float) -> bytes:
-    """What stays on the board, as a PNG: the frame of the curve, its threshold, and a legend.
+    """The static part of the panel as a PNG: the curve's frame, its threshold, and a legend.
 
     Args:
-        threshold: Where the line across the curve is.
+        threshold: Γ at which the threshold line is drawn.
     """
     from matplotlib.patches import Rectangle
 
     figure = _figure(_WIDTH, _HEIGHT, (1.0, 1.0, 1.0))
     points = _TEXT_HEIGHT * _PIXELS_PER_UNIT * 72 / _DPI
 
-    def write(x: float, z: float, words: str, rgb: tuple[float, float, float]) -> None:
-        figure.text(x / _WIDTH, z / _HEIGHT, words, size=points, color=rgb, va="center")
+    def write(x: float, z: float, text: str, rgb: tuple[float, float, float]) -> None:
+        figure.text(x / _WIDTH, z / _HEIGHT, text, size=points, color=rgb, va="center")
 
     def fill(
         x: float, z: float, width: float, height: float, rgb: tuple[float, float, float]
@@ -220,21 +220,21 @@ def _png(figure: Figure) -> bytes:
     return png.getvalue()
 
 
-def words_picture(
+def text_picture(
     *lines: str,
     rgb: tuple[float, float, float],
     ground: tuple[float, float, float],
     width: float,
     height: float,
 ) -> bytes:
-    """Words as a PNG, the first line bold and larger than the others where there are more.
+    """Text as a PNG; the first of several lines is bold and larger than the others.
 
     Args:
-        *lines: The words; a line that is too wide is made smaller.
-        rgb: Their colour.
-        ground: Colour behind them.
-        width: Of the picture, in the board's units.
-        height: Of the picture, in the board's units.
+        *lines: The text; a line that is too wide is made smaller.
+        rgb: Colour of the text.
+        ground: Background colour.
+        width: Width of the picture, in the board's units.
+        height: Height of the picture, in the board's units.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -266,14 +266,14 @@ def words_picture(
 
 
 def picture_board(png: bytes, width: float, height: float) -> InMemoryMesh:
-    """A rectangle that shows a picture as it is, whatever the light: one glTF file in memory.
+    """An unlit rectangle with a picture, as a glTF file in memory.
 
     The board stands in the x-z plane, centred in x, its lower edge at z = 0, its face towards -y.
 
     Args:
         png: The picture.
-        width: Of the board.
-        height: Of the board.
+        width: Width of the board.
+        height: Height of the board.
     """
     w = 0.5 * width
     # glTF's y is up: Drake turns (x, y, z) into (x, -z, y).

@@ -1,4 +1,4 @@
-"""Live sessions: a robot that one plays with in Meshcat, tick by tick, in real time."""
+"""Interactive sessions with a robot in Meshcat, in real time."""
 
 from __future__ import annotations
 
@@ -12,18 +12,9 @@ from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.prediction import NO_CAUSE, likely_causes
-from drake_safety.live.panel import (
-    INK_RGB,
-    RECOVERY_RGB,
-    SAFE_RGB,
-    UNSAFE_RGB,
-    LivePanel,
-)
-from drake_safety.planning.goal_verdict import (
-    GoalVerdict,
-    assess_goal,
-)
+from drake_safety.learning.causes import describe_margin, likely_cause
+from drake_safety.live.panel import INK_RGB, RECOVERY_RGB, SAFE_RGB, UNSAFE_RGB, LivePanel
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.capabilities import HasBall, HasGoals, angular_constraints, require
@@ -31,25 +22,25 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
 TICK_S = 0.04
-"""Simulated time between two looks at the controls [s]."""
+"""Simulated time per tick [s]."""
 STOP = "Stop"
 PROBABILITY = "Γ, shown"
 """The slider that shows Γ as a number; moving it has no effect."""
 
-_FLIGHT_S = 0.2  # Of a ball, so that one sees it come.
-_LYING_S = 1.5  # After a fall, before the robot is stood up again.
-_NUM_CANDIDATES = 24  # Judged at a time in the search: somebody waits for its answer.
-_BREAK_S = 0.02  # Real time between two looks at the controls while nothing moves.
+_FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
+_LYING_S = 1.5  # From a fall to the reset.
+_NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
+_BREAK_S = 0.02  # Real time between ticks while nothing moves.
 
 
 @dataclass
 class Pace:
-    """How fast a live session ran.
+    """Simulated and real time of a live session.
 
     Attributes:
-        simulated_s: Time that was simulated [s].
-        busy_s: Real time that simulating and drawing it took, waiting left out [s].
-        elapsed_s: Real time that passed while it was simulated [s].
+        simulated_s: Simulated time [s].
+        busy_s: Real time spent on simulation and drawing, without waiting [s].
+        elapsed_s: Real time elapsed during the simulation [s].
     """
 
     simulated_s: float = 0.0
@@ -58,30 +49,30 @@ class Pace:
 
     @property
     def realtime_factor(self) -> float:
-        """Simulated time by real time, as it was watched; 1 where the simulation kept up."""
+        """Simulated by elapsed real time; 1 if the simulation kept up with the clock."""
         return self.simulated_s / self.elapsed_s if self.elapsed_s > 0 else math.nan
 
     @property
     def possible_factor(self) -> float:
-        """How much faster than the clock it could have run."""
+        """Simulated time by the real time spent on it: the largest possible real-time factor."""
         return self.simulated_s / self.busy_s if self.busy_s > 0 else math.nan
 
 
 class LiveSession(ABC):
-    """A closed loop with Γ that is shown in Meshcat and reacts to its buttons and sliders.
+    """A closed loop with Γ in Meshcat that reacts to buttons and sliders.
 
     Args:
-        loop: A closed loop that was built with this Meshcat and with Γ.
-        meshcat: Where it is shown.
-        threshold: Γ below this is what the task reacts to, or refuses.
-        seed: Of start and noise.
+        loop: A closed loop built with this Meshcat and with an assessment.
+        meshcat: The Meshcat server.
+        threshold: Threshold of Γ.
+        seed: Seed of starts and noise.
 
     Raises:
-        ValueError: The loop was built without Γ.
+        ValueError: The loop was built without an assessment.
 
     Attributes:
-        pace: How fast it ran.
-        probability: Γ as it is shown.
+        pace: Simulated and real time so far.
+        probability: Γ as shown.
     """
 
     probability_port = "normalized_safety_probability"
@@ -102,7 +93,7 @@ class LiveSession(ABC):
         self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
         self._fall_column = loop.constraint_names.index(loop.fall_name)
-        # How large the robot is: twice the height of its base, or as long as its feet stand.
+        # Size of the robot: twice the height of its base, or the extent of its feet.
         q = loop.kinematics.standing_positions()
         contacts = loop.kinematics.contact_positions(q)
         self._size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
@@ -112,17 +103,17 @@ class LiveSession(ABC):
 
     @abstractmethod
     def tick(self) -> bool:
-        """Reacts to the controls and goes on by one tick.
+        """Reacts to the controls and advances by one tick.
 
         Returns:
             Whether anything was simulated.
         """
 
     def run(self, *, is_paced: bool = True) -> None:
-        """Ticks until the button Stop.
+        """Ticks until the button Stop is clicked.
 
         Args:
-            is_paced: Whether to wait for the clock; False simulates as fast as it goes.
+            is_paced: Whether to run in real time; False runs as fast as possible.
         """
         while not self._is_clicked(STOP):
             begin = time.perf_counter()
@@ -133,7 +124,7 @@ class LiveSession(ABC):
                 self._late_s = 0.0
                 continue
             if is_paced:
-                # What is behind the clock is caught up with, up to a few ticks.
+                # A delay is made up for, up to a few ticks.
                 spare_s = TICK_S - busy_s - self._late_s
                 time.sleep(max(spare_s, 0.0))
                 self._late_s = min(max(-spare_s, 0.0), 5 * TICK_S)
@@ -156,9 +147,9 @@ class LiveSession(ABC):
         return episode_rng(self._seed, self._num_resets - 1)
 
     def _begin(self) -> None:
-        """Draws what was reset, and goes on from there."""
+        """Initializes the simulator after a reset, and redraws."""
         self._simulator.Initialize()
-        self.panel.forget()
+        self.panel.clear_history()
         self._aim_camera()
 
     def _advance(self) -> None:
@@ -185,11 +176,11 @@ class LiveSession(ABC):
 
     @property
     def has_fallen(self) -> bool:
-        """Whether the robot lies."""
+        """Whether the robot has fallen."""
         return bool(self._eval("margins")[self._fall_column] < 0)
 
     def _rightwards(self) -> np.ndarray:
-        """To the right of who looks through the camera, in the world, (3,)."""
+        """Direction to the right in the camera's view, in the world, (3,)."""
         azimuth = self.loop.view.azimuth_rad
         return np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
 
@@ -210,13 +201,13 @@ class LiveSession(ABC):
 
 
 class LiveThrows(LiveSession):
-    """A robot that balances, and balls to throw at it.
+    """A session with a balancing robot and balls to throw at it.
 
     Args:
-        loop: A closed loop with a ball, built with this Meshcat and with Γ.
-        meshcat: Where it is shown.
-        threshold: Below which Γ triggers recovery.
-        seed: Of start and noise.
+        loop: A closed loop with a ball, built with this Meshcat and with an assessment.
+        meshcat: The Meshcat server.
+        threshold: Threshold of Γ that triggers recovery.
+        seed: Seed of starts and noise.
     """
 
     THROW, STAND = "Throw", "Stand up again"
@@ -227,7 +218,7 @@ class LiveThrows(LiveSession):
         self._thrown = require(loop, HasBall)
         self.probability_port = self._thrown.trigger_port
         self._has_recovery = loop.HasOutputPort("recovery_active")
-        self._unit = self.assessment.parameters.margin_unit
+
         self._note, self._note_until_s = "", 0.0
         self._lies_until_s = math.inf
         self._add_button(self.THROW, "Space")
@@ -238,7 +229,7 @@ class LiveThrows(LiveSession):
         self._stand()
 
     def tick(self) -> bool:
-        """Throws if asked to, advances, and shows Γ, belief and verdict."""
+        """Throws a ball if the button was clicked, advances, and shows Γ, belief and verdict."""
         now = self.context.get_time()
         if self._is_clicked(self.STAND) or now >= self._lies_until_s:
             self._stand()
@@ -246,7 +237,7 @@ class LiveThrows(LiveSession):
             self._throw()
         self._advance()
         self._place_panel()
-        self._tell()
+        self._show_status()
         return True
 
     def _stand(self) -> None:
@@ -262,37 +253,39 @@ class LiveThrows(LiveSession):
         try:
             self._thrown.throw_ball(self.context, throw, _FLIGHT_S)
             self._note = f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°"
-        except ValueError:  # The robot lies, or stands so that the line leads past it.
+        except ValueError:  # The robot has fallen, or the ball's path misses its base.
             self._note = "this ball would miss the robot"
         self._note_until_s = self.context.get_time() + 3.0
 
-    def _tell(self) -> None:
+    def _show_status(self) -> None:
         now = self.context.get_time()
         note = self._note if now < self._note_until_s else "Space throws a ball"
         if self.has_fallen:
             self._lies_until_s = min(self._lies_until_s, now + _LYING_S)
-            self.panel.say("fell", note, rgb=UNSAFE_RGB)
+            self.panel.show_text("fell", note, rgb=UNSAFE_RGB)
         elif self._has_recovery and self._eval("recovery_active")[0] > 0:
-            self.panel.say("Γ fell: recovery steps", note, rgb=RECOVERY_RGB)
+            self.panel.show_text("Γ fell: recovery steps", note, rgb=RECOVERY_RGB)
         elif self.probability >= self.threshold:
-            self.panel.say("safe: balancing", note, rgb=SAFE_RGB)
+            self.panel.show_text("safe: balancing", note, rgb=SAFE_RGB)
         else:
-            masses, margins = self._eval("cause_probability"), self._eval("predicted_margins")
-            (cause,) = likely_causes(masses[None], margins[None], self._unit)
-            name = "" if cause == NO_CAUSE else f": {self.loop.constraint_names[cause]}"
-            self.panel.say("unsafe" + name, note, rgb=UNSAFE_RGB)
+            cause = likely_cause(
+                self.loop.constraint_names,
+                self._eval("cause_probability"),
+                self._eval("predicted_margins"),
+                self.assessment.parameters.margin_unit,
+            )
+            self.panel.show_text(f"unsafe: {cause}" if cause else "unsafe", note, rgb=UNSAFE_RGB)
 
 
 class LiveGoals(LiveSession):
-    """A robot that goes to targets, if Γ lets it.
+    """A session with a robot that reaches for accepted targets.
 
     Args:
-        loop: A closed loop whose plans have a goal, built with this Meshcat and with Γ.
-        meshcat: Where it is shown.
-        threshold: From which Γ on a goal is accepted.
-        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
-            default.
-        seed: Of the noise.
+        loop: A closed loop whose plans have a goal, built with this Meshcat and with an assessment.
+        meshcat: The Meshcat server.
+        threshold: See :func:`drake_safety.planning.goal_verdict.assess_goal`.
+        unsafe_below: See there.
+        seed: Seed of the noise.
     """
 
     ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
@@ -332,23 +325,23 @@ class LiveGoals(LiveSession):
         self._stand()
 
     def tick(self) -> bool:
-        """Judges a target that was moved, goes if asked and allowed to, and shows the verdict."""
+        """Assesses a target that was moved, starts a motion if requested, and shows the verdict."""
         goal = np.array([self.meshcat.GetSliderValue(name) for name in self.AXES])
         is_asked = self._is_clicked(self.ASK)
         is_to_go, is_forced = self._is_clicked(self.GO), self._is_clicked(self.FORCE)
         if self._is_clicked(self.STAND):
             self._stand()
         if is_asked or is_to_go or is_forced or not np.array_equal(goal, self._goal):
-            verdict = self._judge(goal, is_thorough=is_asked or is_to_go)
+            verdict = self._assess(goal, is_thorough=is_asked or is_to_go)
             if is_forced or (is_to_go and verdict.is_accepted):
                 self._go(goal)
         if self.context.get_time() >= self._end_s - 1e-9:
             return False
         self._advance()
-        self._tell_motion()
+        self._show_motion()
         return True
 
-    def _judge(self, goal: np.ndarray, *, is_thorough: bool) -> GoalVerdict:
+    def _assess(self, goal: np.ndarray, *, is_thorough: bool) -> GoalVerdict:
         self._goal = goal
         self.meshcat.SetTransform(self._TARGET, RigidTransform(goal))
         self.meshcat.SetProperty(self._NEAREST, "visible", False)
@@ -370,7 +363,7 @@ class LiveGoals(LiveSession):
                 num_candidates=_NUM_CANDIDATES,
             )
         self._show_gamma(verdict.safety_probability, verdict.belief)
-        self._tell_verdict(verdict, is_thorough=is_thorough)
+        self._show_verdict(verdict, is_thorough=is_thorough)
         return verdict
 
     def _go(self, goal: np.ndarray) -> None:
@@ -379,23 +372,22 @@ class LiveGoals(LiveSession):
         self._end_s = self.loop.scenario.episode_duration_s + 1.0
 
     def _stand(self) -> None:
-        # The posture alone is shown; no motion begins.
+        # Shows the posture only; no motion begins.
         self._goals.reset_standing(self.context, self._goals.target_box.mean(axis=0))
         self._begin()
         self._end_s = -math.inf
         self._goal = np.full(3, np.nan)
 
-    def _tell_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
+    def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
         if verdict.is_accepted:
-            self.panel.say(
+            self.panel.show_text(
                 f"accepted: Γ {verdict.safety_probability:.2f}", "Space goes there", rgb=SAFE_RGB
             )
             return
         first = f"refused: Γ {verdict.safety_probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
-        is_angle = verdict.cause in angular_constraints(self.loop)
-        cause = verdict.cause + _margin_words(verdict.cause_margin, is_angle)
+        cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))
         second = f"expected: {cause}" if cause else verdict.reason
         if is_thorough:
             if self.nearest is None:
@@ -405,28 +397,24 @@ class LiveGoals(LiveSession):
                 second += f"; accepted {100 * distance_m:.0f} cm away"
                 self.meshcat.SetTransform(self._NEAREST, RigidTransform(self.nearest.goal))
                 self.meshcat.SetProperty(self._NEAREST, "visible", True)
-        self.panel.say(first, second, rgb=UNSAFE_RGB)
+        self.panel.show_text(first, second, rgb=UNSAFE_RGB)
 
-    def _tell_motion(self) -> None:
+    def _show_motion(self) -> None:
         margins = self._eval("margins")
         if self.has_fallen:
             self._end_s = min(self._end_s, self.context.get_time() + _LYING_S)
-            self.panel.say("fell", "R stands it up again", rgb=UNSAFE_RGB)
+            self.panel.show_text("fell", "R stands it up again", rgb=UNSAFE_RGB)
         elif margins.min() < 0:
             name = self.loop.constraint_names[int(np.argmin(margins))]
-            self.panel.say(f"left the safe set: {name}", "R stands it up again", rgb=UNSAFE_RGB)
+            self.panel.show_text(
+                f"left the safe set: {name}", "R stands it up again", rgb=UNSAFE_RGB
+            )
             return
         else:
             miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
             if self.context.get_time() >= self._end_s - 1e-9:
-                self.panel.say("there", f"{100 * miss_m:.1f} cm off", rgb=RECOVERY_RGB)
+                self.panel.show_text("there", f"{100 * miss_m:.1f} cm off", rgb=RECOVERY_RGB)
             else:
-                self.panel.say("on the way", f"the {self._goals.hand} hand reaches", rgb=SAFE_RGB)
-
-
-def _margin_words(margin: float, is_angle: bool) -> str:
-    if not math.isfinite(margin):
-        return ""
-    if is_angle:
-        return f", {math.degrees(margin):+.1f}°"
-    return f", {100 * margin:+.1f} cm"
+                self.panel.show_text(
+                    "on the way", f"the {self._goals.hand} hand reaches", rgb=SAFE_RGB
+                )

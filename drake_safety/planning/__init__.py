@@ -1,1 +1,1 @@
-"""Goals and plans judged before anything moves, and chosen by what the judgement says."""
+"""Assessment and selection of goals and plans before the robot moves."""

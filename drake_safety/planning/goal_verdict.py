@@ -1,4 +1,4 @@
-"""Goals judged before anything moves: what Γ says of them."""
+"""Verdicts on goals before the robot moves."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ import numpy as np
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
-from drake_safety.learning.prediction import NO_CAUSE, is_unknown, likely_causes
+from drake_safety.learning.causes import likely_cause
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GoalVerdict:
-    """What an assessment says of a goal, before anything moves.
+    """The verdict of an assessment on a goal, before the robot moves.
 
     Attributes:
         goal: The goal in the world, (3,) [m].
         verdict: "safe", "unsafe" or "don't know".
         belief: (safe, unsafe, don't know), (3,).
-        safety_probability: Γ, calibrated; NaN where Γ was not asked, because the goal is
-            outside what it has learned.
-        threshold: From which Γ on a goal is safe.
+        safety_probability: Γ, calibrated; NaN where Γ was not evaluated, because the goal is
+            outside the region sampled in training.
+        threshold: Lowest Γ of a safe goal.
         constraint_names: The n_c constraints, the possible causes.
-        cause_probability: b_unsafe split by the constraint that will be violated, (n_c,).
-        predicted_margins: Smallest margin of each constraint that is expected, (n_c,); NaN where
-            none is predicted.
-        margin_unit: Margin that counts as one when margins are compared [m, rad].
-        reason: Why the answer is "don't know"; "" otherwise.
+        cause_probability: b_unsafe split by the violated constraint, (n_c,).
+        predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
+            where none is predicted.
+        margin_unit: Scale by which margins are compared [m, rad].
+        reason: Why the verdict is "don't know"; "" otherwise.
     """
 
     goal: np.ndarray
@@ -48,26 +49,28 @@ class GoalVerdict:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether the robot may go there."""
+        """Whether the verdict is "safe"."""
         return self.verdict == SAFE
 
     @property
     def cause(self) -> str:
-        """The constraint that is most likely to be violated; "" where nothing speaks for any."""
-        (column,) = likely_causes(
-            self.cause_probability[None], self.predicted_margins[None], self.margin_unit
+        """The constraint most likely to be violated; "" if there is no evidence for any."""
+        return likely_cause(
+            self.constraint_names,
+            self.cause_probability,
+            self.predicted_margins,
+            self.margin_unit,
         )
-        return "" if column == NO_CAUSE else self.constraint_names[column]
 
     @property
     def cause_margin(self) -> float:
-        """The margin that is predicted for the cause [m, rad]; NaN where none is."""
+        """The margin predicted for the cause [m, rad]; NaN if there is none."""
         if not self.cause:
             return math.nan
         return float(self.predicted_margins[self.constraint_names.index(self.cause)])
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values; what is unknown is None."""
+        """Returns the verdict as JSON types; unknown values are None."""
         by_name = zip(self.constraint_names, self.cause_probability.tolist(), strict=True)
         return {
             "goal": [_finite(value) for value in self.goal.tolist()],
@@ -90,30 +93,31 @@ def assess_goal(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> GoalVerdict:
-    """What an assessment says of going from the standing posture to a goal.
+    """Assesses the motion from the standing posture to a goal.
 
-    Nothing is simulated: the state, the plan and the features of the first instant are judged.
+    Nothing is simulated: Γ is evaluated on the state, the plan and the features of the first
+    instant.
 
     Args:
         loop: A closed loop whose plans have a goal.
-        assessment: What was learned from its episodes.
-        goal: In the world, (3,) [m]. One that is not finite, or outside the region that was
-            sampled in training, is answered with "don't know" and the region.
-        threshold: From which Γ, calibrated, on a goal is safe.
-        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
-            default.
+        assessment: The assessment learned from its episodes.
+        goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
+            region sampled in training, is "don't know".
+        threshold: Lowest Γ, calibrated, of a safe goal.
+        unsafe_below: A Γ below this is unsafe, one between this and the threshold "don't know";
+            the threshold by default.
 
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
     """
     goal = checked_goal(goal)
-    box = target_box(loop)
+    box = require(loop, HasGoals).target_box
     if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
         (verdict,) = assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
         )
         return verdict
-    what = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
+    position = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
     names = tuple(loop.constraint_names)
     return GoalVerdict(
         goal=goal,
@@ -124,7 +128,7 @@ def assess_goal(
         constraint_names=names,
         cause_probability=np.zeros(len(names)),
         predicted_margins=np.full(len(names), np.nan),
-        reason=f"the target {what} the region sampled in training, {_region(box)}",
+        reason=f"the target {position} the region sampled in training, {_region(box)}",
     )
 
 
@@ -136,46 +140,47 @@ def assess_goals(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> list[GoalVerdict]:
-    """What an assessment says of goals inside the region that was sampled in training.
+    """Assesses goals inside the region sampled in training.
 
-    Γ is taken for unknown where more than half of the belief comes from cells that know nothing.
+    The verdict is "don't know" where more than half of the belief comes from cells without
+    training data.
 
     Args:
         loop: A closed loop whose plans have a goal.
-        assessment: What was learned from its episodes.
+        assessment: The assessment learned from its episodes.
         goals: In the world, (N, 3) [m].
-        threshold: From which Γ, calibrated, on a goal is safe.
-        unsafe_below: Below which it is unsafe, and "don't know" in between; the threshold by
-            default.
+        threshold: See :func:`assess_goal`.
+        unsafe_below: See :func:`assess_goal`.
     """
     if len(goals) == 0:
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
-    said = assessment.predict(*goal_inputs(loop, goals))
-    is_open = is_unknown(said.belief, assessment.parameters.initial_uncertainty)
+    prediction = assessment.predict(*goal_inputs(loop, goals))
+    has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
+        probability = float(prediction.calibrated[i])
         reason = ""
-        verdict = SAFE if said.calibrated[i] >= threshold else UNSAFE
-        if unsafe_below <= said.calibrated[i] < threshold:
+        verdict = SAFE if probability >= threshold else UNSAFE
+        if unsafe_below <= probability < threshold:
             verdict = UNKNOWN
             reason = (
-                f"Γ {said.calibrated[i]:.3f} lies between {unsafe_below:.3f} and "
-                f"{threshold:.3f}, where safe and unsafe targets cannot be told apart"
+                f"Γ {probability:.3f} lies between {unsafe_below:.3f} and {threshold:.3f}, where "
+                "safe and unsafe targets cannot be distinguished"
             )
-        if is_open[i]:
+        if has_no_data[i]:
             verdict = UNKNOWN
-            reason = "training came too seldom near what this target looks like to the assessment"
+            reason = "too little training data near this target's embedding"
         verdicts.append(
             GoalVerdict(
                 goal=np.array(goal, dtype=float),
                 verdict=verdict,
-                belief=said.belief[i],
-                safety_probability=float(said.calibrated[i]),
+                belief=prediction.belief[i],
+                safety_probability=probability,
                 threshold=threshold,
                 constraint_names=tuple(loop.constraint_names),
-                cause_probability=said.cause_probability[i],
-                predicted_margins=said.predicted_margins[i],
+                cause_probability=prediction.cause_probability[i],
+                predicted_margins=prediction.predicted_margins[i],
                 margin_unit=assessment.parameters.margin_unit,
                 reason=reason,
             )
@@ -184,7 +189,7 @@ def assess_goals(
 
 
 def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
-    """What an assessment judges goals by: the first instant on the way from standing to each.
+    """The assessment's inputs at the first instant of the motion from standing to each goal.
 
     Args:
         loop: A closed loop whose plans have a goal.
@@ -203,20 +208,11 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
-def target_box(loop: ClosedLoop) -> np.ndarray:
-    """Lowest and highest corner of the goals that were sampled in training, (2, 3) [m].
-
-    Raises:
-        ValueError: The task's plans have no goal.
-    """
-    return require(loop, HasGoals).target_box
-
-
 def checked_goal(goal: np.ndarray) -> np.ndarray:
-    """A goal as an array, (3,) [m]; it need not be finite.
+    """Returns a goal as an array, (3,) [m]; it need not be finite.
 
     Raises:
-        ValueError: It is not three numbers.
+        ValueError: The goal is not three numbers.
     """
     goal = np.asarray(goal, dtype=float)
     if goal.shape != (3,):

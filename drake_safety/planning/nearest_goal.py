@@ -1,4 +1,4 @@
-"""The nearest accepted goal: what may be offered in place of a goal that is refused."""
+"""Search for the accepted goal nearest to a refused one."""
 
 from __future__ import annotations
 
@@ -15,33 +15,31 @@ from drake_safety.planning.goal_verdict import (
     assess_goals,
     checked_goal,
     goal_inputs,
-    target_box,
 )
+from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 METHODS = ("both", "gradient", "search")
-"""How the nearest accepted goal may be looked for."""
+"""Methods of :func:`nearest_accepted_goal`."""
 RESERVE = 0.8
-"""Share of the way from the threshold to certainty by which a suggested goal exceeds the threshold.
+"""Share of the interval from the threshold to 1 by which a suggested goal exceeds the threshold.
 
-At the threshold itself as many goals are safe as not: a suggestion must be better than that."""
+Of the goals at the threshold itself, about half are unsafe."""
 
 _Nearest = Callable[[np.ndarray], GoalVerdict | None]
-"""The nearest to the goal of those of the candidates (N, 3) [m] that are accepted."""
+"""The accepted candidate, of (N, 3) [m], nearest to the goal."""
 
-_DIFFERENCE_M = 1e-3  # Between the goals that tell how inputs change with them.
+_DIFFERENCE_M = 1e-3  # Step of the finite differences of the inputs by the goal.
 _MAX_STEPS = 12  # Along the gradient.
-_LONGEST_STEP_M = 0.15  # The logit is nearly straight over that much.
-_MARGIN = 0.5  # By how much the logit that is aimed at falls where Γ does not follow.
+_LONGEST_STEP_M = 0.15  # The logit is nearly linear over that distance.
+_MARGIN = 0.5  # By how much the target logit falls where Γ does not follow it.
 _LARGEST_LOGIT = 8.0
 
 _FIRST_RADIUS_M = 0.05
 _GROWTH = 1.6  # From one ball of candidates to the next.
-_LAST_CHANCE = (
-    16  # Times as many candidates, all over the region, when no ball had an accepted one.
-)
-_SPREAD = 0.25  # How far these lie from it, as a share of its distance to the goal.
-_NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Of candidates about the best goal that was found.
+_LAST_CHANCE = 16  # Times as many candidates in the whole region if no ball had an accepted one.
+_SPREAD = 0.25  # Radius of the candidates about the best goal, by its distance to the goal.
+_NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Of candidates about the best goal.
 
 
 def nearest_accepted_goal(
@@ -56,39 +54,38 @@ def nearest_accepted_goal(
     resolution_m: float = 1e-3,
     method: str = "both",
 ) -> GoalVerdict | None:
-    """The goal nearest to a given one that is accepted with reserve, as far as it can be found.
+    """Finds an accepted goal near a given one, with a reserve.
 
-    With reserve: Γ ≥ threshold + reserve (1 - threshold). The nearest goal lies at the limit that
-    was searched with, and of those at the threshold itself many are unsafe.
+    With reserve: Γ ≥ threshold + reserve (1 - threshold). The goal found lies at the limit of the
+    search, and of the goals at the threshold itself many are unsafe.
 
-    The gradient of the logit that is learned with Γ finds an accepted goal with few goals judged,
-    often not the nearest one: it follows one basin, and Γ, which decides, not exactly. A search no
-    farther than that, in all directions, takes fewer goals than one that knows none yet. Where the
-    gradient finds nothing, or the maps have none to follow, the search is the whole one.
+    Descent along the gradient of the safety head's logit finds an accepted goal with few
+    evaluations, but often not the nearest one: it stays in one basin, and Γ follows the logit only
+    approximately. It bounds the radius of a search in all directions. If the descent finds nothing,
+    or the maps have no safety head, the search covers the whole region.
 
-    All candidates lie on a grid of ``resolution_m``: rounded to it, an accepted goal stays an
-    accepted one.
+    All candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict.
 
     Args:
         loop: A closed loop whose plans have a goal.
-        assessment: What was learned from its episodes.
+        assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
-        threshold: From which Γ, calibrated, on a goal is safe.
+        threshold: Lowest Γ, calibrated, of a safe goal.
         rng: Source of the candidates.
-        reserve: Share of the way from the threshold to certainty, in [0, 1]; 0 suggests whatever
-            is accepted.
-        num_candidates: That the search judges at a time, half as many where the gradient has found
+        reserve: Share of the interval from the threshold to 1, in [0, 1].
+        num_candidates: Candidates of the search per batch; half as many if the descent has found
             an accepted goal.
-        resolution_m: Spacing of the grid that the goal found lies on [m].
+        resolution_m: Spacing of the grid of candidates [m].
         method: ``both``, or the ``gradient`` or the ``search`` alone.
 
     Returns:
-        The verdict on it, by the threshold itself; None when the goal is not finite, or nothing
-        that is accepted with reserve was found.
+        The verdict on the goal found, with the threshold itself; None if the given goal is not
+        finite, or no goal was found that is accepted with the reserve.
 
     Raises:
         ValueError: The loop's plans have no goal, the goal is not three numbers, the reserve is
-            not in [0, 1], the method is unknown, or maps without a safety head are to be followed.
+            not in [0, 1], the method is unknown, or it is ``gradient`` and the maps have no safety
+            head.
     """
     if method not in METHODS:
         raise ValueError(f"nearest accepted goal: method must be one of {METHODS}; got '{method}'")
@@ -98,7 +95,7 @@ def nearest_accepted_goal(
     goal = checked_goal(goal)
     if not np.isfinite(goal).all():
         return None
-    box = target_box(loop)
+    box = require(loop, HasGoals).target_box
 
     def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
         points = np.unique(on_grid(candidates, resolution_m), axis=0)
@@ -107,7 +104,7 @@ def nearest_accepted_goal(
         return _nearest((verdict for verdict in verdicts if verdict.is_accepted), goal)
 
     best: GoalVerdict | None = None
-    # Matrices this small are multiplied sooner by one thread than by several.
+    # One thread multiplies matrices this small faster than several.
     with threadpool_limits(1):
         if method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head):
             best = _descend(loop, assessment, goal, box, stricter, nearest_of, resolution_m)
@@ -125,12 +122,11 @@ def _descend(
     nearest_of: _Nearest,
     resolution_m: float,
 ) -> GoalVerdict | None:
-    """Moves a refused goal to the nearest accepted one of one basin, along the gradient.
+    """Moves a refused goal along the gradient to an accepted one.
 
-    Each step goes to the point nearest to the goal on the plane on which the logit, were it
-    straight, would have the value aimed at. Network and inputs share the chain rule: the network's
-    gradient is exact, the inputs' change with the goal a difference of four goals. What is aimed at
-    falls as long as Γ, which decides, does not accept.
+    Each step goes to the point nearest to the goal on the plane where the linearised logit has the
+    target value. The gradient of the network is exact; the derivative of its inputs by the goal is
+    a finite difference of four goals. The target value falls until Γ accepts the goal.
     """
     bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
     share = min(max(threshold, 1.0 - bound), bound)
@@ -138,7 +134,7 @@ def _descend(
     best: GoalVerdict | None = None
     point = centre = np.clip(goal, *box)
     for _ in range(_MAX_STEPS):
-        # Beyond the region nothing was learned: differences point inwards.
+        # Differences point inwards: there is no training data beyond the region.
         inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
         inputs = goal_inputs(loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
         x, logit, gradient = assessment.unsafe_logits(*inputs)
@@ -168,12 +164,11 @@ def _search(
     num_candidates: int,
     resolution_m: float,
 ) -> GoalVerdict | None:
-    """Looks for the nearest accepted goal in all directions.
+    """Searches the nearest accepted goal in all directions.
 
-    Candidates fill growing balls about the goal until one of them is accepted: as far as the one
-    that is known, with fewer of them, and where none is in the end the whole region. From there on
-    the search goes down: a bisection towards the goal, then candidates about the best one and in
-    the ball that it bounds, and so on.
+    Candidates fill growing balls about the goal until one of them is accepted: up to the distance
+    of the known goal, or else in the end the whole region. Each round of refinement then bisects
+    towards the goal, and draws candidates about the best goal and in the ball that it bounds.
     """
     centre = np.clip(goal, *box)
     best = nearest_of(centre[None])
@@ -209,7 +204,7 @@ def _search(
 def _bisect(
     best: GoalVerdict, centre: np.ndarray, nearest_of: _Nearest, resolution_m: float
 ) -> GoalVerdict:
-    """Moves an accepted goal straight towards the centre for as long as it stays accepted."""
+    """Moves an accepted goal straight towards the centre while it stays accepted."""
     refused = centre
     while _distance(best.goal, refused) > resolution_m:
         between = 0.5 * (best.goal + refused)
@@ -224,24 +219,23 @@ def _bisect(
 
 
 def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
-    """The nearest points of the grid that suggested goals lie on.
+    """Rounds points to the grid of candidates.
 
     Args:
         points: In the world, (..., 3) [m].
         resolution_m: Spacing of the grid [m].
     """
-    # A multiple of the spacing is not yet the number that is read back from its digits.
+    # A multiple of the spacing differs in its last bits from the same number read from a text.
     return np.round(np.round(points / resolution_m) * resolution_m, 9)
 
 
 def _nearest(verdicts: Iterable[GoalVerdict | None], goal: np.ndarray) -> GoalVerdict | None:
-    """The first of the verdicts whose goal is nearest to the given one."""
     found = [verdict for verdict in verdicts if verdict is not None]
     return min(found, key=lambda verdict: _distance(verdict.goal, goal), default=None)
 
 
 def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
-    """Points spread evenly in the unit ball, (N, 3)."""
+    """Points distributed uniformly in the unit ball, (N, 3)."""
     directions = rng.normal(size=(num_points, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions * np.cbrt(rng.uniform(size=(num_points, 1)))

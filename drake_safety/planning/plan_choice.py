@@ -1,4 +1,4 @@
-"""Planning with Γ: of the plans that would do, the one that Γ takes to be safest."""
+"""Planning with Γ: selection of the safest of several candidate plans."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _INPUTS = ("state", "desired_preview", "features")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlanChoice:
-    """Which plan was chosen, and what Γ said of all.
+    """The chosen plan, and Γ of all candidates.
 
     Attributes:
         index: Position of the chosen plan among the candidates.
         safety_probability: Γ, calibrated, of each candidate, (M,).
-        threshold: From which Γ on a plan is accepted.
+        threshold: Lowest Γ of an accepted plan.
     """
 
     index: int
@@ -32,19 +32,19 @@ class PlanChoice:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether the chosen plan may be executed; if not, it takes another target."""
+        """Whether Γ of the chosen plan reaches the threshold."""
         return bool(self.safety_probability[self.index] >= self.threshold)
 
 
 def plan_inputs(
     loop: ClosedLoop, context: Context, plans: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What an assessment judges each plan by, from the state that a Context is in.
+    """The assessment's inputs for each plan, in the state of a Context.
 
     Args:
         loop: A closed loop whose plans can be chosen.
-        context: Its Context; it keeps the plan that it has.
-        plans: M candidates, the first of them the plan that the Context has.
+        context: Its Context; it keeps its plan.
+        plans: M candidates, the first of them the plan of the Context.
 
     Returns:
         State (M, n_s), desired preview (M, H n_z) and features (M, n_f).
@@ -71,16 +71,16 @@ def choose_plan(
     rng: np.random.Generator,
     num_plans: int = 16,
 ) -> PlanChoice:
-    """Sets the plan with the highest Γ; the one that the Context has is among the candidates.
+    """Sets the plan with the highest Γ; the present plan is one of the candidates.
 
     Args:
         loop: A closed loop whose plans can be chosen.
-        assessment: What was learned from its episodes.
+        assessment: The assessment learned from its episodes.
         context: Its Context, in the state to plan from; the chosen plan is set in it.
-        threshold: From which Γ, calibrated, on a plan is accepted. If none is, the best is
-            set all the same and the choice says so: it takes another target.
+        threshold: Lowest Γ, calibrated, of an accepted plan. If no candidate reaches it, the best
+            one is set, and ``is_accepted`` is False.
         rng: Source of the candidates.
-        num_plans: How many candidates are judged at most.
+        num_plans: Largest number of candidates.
 
     Raises:
         ValueError: The task's plans cannot be chosen.
@@ -88,7 +88,7 @@ def choose_plan(
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)
     state, preview, features = plan_inputs(loop, context, plans)
-    said = assessment.predict(state, preview, features if assessment.uses_features else None)
-    best = int(np.argmax(said.calibrated))  # Of equally good ones the first: no needless change.
+    prediction = assessment.predict(state, preview, features if assessment.uses_features else None)
+    best = int(np.argmax(prediction.calibrated))  # The first of equals: the present plan, if any.
     offering.set_plan(context, plans[best])
-    return PlanChoice(index=best, safety_probability=said.calibrated, threshold=threshold)
+    return PlanChoice(index=best, safety_probability=prediction.calibrated, threshold=threshold)

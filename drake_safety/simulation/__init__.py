@@ -1,1 +1,1 @@
-"""Closed loops and what they are made of, scenarios, rollouts, throws, and episodes on disk."""
+"""Closed loops, scenarios, rollouts, throws, and episodes on disk."""

@@ -1,7 +1,7 @@
-"""What only some tasks can do, a protocol each; users ask by ``isinstance``, or :func:`require`.
+"""Protocols of optional features of a task, queried by ``isinstance`` or :func:`require`.
 
-Throughout, ``context`` is the diagram's root Context, of which a reset overwrites what an earlier
-episode left, ``rng`` the source of every draw, and ``episode`` one of the loop's own.
+Throughout, ``context`` is the diagram's root Context, which a reset overwrites, ``rng`` a random
+generator, and ``episode`` an episode of the loop.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_safety.control.observation import is_rate
+from drake_safety.simulation.planned_loop import PlannedLoop
 
 if TYPE_CHECKING:
     from drake_safety.learning.segments import Episode
@@ -29,8 +30,8 @@ class HasGoals(Protocol):
     """Plans lead to a goal, a point in the world.
 
     Attributes:
-        named_targets: Goals that can be asked for by name, in the world, (3,) [m] each.
-        hand: The robot's reaching frame that goes to the goal; None for another part of it.
+        named_targets: Named goals in the world, (3,) [m] each.
+        hand: The reaching frame that moves to the goal; None for another part of the robot.
     """
 
     named_targets: Mapping[str, list[float]]
@@ -38,65 +39,72 @@ class HasGoals(Protocol):
 
     @property
     def target_box(self) -> np.ndarray:
-        """Lowest and highest corner of the goals that are drawn, in the world, (2, 3) [m]."""
+        """Lowest and highest corner of the sampled goals, in the world, (2, 3) [m]."""
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
     ) -> int:
-        """As the reset of every loop; ``goal`` (3,) [m], in the world, replaces a random one."""
+        """Like :meth:`ClosedLoop.reset`; ``goal`` (3,) [m], in the world, replaces a random one."""
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts at rest in the robot's own posture towards a goal (3,) [m] in the world.
+        """Starts at rest in the standing posture with a plan to a goal (3,) [m] in the world.
 
-        The first instant is without noise; that which follows is always the same by default.
+        The initial state is without noise; later noise is that of fixed seeds by default.
         """
 
     def goal_of(self, episode: Episode) -> np.ndarray:
-        """Where the plan of an episode of this loop led to, in the world, (3,) [m]."""
+        """Goal of an episode's plan, in the world, (3,) [m]."""
 
 
 @runtime_checkable
 class HasFairGoals(Protocol):
-    """Of the goals some are trivial or absurd; without this, none are."""
+    """Some goals are trivially safe or unsafe; without this protocol, none are."""
 
     @property
     def fair_box(self) -> np.ndarray:
-        """The part of the target box whose goals are neither, (2, 3) [m]."""
+        """The part of the target box without trivial goals, (2, 3) [m]."""
 
     def is_fair(self, episode: Episode) -> bool:
-        """Whether an episode of this loop belongs to the set in which verdicts are not trivial."""
+        """Whether the verdict on an episode's goal is not trivial."""
 
 
 @runtime_checkable
 class CanFall(Protocol):
-    """A robot can fall, which ends a motion and violates the constraint ``fall_name``."""
+    """The robot can fall, which ends a motion.
+
+    Attributes:
+        fall_name: The constraint whose violation is a fall.
+        watched_features: Features that a conventional monitor thresholds, by quantity; larger
+            values are safer.
+    """
 
     fall_name: str
+    watched_features: Mapping[str, str]
 
 
 @runtime_checkable
 class HasBall(Protocol):
-    """A ball can be thrown at the robot, and a recovery be triggered."""
+    """A ball can be thrown at the robot, and recovery can be triggered."""
 
     @property
     def trigger_port(self) -> str:
-        """Name of the output port that recovery is triggered by."""
+        """Name of the output port that triggers recovery."""
 
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
-        """Samples a calm motion, during which a ball is thrown."""
+        """Samples an undisturbed motion, during which a ball is thrown."""
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball that touches at a given time [s]."""
+        """Samples a ball with a given time of impact [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
         """Sets a ball in flight towards the robot.
 
-        It touches, were the robot to stay still, ``lead_s`` [s] from now.
+        It hits a robot at rest after ``lead_s`` [s].
 
         Returns:
-            When it touches, simulation time [s].
+            The time of impact, simulation time [s].
 
         Raises:
             ValueError: The loop was built without its ball.
@@ -108,24 +116,24 @@ class CanBePushed(Protocol):
     """Forces can act on the robot's bodies.
 
     Attributes:
-        pushes: Pushes that a run can be disturbed with, by name.
+        pushes: Named pushes for single runs.
     """
 
     pushes: Mapping[str, Push]
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Plans a push on the robot in a run that was reset."""
+        """Sets a push on the robot; call it after a reset."""
 
     def sample_push(self, rng: np.random.Generator) -> Push:
-        """A random push on the robot."""
+        """Samples a push on the robot."""
 
 
 @runtime_checkable
 class OffersPlans(Protocol):
-    """From a state there are several plans to choose from.
+    """There are several plans to choose from in a state.
 
     Attributes:
-        plan_variety: Where a scenario says how plans may differ.
+        plan_variety: Where a scenario specifies how plans may differ, for messages.
     """
 
     plan_variety: str
@@ -133,17 +141,14 @@ class OffersPlans(Protocol):
     def candidate_plans(
         self, context: Context, rng: np.random.Generator, num_plans: int
     ) -> list[Any]:
-        """Plans from the state of a Context that would do.
-
-        They stay inside what the scenario's training covers, or Γ could not judge them.
+        """Samples plans from the state of a Context, within the distribution of training.
 
         Returns:
-            At most ``num_plans`` of what :meth:`set_plan` takes; the first is the plan that the
-            Context has.
+            At most ``num_plans`` arguments for :meth:`set_plan`; the first is the present plan.
         """
 
     def set_plan(self, context: Context, plan: Any) -> None:
-        """Sets one of :meth:`candidate_plans`; the state stays as it is."""
+        """Sets one of :meth:`candidate_plans` and keeps the state."""
 
 
 @runtime_checkable
@@ -159,19 +164,19 @@ class CanStartAnywhere(Protocol):
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Begins with a given plant state and plan; no ``rng``: no noise in this instant.
+        """Sets plant state and plan; without ``rng`` the initial state is without noise.
 
         Raises:
             ValueError: The start does not fit the plant.
         """
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with; see :meth:`reset_to`."""
+        """State and plan of a Context, as a start for :meth:`reset_to`."""
 
 
 @runtime_checkable
 class HasStatePlanes(Protocol):
-    """There are planes of starts on which the true safe set can be simulated."""
+    """The true safe set can be simulated on planes of starts."""
 
     @property
     def state_planes(self) -> Mapping[str, StatePlane]:
@@ -180,84 +185,14 @@ class HasStatePlanes(Protocol):
 
 @runtime_checkable
 class HasMirrorImage(Protocol):
-    """The task can be done on the other side."""
+    """The task has a mirror image."""
 
     @property
     def mirror_options(self) -> dict[str, Any]:
-        """Options of the diagram that is this one in the mirror; empty where there is none."""
+        """Options of the mirrored diagram; empty without a mirror image."""
 
 
-@runtime_checkable
-class HasAngularMargins(Protocol):
-    """Margins of ``angular_constraints`` are angles [rad]; those of all others lengths [m]."""
-
-    angular_constraints: tuple[str, ...]
-
-
-@runtime_checkable
-class HasWatchedFeatures(Protocol):
-    """One would set an alarm on features by hand: by what they measure; larger is safer."""
-
-    watched_features: Mapping[str, str]
-
-
-@runtime_checkable
-class HasRates(Protocol):
-    """Some features are made of velocities."""
-
-    @property
-    def rate_names(self) -> list[str]:
-        """States and features that are."""
-
-
-@runtime_checkable
-class HasMonitorPeriod(Protocol):
-    """Whether the state is safe is looked at with a period of its own.
-
-    Attributes:
-        monitor_period_s: Time between two looks [s].
-    """
-
-    monitor_period_s: float
-
-
-@runtime_checkable
-class CountsFailures(Protocol):
-    """A controller can be without a command of its own."""
-
-    def num_controller_failures(self, context: Context) -> int:
-        """How often that was so since the episode began."""
-
-
-@runtime_checkable
-class HasJudgingOptions(Protocol):
-    """Verdicts are judged with other options of the diagram than training's; of the class."""
-
-    judging_options: Mapping[str, Any]
-
-
-@runtime_checkable
-class HasPairingOptions(Protocol):
-    """A variation and its nominal twin take options to begin alike; of the task's class."""
-
-    def pairing_options(self, scenario: Any, variation: str) -> dict[str, Any]:
-        """Options of the diagrams of both; ``variation`` is the actual one's."""
-
-
-@runtime_checkable
-class CompletesParameters(Protocol):
-    """Defaults of parameters depend on the robot; a method of the task's class."""
-
-    def complete_parameters(self, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
-        """What the scenario file says of the task's parameters, with defaults that it asks for.
-
-        Args:
-            robot: The scenario's robot.
-            stated: What stands in the file.
-        """
-
-
-_WORDS: dict[type, str] = {
+_DESCRIPTIONS: dict[type, str] = {
     HasGoals: "plans with a goal",
     HasBall: "a ball to throw",
     CanFall: "a fall",
@@ -267,76 +202,72 @@ _WORDS: dict[type, str] = {
     HasStatePlanes: "state planes",
     HasMirrorImage: "a mirror image",
 }
-"""What a user can ask a task for."""
+"""Descriptions for messages."""
 
 
 def require(loop: object, capability: type[_Capability], who: str = "") -> _Capability:
-    """The loop itself, for what only some tasks can do.
+    """Returns the loop if it has a capability.
 
     Args:
         loop: A closed loop.
         capability: A protocol of this module.
-        who: Who asks, with what should be done where the task cannot; begins the message.
+        who: Beginning of the message, such as the command that requires it.
 
     Raises:
-        ValueError: The task has no such thing; it is said what it has.
+        ValueError: The task lacks the capability.
     """
     if isinstance(loop, capability):
         return loop
-    has = [word for protocol, word in _WORDS.items() if isinstance(loop, protocol)]
-    lacked = _WORDS[capability].removeprefix("a ")
+    present = [text for protocol, text in _DESCRIPTIONS.items() if isinstance(loop, protocol)]
+    missing = _DESCRIPTIONS[capability].removeprefix("a ")
     raise ValueError(
-        f"{who + ': ' if who else ''}task '{type(loop).__name__}' has no {lacked}; "
-        f"it has {', '.join(has) or 'nothing that only some tasks have'}"
+        f"{who + ': ' if who else ''}task '{type(loop).__name__}' has no {missing}; "
+        f"it has {', '.join(present) or 'no optional features'}"
     )
 
 
 def judging_options(task: type) -> dict[str, Any]:
-    """Options of the diagram that verdicts are judged with, where they are not the training's.
-
-    Args:
-        task: The task's class.
-    """
-    return dict(task.judging_options) if isinstance(task, HasJudgingOptions) else {}
+    """Options of a task's diagram for evaluation, if they differ from those of training."""
+    return dict(task.judging_options) if issubclass(task, PlannedLoop) else {}
 
 
 def pairing_options(scenario: Any, variation: str) -> dict[str, Any]:
-    """Options of the diagram with which a variation and its nominal twin begin alike.
+    """Options with which a variation and its nominal twin can start alike.
 
     Args:
         scenario: The scenario.
-        variation: Which plant is the actual one.
+        variation: The actual plant.
     """
     task = scenario.task_class()
-    if isinstance(task, HasPairingOptions):
-        return task.pairing_options(scenario, variation)
-    return {}
+    return task.pairing_options(scenario, variation) if issubclass(task, PlannedLoop) else {}
 
 
 def angular_constraints(loop: object) -> tuple[str, ...]:
-    """Constraints of a loop whose margins are angles [rad]; those of all others are lengths [m]."""
-    return loop.angular_constraints if isinstance(loop, HasAngularMargins) else ()
+    """Constraints of a loop whose margins are angles [rad]; the others are lengths [m]."""
+    return loop.angular_constraints if isinstance(loop, PlannedLoop) else ()
 
 
 def monitor_period_s(loop: ClosedLoop) -> float:
-    """Time between two looks at whether a loop's state is safe; the control period by default."""
-    if isinstance(loop, HasMonitorPeriod):
+    """Sampling period of a loop's port ``safe`` [s]; the control period by default."""
+    if isinstance(loop, PlannedLoop):
         return loop.monitor_period_s
     return loop.scenario.control_period_s
 
 
 def rate_names(loop: ClosedLoop) -> list[str]:
-    """States and features of a loop that are made of velocities, as far as the task says."""
-    return loop.rate_names if isinstance(loop, HasRates) else [*filter(is_rate, loop.state_names)]
+    """States and features of a loop that depend on velocities."""
+    if isinstance(loop, PlannedLoop):
+        return loop.rate_names
+    return [*filter(is_rate, loop.state_names)]
 
 
 def fair_box(loop: HasGoals) -> np.ndarray:
-    """The part of a loop's target box whose goals are neither trivial nor absurd, (2, 3) [m]."""
+    """The part of a loop's target box without trivial goals, (2, 3) [m]."""
     return loop.fair_box if isinstance(loop, HasFairGoals) else loop.target_box
 
 
 def is_fair(loop: HasGoals, episode: Episode) -> bool:
-    """Whether an episode of a loop belongs to the set in which verdicts are not trivial."""
+    """Whether the verdict on the goal of a loop's episode is not trivial."""
     return loop.is_fair(episode) if isinstance(loop, HasFairGoals) else True
 
 

@@ -1,4 +1,4 @@
-"""ClosedLoop: the contract between a task's diagram and everything that runs or judges it."""
+"""ClosedLoop: the contract of a task's diagram."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
-"""Output ports that an episode records, row by row."""
+"""Output ports recorded in episodes."""
 REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
-"""Output ports that every task exports."""
+"""Output ports of every task."""
 ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
-"""Output ports that a task exports besides when it has an assessment."""
+"""Further output ports of a task with an assessment."""
 
 _SIZED_BY = {
     "state": "state_names",
@@ -35,7 +35,7 @@ _SIZED_BY = {
 
 
 class LoopScenario(Protocol):
-    """What a loop is told by its :class:`~drake_safety.simulation.scenario.Scenario`."""
+    """The part of a :class:`~drake_safety.simulation.scenario.Scenario` that a loop reads."""
 
     name: str
     task: str
@@ -55,25 +55,24 @@ class LoopScenario(Protocol):
         """A plant variation by name."""
 
     def simulation_hash(self, variation: str = "nominal") -> str:
-        """A digest of all that decides what a rollout does and records."""
+        """A digest of all parameters that determine a rollout."""
 
     def code_digest(self) -> str:
-        """A digest of the code that does it."""
+        """A digest of the code that simulates."""
 
 
 class ClosedLoop(FloatSystem, Diagram):
-    """A task's diagram: plant, controller, planner, monitor, and the assessor when there is Γ.
+    """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
-    Whoever runs, records or judges episodes needs only what this class promises: the output ports
-    below, :meth:`reset`, and the names of what the ports carry. What only some tasks can do is a
-    protocol each in :mod:`~drake_safety.simulation.capabilities`: a task has it by having its
-    members. A subclass wires its systems in ``__init__``, sets the names, calls
-    :meth:`add_assessor`, and ends with :meth:`finish`.
+    The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
+    entries. Optional features are protocols in :mod:`~drake_safety.simulation.capabilities`, which
+    a task implements by having their members. A subclass connects its systems in ``__init__``,
+    sets the names, calls :meth:`add_assessor`, and finally :meth:`finish`.
 
     ====================== ======= ============================================================
     output port            size    meaning
     ====================== ======= ============================================================
-    ``state``              n_s     s_k as the assessor sees it, in the stance frame
+    ``state``              n_s     s_k, the assessor's input, in the stance frame
     ``true_state``         n_s     s_k without observation noise
     ``output``             n_z     z_k, measured, in the world [m]
     ``desired_output``     n_z     z*_k, in the world [m]
@@ -83,26 +82,29 @@ class ClosedLoop(FloatSystem, Diagram):
     ``safe``               1       1 while the state is inside the safe set
     ``safety_probability`` 1       Γ, with an assessment (also ``normalized_…``)
     ``belief``             3       (safe, unsafe, unknown), with an assessment
-    ``recovery_active``    1       1 during a recovery step, with recovery
+    ``recovery_active``    1       1 during recovery, with recovery
     ====================== ======= ============================================================
+
+    An optional port ``num_controller_failures`` counts the control periods since the start for
+    which the controller found no command; episodes store its last value.
 
     Args:
         scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Γ, or None.
+        assessment: The assessment, or None.
 
     Attributes:
         scenario: The scenario.
         variation_name, variation: The plant variation.
-        assessment: Γ, or None.
-        state_names, output_names, feature_names, constraint_names: What the ports carry.
+        assessment: The assessment, or None.
+        state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
     Parameters: type
-    """Schema of the task's own part of the scenario file."""
+    """Schema of the task's part of the scenario file."""
 
     online_parameters: tuple[str, ...] = ()
-    """Parameters that no recorded episode depends on; the scenario's hash leaves them out."""
+    """Parameters on which no episode depends; the scenario's hash leaves them out."""
 
     state_names: list[str]
     output_names: list[str]
@@ -118,7 +120,7 @@ class ClosedLoop(FloatSystem, Diagram):
 
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
-        """Files besides the scenario that decide what the plant is; part of its hash."""
+        """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
 
@@ -126,12 +128,12 @@ class ClosedLoop(FloatSystem, Diagram):
         """Samples an initial state and a plan into the root Context.
 
         Args:
-            context: The diagram's Context; what an earlier episode left is overwritten.
-            rng: Source of every draw.
+            context: The diagram's Context; its state is overwritten.
+            rng: Random generator.
 
         Returns:
-            The first step whose future is undisturbed: 0, or later when the episode begins
-            with a push.
+            The first step whose future is undisturbed: 0, or later if the episode begins with a
+            push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
 
@@ -144,44 +146,46 @@ class ClosedLoop(FloatSystem, Diagram):
         desired_preview: OutputPort,
         features: OutputPort,
     ) -> SafetyAssessor | None:
-        """Adds the assessor, if there is Γ, and exports what it says.
+        """Adds an assessor and exports its outputs, if there is an assessment.
 
-        To be called when the names of what the ports carry are set.
+        The names of the ports' entries must have been set.
 
         Args:
-            builder: Of the task's diagram.
-            period_s: Time between two of its looks [s].
-            state: As it sees it.
-            desired_preview: The coming desired outputs.
-            features: As it sees them.
+            builder: The diagram's builder.
+            period_s: Time between two evaluations of Γ [s].
+            state: Port of the state.
+            desired_preview: Port of the desired preview.
+            features: Port of the features.
 
         Returns:
-            The assessor; None without Γ.
+            The assessor; None without an assessment.
 
         Raises:
-            ValueError: The assessment was learned from something else.
+            ValueError: The assessment is that of another diagram.
         """
         if self.assessment is None:
             return None
-        from drake_safety.systems.safety_assessor import SafetyAssessor
+        from drake_safety.systems.safety_assessor import AddSafetyAssessor
 
         self._check_assessment(self.assessment)
-        assessor = builder.AddNamedSystem(
-            "safety_assessor", SafetyAssessor(self.assessment, period_s=period_s)
+        assessor = AddSafetyAssessor(
+            builder,
+            self.assessment,
+            state=state,
+            desired_preview=desired_preview,
+            features=features,
+            period_s=period_s,
         )
-        inputs = {"state": state, "desired_preview": desired_preview, "features": features}
-        for name, port in inputs.items():
-            builder.Connect(port, assessor.GetInputPort(name))
         for i in range(assessor.num_output_ports()):
             port = assessor.get_output_port(i)
             builder.ExportOutput(port, port.get_name())
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks that its ports keep the contract.
+        """Builds the diagram and checks its ports.
 
         Raises:
-            ValueError: A promised port is missing, or has another size than its names promise.
+            ValueError: A required port is missing, or its size is not the number of its names.
         """
         builder.BuildInto(self)
         check_ports(self)
@@ -207,10 +211,10 @@ class ClosedLoop(FloatSystem, Diagram):
 
 
 def check_ports(loop: ClosedLoop) -> None:
-    """Checks that the ports of a loop that was built exist, as large as its names promise.
+    """Checks that the required ports of a loop exist and have the sizes of their names.
 
     Args:
-        loop: The closed loop; names that it has not set promise no size.
+        loop: The closed loop; sizes without names are not checked.
 
     Raises:
         ValueError: A port is missing, or has another size.
@@ -232,7 +236,9 @@ def check_ports(loop: ClosedLoop) -> None:
     if "output" in sizes:
         sizes["desired_preview"] = sizes["output"] * loop.scenario.assessment.horizon
     wrong = [
-        f"'{name}' has {ports[name]} and not {n}" for name, n in sizes.items() if ports[name] != n
+        f"'{name}' has size {ports[name]}, expected {n}"
+        for name, n in sizes.items()
+        if ports[name] != n
     ]
     if wrong:
-        raise ValueError(f"{who} promises other sizes by its names: {'; '.join(wrong)}")
+        raise ValueError(f"{who} has ports whose sizes do not fit their names: {'; '.join(wrong)}")

@@ -1,10 +1,12 @@
-"""The contract of a closed loop, checked: which ports it has promised, how large, and finite."""
+"""Check of a closed loop's contract: its ports, their sizes, and finite values."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop, check_ports
@@ -14,13 +16,13 @@ _NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What was looked at, and what was found.
+    """Result of a check.
 
     Attributes:
-        item: What was looked at.
-        is_ok: Whether it is as it should be.
-        message: What is so.
-        remedy: How to mend it; empty when there is nothing to mend.
+        item: The item checked.
+        is_ok: Whether the check passed.
+        message: Description of the result.
+        remedy: How to correct a failure; "" if the check passed.
     """
 
     item: str
@@ -29,18 +31,28 @@ class Finding:
     remedy: str = ""
 
 
+def passed(item: str, message: str) -> Finding:
+    """A finding of a check that passed."""
+    return Finding(item=item, is_ok=True, message=message)
+
+
+def failed(item: str, message: str, remedy: str) -> Finding:
+    """A finding of a check that failed."""
+    return Finding(item=item, is_ok=False, message=message, remedy=remedy)
+
+
 def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     """Checks that a task's diagram keeps the contract of :class:`ClosedLoop`.
 
-    Its ports exist and have the sizes that its names promise, `reset` draws a start, and what the
-    ports then say is finite, at the start and one assessment step later.
+    Its ports exist and have the sizes of its names, `reset` samples a start, and the ports' values
+    are finite at the start and one assessment step later.
 
     Args:
         diagram: The closed loop.
-        seed: Seed of the start that is drawn.
+        seed: Seed of the start.
 
     Returns:
-        A finding for each part; later parts are left out while an earlier one fails.
+        One finding per check; checks that depend on a failed one are left out.
     """
     findings = [_names(diagram), _ports(diagram)]
     if not all(finding.is_ok for finding in findings):
@@ -48,73 +60,53 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     return [*findings, *_values(diagram, seed)]
 
 
+def _names(diagram: ClosedLoop) -> Finding:
+    missing = [name for name in _NAMES if name not in vars(diagram)]
+    if missing:
+        return failed(
+            "names",
+            f"task '{type(diagram).__name__}' does not set {missing}",
+            "set them in __init__: lists of the names of the ports' entries",
+        )
+    return passed("names", "states, outputs, features and constraints have names")
+
+
 def _ports(diagram: ClosedLoop) -> Finding:
     try:
         check_ports(diagram)
     except ValueError as error:
-        return Finding(
-            item="ports",
-            is_ok=False,
-            message=str(error),
-            remedy="call builder.ExportOutput(port, NAME) for each before finish(builder); one "
-            "name an entry; the preview is H·n_z, row-major in time",
+        return failed(
+            "ports",
+            str(error),
+            "call builder.ExportOutput(port, NAME) for each before finish(builder); one name per "
+            "entry; the preview is H·n_z, row-major in time",
         )
-    return Finding(item="ports", is_ok=True, message="all are there, as large as the names promise")
+    return passed("ports", "complete, with the sizes of their names")
 
 
-def _names(diagram: ClosedLoop) -> Finding:
-    missing = [name for name in _NAMES if name not in vars(diagram)]
-    return Finding(
-        item="names",
-        is_ok=not missing,
-        message=f"task '{type(diagram).__name__}' does not set {missing}"
-        if missing
-        else "states, outputs, features and constraints have names",
-        remedy="set them in __init__: lists of what the ports carry" if missing else "",
-    )
-
-
-def _values(diagram: ClosedLoop, seed: int) -> list[Finding]:
-    from pydrake.systems.analysis import Simulator
-
+def _values(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     try:
         first_step = diagram.reset(context, np.random.default_rng(seed))
     except (RuntimeError, TypeError, ValueError) as error:
-        return [
-            Finding(
-                item="reset",
-                is_ok=False,
-                message=str(error),
-                remedy="reset(context, rng) draws a start and a plan into the Context",
-            )
-        ]
+        remedy = "reset(context, rng) samples a start and a plan into the Context"
+        yield failed("reset", str(error), remedy)
+        return
     is_step = isinstance(first_step, int | np.integer)
-    findings = [
-        Finding(
-            item="reset",
-            is_ok=is_step,
-            message="draws a start" if is_step else f"returns {first_step!r}",
-            remedy="" if is_step else "return the first step whose future is undisturbed, mostly 0",
-        )
-    ]
+    if is_step:
+        yield passed("reset", "samples a start")
+    else:
+        remedy = "return the first step whose future is undisturbed, mostly 0"
+        yield failed("reset", f"returns {first_step!r}", remedy)
     step_s = diagram.scenario.step_s
     try:
         simulator.Initialize()
-        findings.append(_finite(diagram, context, "at the start"))
+        yield _finite(diagram, context, "at the start")
         simulator.AdvanceTo(step_s)
-        findings.append(_finite(diagram, context, f"after {step_s:g} s"))
+        yield _finite(diagram, context, f"after {step_s:g} s")
     except (RuntimeError, TypeError, ValueError) as error:
-        findings.append(
-            Finding(
-                item="simulation",
-                is_ok=False,
-                message=str(error),
-                remedy="the system that is named raises it",
-            )
-        )
-    return findings
+        yield failed("simulation", str(error), "correct the system named")
 
 
 def _finite(diagram: ClosedLoop, context: Context, when: str) -> Finding:
@@ -123,11 +115,7 @@ def _finite(diagram: ClosedLoop, context: Context, when: str) -> Finding:
         for name in REQUIRED_PORTS
         if not np.isfinite(diagram.GetOutputPort(name).Eval(context)).all()
     ]
-    return Finding(
-        item=f"values {when}",
-        is_ok=not wrong,
-        message=f"ports {wrong} are not finite" if wrong else "finite",
-        remedy="look for a division by zero, or a state that the reset did not set"
-        if wrong
-        else "",
-    )
+    if wrong:
+        remedy = "look for a division by zero, or a state that reset does not set"
+        return failed(f"values {when}", f"ports {wrong} are not finite", remedy)
+    return passed(f"values {when}", "finite")

@@ -2,9 +2,9 @@
 
 ``info.json`` holds what all episodes share. Each ``episodes-NNNNN.parquet`` has one row per
 (episode, step); arrays are columns of fixed-size lists of float64 in SI units. A file is written
-under a temporary name, which starts with a dot, and renamed: whatever carries its final name is
-whole, and a run that was stopped loses at most the episodes it had not flushed. Without this
-library the rows are read by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
+under a temporary name, which starts with a dot, and renamed: a file with its final name is
+complete, and an interrupted run loses at most the episodes that were not flushed. pandas reads the
+rows by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
 """
 
 import contextlib
@@ -17,7 +17,6 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -26,15 +25,6 @@ from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-__all__ = [
-    "EpisodeWriter",
-    "completed",
-    "load_episodes",
-    "open_folder",
-    "read_info",
-    "replacing",
-]
 
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
@@ -47,22 +37,22 @@ _LOGGER = logging.getLogger("drake_safety")
 class EpisodeWriter:
     """Appends episodes to a folder, a shard at a time; a context manager.
 
-    Leaving the ``with`` block writes what is pending, after an exception or Ctrl-C too. Opening a
-    folder that holds episodes goes on where it ended: ``completed(path)`` says which are done. One
-    folder has one writer at a time.
+    Leaving the ``with`` block writes the pending episodes, after an exception or Ctrl-C too. A
+    folder that holds episodes is continued: ``completed(path)`` gives their indices. A folder must
+    not have two writers at a time.
 
     Args:
         path: The folder; made if it does not exist.
-        info: What all episodes share.
-        extra: Anything else worth keeping in ``info.json``, as JSON types (the command, the
-            scenario's text, ...). On going on, it replaces entries of the same names.
-        flush_episodes: Number of pending episodes that make a shard.
-        flush_seconds: Age of the oldest pending episode that makes a shard [s]; looked at when an
-            episode is appended.
-        accept_code_change: As :func:`open_folder`.
+        info: Metadata common to all episodes.
+        extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
+            ...). In a folder that is continued, it replaces entries of the same names.
+        flush_episodes: Number of pending episodes that are written as a shard.
+        flush_seconds: Age of the oldest pending episode at which they are written [s]; checked
+            when an episode is appended.
+        accept_code_change: See :func:`open_folder`.
 
     Raises:
-        ValueError: The folder holds episodes of another set, or is not such a folder.
+        ValueError: The folder holds another set of episodes, or something else.
     """
 
     def __init__(
@@ -97,16 +87,14 @@ class EpisodeWriter:
         """Adds one episode; it is on disk after the next flush.
 
         Raises:
-            ValueError: The writer is closed, the episode's index is there already, or the episode
-                does not fit the info.
+            ValueError: The writer is closed, the folder has an episode of this index, or the
+                episode does not fit the info.
         """
         if self._is_closed:
             raise ValueError(f"EpisodeWriter of {self.path} is closed; open it again to append")
         if episode.index in self._indices:
-            raise ValueError(
-                f"episode {episode.index} is already in {self.path}; completed() says which are"
-            )
-        Episodes(self.info, [episode])  # refuses what does not fit the info
+            raise ValueError(f"episode {episode.index} is already in {self.path}; see completed()")
+        Episodes(self.info, [episode])  # Checks the shapes.
         if not self._pending:
             self._pending_since_s = time.monotonic()
         self._pending.append(episode)
@@ -125,8 +113,8 @@ class EpisodeWriter:
         columns = [f"{name}.list.element" for name, width in self.info.widths.items() if width]
         final = self.path / f"episodes-{self._next_shard:05d}.parquet"
         with replacing(final) as temporary:
-            # Byte streams of float64 compress better split by significance; checksums tell a
-            # damaged page from a whole one.
+            # float64 compresses better with its bytes split by significance; checksums detect
+            # damaged pages.
             pq.write_table(
                 table,
                 temporary,
@@ -146,12 +134,7 @@ class EpisodeWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exception_type: type[BaseException] | None,
-        exception: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 
@@ -162,26 +145,25 @@ def open_folder(
     *,
     accept_code_change: bool = False,
 ) -> None:
-    """Makes the folder of a set, or checks that the one that is there is of the same set.
+    """Makes the folder of a set, or checks that an existing folder holds the same set.
 
     Args:
         path: The folder.
-        info: What the set shares.
-        extra: What else ``info.json`` holds, as JSON types. It replaces entries of the same names:
-            a set that goes on is told by the command that it goes on with.
-        accept_code_change: Whether a set that other source code began goes on with this one; the
+        info: Metadata of the set.
+        extra: Further content of ``info.json``, as JSON types; replaces entries of the same names.
+        accept_code_change: Whether a set begun with other source code may be continued; the
             digests of the earlier code are kept in ``info.json``.
 
     Raises:
-        ValueError: The folder holds another set, one that other source code began, or is not such
-            a folder.
+        ValueError: The folder holds another set, a set begun with other source code, or something
+            else.
     """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if (path / _INFO_NAME).exists():
         stored, known = read_info(path)
         _check_same_set(path, stored, info)
-        told = {**known, **(extra or {})}
+        merged = {**known, **(extra or {})}
         if stored.code != info.code:
             if not accept_code_change:
                 raise ValueError(
@@ -190,19 +172,19 @@ def open_folder(
                     "ones; choose another folder, or accept it: accept_code_change=True, on the "
                     "command line --accept-code-change"
                 )
-            told[_EARLIER_CODE] = [*known.get(_EARLIER_CODE, []), stored.code]
+            merged[_EARLIER_CODE] = [*known.get(_EARLIER_CODE, []), stored.code]
             stored = dataclasses.replace(stored, code=info.code)
-        if known != told:
-            _write_info(path, stored, told)
+        if known != merged:
+            _write_info(path, stored, merged)
     else:
         _write_info(path, info, extra or {})
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
-    """Reads what all episodes of a folder share, and the extra that was stored with it.
+    """Reads the metadata of a folder's episodes, and the extra stored with it.
 
     Raises:
-        ValueError: There is no ``info.json``, or it is not one of ours.
+        ValueError: There is no ``info.json``, or it has another schema.
     """
     file = Path(path) / _INFO_NAME
     try:
@@ -220,14 +202,14 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
     try:
         if not isinstance(extra, dict):
             raise TypeError("it has no extra")
-        # Fields that older folders do not have say by their defaults that they are not known.
+        # Fields that older folders lack have defaults that mean "unknown".
         return EpisodesInfo(**fields), extra
     except TypeError as error:
         raise ValueError(f"{file} does not describe episodes: {error}") from error
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
-    """Indices of the episodes on disk; empty where nothing was written yet.
+    """Indices of the episodes on disk; empty if nothing was written yet.
 
     Raises:
         ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
@@ -235,8 +217,8 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
     shards = _shards(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(
-            f"{path} holds {len(shards)} shards but no {_INFO_NAME}: it cannot be told which set "
-            "they belong to"
+            f"{path} holds {len(shards)} shards but no {_INFO_NAME}, so the set that they belong "
+            "to is unknown"
         )
     indices: set[int] = set()
     for shard in shards:
@@ -247,7 +229,7 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
 def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     """Loads all episodes of a folder, sorted by index, bit for bit as they were appended.
 
-    An episode that stands in two shards is taken once where both are the same to the last bit.
+    An episode in two shards is loaded once if both copies are identical.
 
     Raises:
         ValueError: The folder has no ``info.json``, a shard is truncated, damaged or of another
@@ -260,8 +242,8 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
             known, where = episodes.setdefault(episode.index, (episode, shard))
             if known is not episode and not _is_same(known, episode):
                 raise ValueError(
-                    f"episode {episode.index} stands in {where} and in {shard.name}, and the two "
-                    "differ; remove one of the shards"
+                    f"episode {episode.index} of {where} differs from that of {shard.name}; remove "
+                    "one of the shards"
                 )
     return Episodes(info, [episodes[index][0] for index in sorted(episodes)])
 
@@ -271,9 +253,9 @@ def replacing(final: Path) -> Iterator[Path]:
     """A temporary file beside a final one, renamed to it on success and removed on any exception.
 
     Args:
-        final: The file that is to be there, whole, or not at all.
+        final: Path of the complete file.
     """
-    # Readers of whole folders (pyarrow, pandas) skip names that start with a dot.
+    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     try:
         yield temporary
@@ -300,9 +282,9 @@ def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> Non
 
 
 def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> None:
-    """Refuses to mix sets; other package versions are only worth a warning."""
+    """Raises if the sets differ, and warns if only the package versions do."""
     there = dataclasses.asdict(stored)
-    # Through JSON, as the stored one went: a tuple of names equals the list of the same names.
+    # Through JSON, like the stored info, so that tuples of names equal lists.
     here = json.loads(json.dumps(dataclasses.asdict(given)))
     differences = {
         name: f"{name}: there {there[name]!r}, here {here[name]!r}"
@@ -334,7 +316,7 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
         "time_s": np.concatenate([np.asarray(e.time_s, dtype=np.float64) for e in episodes]),
     }
     for name, width in info.widths.items():
-        # Parquet has no lists of length 0: such an array has no column and is restored from info.
+        # Parquet has no lists of length 0: such an array has no column.
         if width:
             rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
             columns[name] = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(rows)), width)
@@ -351,7 +333,7 @@ def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Epis
     widths = info.widths
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
-    # Shards from before failures were counted are as good: nothing is learned from the count.
+    # Older shards have no count of failures; nothing is learned from it.
     if table.column_names not in ([*names, _FAILURES], names):
         raise ValueError(
             f"{shard} has columns {table.column_names}; expected {[*names, _FAILURES]}"
@@ -395,7 +377,7 @@ def _is_same(a: Episode, b: Episode) -> bool:
     for field in dataclasses.fields(Episode):
         left, right = getattr(a, field.name), getattr(b, field.name)
         if isinstance(left, np.ndarray):
-            # As bytes: NaN equals itself, and 0.0 differs from -0.0.
+            # As bytes, NaN equals itself and 0.0 differs from -0.0.
             if left.shape != right.shape or left.tobytes() != right.tobytes():
                 return False
         elif left != right:

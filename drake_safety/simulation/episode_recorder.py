@@ -1,4 +1,4 @@
-"""Episodes of a running diagram: rows read from its ports, and what its failures mean."""
+"""Recording of a diagram's output ports, and of whole episodes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _LOGGER = logging.getLogger("drake_safety")
 
 
 class Recorder:
-    """Reads output ports of a diagram, a row at a time.
+    """Records output ports of a diagram, row by row.
 
     Args:
         diagram: The diagram.
-        names: Ports to read; a mapping gives them other names in what is recorded.
+        names: Ports to record; a mapping from recorded names to those of ports renames them.
     """
 
     def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):
@@ -34,17 +34,17 @@ class Recorder:
         self._times: list[float] = []
 
     def record(self, context: Context, time_s: float | None = None) -> None:
-        """Appends a row, whole or, where a port raises, not at all.
+        """Appends a row, unless a port raises.
 
         Args:
             context: The diagram's Context.
-            time_s: When it is, but for rounding; by default the Context's time [s].
+            time_s: Time of the row without rounding errors [s]; the Context's by default.
         """
         self._rows.append({name: port.Eval(context).copy() for name, port in self._ports.items()})
         self._times.append(context.get_time() if time_s is None else time_s)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What was recorded: ``time_s`` (N,) [s], and (N, size) for each port by its name."""
+        """Returns ``time_s`` (N,) [s], and (N, size) for each port by name."""
         arrays = {
             name: np.array([row[name] for row in self._rows]).reshape(len(self._rows), port.size())
             for name, port in self._ports.items()
@@ -53,17 +53,17 @@ class Recorder:
 
 
 def advance_to(simulator: Simulator, time_s: float) -> None:
-    """Advances a simulation to an instant, before the updates that are due then.
+    """Advances a simulation to a time, before the updates due at that time.
 
-    A discrete plant's state is then that of the instant. Its next step, which begins at the
-    instant, would already take it to the one after: neither ``AdvancePendingEvents`` nor a time
-    that rounding puts behind that of the update reads a row that belongs to its time.
+    The state of a discrete plant is then that of the given time. The update due then already
+    computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
+    upwards) would not belong to its time.
 
     Args:
         simulator: The simulator.
-        time_s: The instant [s]; nothing happens when it is not later than the present.
+        time_s: The time [s]; nothing happens if it is not later than the present.
     """
-    # Both the instant and Drake's time of an update are a product, rounded at its last bit or two.
+    # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
     if before_s > simulator.get_context().get_time():
         simulator.AdvanceTo(before_s)
@@ -71,27 +71,27 @@ def advance_to(simulator: Simulator, time_s: float) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeTiming:
-    """When an episode's rows are read.
+    """Sampling times of an episode.
 
     Attributes:
         step_s: Time between two rows [s].
-        num_steps: T, steps of an episode that is not cut short.
-        monitor_period_s: Time between two looks at the safe set, counted from each row [s].
+        num_steps: T, steps of a safe episode.
+        monitor_period_s: Sampling period of the safe set, counted from each row [s].
     """
 
     step_s: float
     num_steps: int
     monitor_period_s: float
 
-    def looks(self, step: int) -> list[float]:
-        """Instants of the looks during a step, its end included [s].
+    def monitor_times(self, step: int) -> list[float]:
+        """Times at which the safe set is sampled during a step, its end included [s].
 
         Args:
             step: 1 for the step that leads to row 1.
         """
         count = max(math.ceil(self.step_s / self.monitor_period_s - 1e-6), 1)
         begin_s = (step - 1) * self.step_s
-        within = [begin_s + look * self.monitor_period_s for look in range(1, count)]
+        within = [begin_s + i * self.monitor_period_s for i in range(1, count)]
         return [*within, step * self.step_s]
 
 
@@ -105,25 +105,25 @@ def record_episode(
     index: int = 0,
     first_step: int = 0,
 ) -> Episode:
-    """Simulates an episode: until it leaves the safe set, or its time is over.
+    """Simulates an episode, which ends when it leaves the safe set or its time is over.
 
     Args:
-        simulator: Of the diagram, whose Context is set to the start.
-        ports: The diagram's port for each of the names in ``RECORDED``, and for ``safe``. Without
-            ``safe`` it is that no margin is negative; without ``true_state`` it is ``state``,
-            without ``desired_output`` the preview's first sample, without ``features`` none.
-        timing: When rows are read.
+        simulator: Simulator of the diagram, with its Context set to the start.
+        ports: The diagram's port for each of the names in ``RECORDED``, and for ``safe``. ``safe``
+            defaults to no margin being negative, ``true_state`` to ``state``, ``desired_output``
+            to the preview's first sample, and ``features`` to none.
+        timing: Sampling times.
         constraint_names: The n_c constraints.
         who: The episode, for messages.
         index: Number of the episode in its set.
         first_step: First row whose future is undisturbed.
 
     Returns:
-        The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
-        that were finite.
+        The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
+        are finite.
 
     Raises:
-        EpisodeError: A system raised an error that is not the simulation's failure.
+        EpisodeError: A system raised an error other than a failure of the simulation.
     """
     context = simulator.get_mutable_context()
     diagram = simulator.get_system()
@@ -143,7 +143,7 @@ def record_episode(
         for step in range(1, timing.num_steps + 1):
             if has_left:
                 break
-            for time_s in timing.looks(step):
+            for time_s in timing.monitor_times(step):
                 advance_to(simulator, time_s)
                 if has_left := not is_safe():
                     break
@@ -181,19 +181,19 @@ _NUMERICAL_FAILURE = re.compile(
     r"solver failed to converge|Detected NaN|is NaN\b|non-finite value|step smaller than minimum"
     r"|Failure at .*(solver|multibody|integrator)"
 )
-"""How Drake says that its contact solver, SceneGraph or integrator was given no sound numbers.
+"""Messages of numerical failures of Drake's contact solver, SceneGraph and integrators.
 
-It throws ``std::exception`` for these as for anything else, and its failed assertions, such as
-TAMSI's on a huge force, end the interpreter by SystemExit."""
+Drake raises them as RuntimeError, like any other error, and failed assertions, such as TAMSI's on a
+huge force, as SystemExit."""
 
 
 def _is_divergence(error: BaseException, context: Context, is_finite_at_start: np.ndarray) -> bool:
-    """Whether an error is the simulation's own failure, and not a mistake in somebody's code."""
+    """Whether an error is a numerical failure of the simulation, not a programming error."""
     if isinstance(error, DivergenceError):
         return True
     if type(error) in (RuntimeError, SystemExit) and _NUMERICAL_FAILURE.search(str(error)):
         return True
-    # Whatever was computed from a state that had run away.
+    # Any error that follows a state that became non-finite.
     state = _state(context)
     return bool((is_finite_at_start & ~np.isfinite(state)).any())
 

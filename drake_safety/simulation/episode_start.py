@@ -1,4 +1,4 @@
-"""Where and how an episode begins: as another one did, or somewhere on a plane of starts."""
+"""Starts of episodes: a plant state and a plan, and planes of them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from drake_safety.control.kinematics import RobotKinematics, fit_stance
 
 @dataclass(kw_only=True, eq=False)
 class EpisodeStart:
-    """A plant state and a plan: what the nominal twin of an actual episode begins with.
+    """A plant state and a plan, from which an episode or its nominal twin starts.
 
-    What is said of a robot's state is of a robot; a task with a plant of its own has its own.
+    The orders of ``q`` and ``v`` are those of a robot; a task with another plant has its own.
 
     Attributes:
         q: Positions in Drake's order: base quaternion (w, x, y, z), base position, joints, (n_q,).
         v: Velocities: of the base in the world, angular first, then of the joints, (n_v,).
         plan: Desired output over time since the start, in the stance frame, (n_z, 1) [m].
-        foot_positions: Where the controller believes the feet to stand: centres of the contact
-            spheres, (n_c, 3) [m]. None for where ``q`` has them, on the ground.
+        foot_positions: Positions of the feet as the controller assumes them: centres of the contact
+            spheres, (n_c, 3) [m]. By default those of ``q``, put on the ground.
     """
 
     q: np.ndarray
@@ -31,7 +31,7 @@ class EpisodeStart:
     foot_positions: np.ndarray | None = None
 
     def feet(self, kinematics: RobotKinematics) -> np.ndarray:
-        """Where the feet stand, (n_c, 3) [m].
+        """Foot positions, (n_c, 3) [m].
 
         Args:
             kinematics: The robot.
@@ -43,7 +43,7 @@ class EpisodeStart:
         return p_WC
 
     def stance_pose(self, kinematics: RobotKinematics) -> np.ndarray:
-        """The frame of the plan, [x, y, yaw] in the world (3,) [m, rad].
+        """Pose of the plan's frame, [x, y, yaw] in the world (3,) [m, rad].
 
         Args:
             kinematics: The robot.
@@ -51,10 +51,10 @@ class EpisodeStart:
         return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
 
     def check(self, who: str, num_positions: int, num_velocities: int) -> None:
-        """Refuses what no plant can begin with.
+        """Checks the sizes of the state.
 
         Args:
-            who: Whose start it is, for messages.
+            who: Owner of the start, for messages.
             num_positions: n_q.
             num_velocities: n_v.
 
@@ -67,14 +67,14 @@ class EpisodeStart:
                 raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
 
     def check_robot(self, kinematics: RobotKinematics) -> None:
-        """Refuses what no robot can begin with.
+        """Checks that the start fits a robot.
 
         Args:
             kinematics: The robot.
 
         Raises:
-            ValueError: A part has another size than the robot, is not finite, or the quaternion
-                is none.
+            ValueError: A part has another size than the robot or is not finite, or the quaternion
+                has not unit norm.
         """
         who = f"start of robot '{kinematics.robot.name}'"
         self.check(who, kinematics.num_positions, kinematics.num_velocities)
@@ -92,13 +92,13 @@ class EpisodeStart:
 
 @dataclass(frozen=True, kw_only=True)
 class StatePlane:
-    """Two state variables, all else fixed, on whose plane the truth can be simulated.
+    """A plane of starts that differ in two state variables.
 
     Attributes:
-        axes: What the two variables are, with their units.
-        lowest: Of both.
-        highest: Of both.
-        start: From a point (2,) of the plane to a start.
+        axes: Names of the two variables, with units.
+        lowest: Lower bounds.
+        highest: Upper bounds.
+        start: Maps a point (2,) of the plane to a start.
     """
 
     axes: tuple[str, str]

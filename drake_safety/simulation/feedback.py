@@ -1,4 +1,4 @@
-"""Feedback by simulation: actual episodes, and nominal twins from the same state and plan."""
+"""Feedback by simulation: actual episodes and their nominal twins."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import (
     Progress,
-    batches,
     episodes_info,
-    parallel_map,
+    run_batches,
     run_episode,
     run_episodes,
     worker_loop,
@@ -38,7 +37,7 @@ class EpisodePairs:
 
     Attributes:
         actual: Episodes of the actual plant.
-        nominal: Episodes of the nominal plant from the same states along the same plans.
+        nominal: Episodes of the nominal plant with the same initial states and plans.
         nominal_hash: Scenario hash of the nominal plant.
     """
 
@@ -47,14 +46,14 @@ class EpisodePairs:
     nominal_hash: str
 
     def feedback(self) -> list[FeedbackSet]:
-        """One feedback set a pair, in the order of the episodes; diverged ones are left out."""
+        """One feedback set per pair, in the order of the episodes, without diverged ones."""
         return feedback_sets(self.actual, self.nominal, nominal_hash=self.nominal_hash)
 
     @property
     def gap(self) -> tuple[int, int]:
-        """How many pairs end differently, and how many there are."""
+        """Number of pairs that end differently, and number of pairs."""
         sets = self.feedback()
-        return sum(one.differs for one in sets), len(sets)
+        return sum(feedback_set.differs for feedback_set in sets), len(sets)
 
 
 def run_pairs(
@@ -71,19 +70,20 @@ def run_pairs(
 ) -> EpisodePairs:
     """Simulates actual episodes and their nominal twins, in worker processes.
 
-    Both of a pair draw from the same generator, so that they begin alike.
+    Both episodes of a pair draw from the same generator, so their initial states are the same.
 
     Args:
         scenario: The scenario.
-        num_pairs: How many.
-        variation: Which plant is the actual one.
+        num_pairs: Number of pairs.
+        variation: The actual plant.
         seed: Seed of the set.
-        num_workers: Processes; as many as there are cores by default.
-        path: Folder where episodes are kept as they finish, a folder in it for either plant;
-            those that it already holds are not simulated again.
-        progress: Called with the number of episodes done and the number wanted, two a pair.
-        extra: Stored beside the episodes' info.
-        **loop_options: For the task, over those with which the variation and its twin begin alike.
+        num_workers: Number of processes; that of cores by default.
+        path: Folder for the episodes, with a folder for either plant; episodes that it already
+            holds are not simulated again.
+        progress: Called with the number of episodes done and in all, two per pair.
+        extra: Stored with the episodes' info.
+        **loop_options: Options of the task; they replace those of
+            :func:`~drake_safety.simulation.capabilities.pairing_options`.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
@@ -116,12 +116,12 @@ def run_pairs(
 def make_recorder(
     loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
 ) -> FeedbackRecorder:
-    """The recorder that fits a loop.
+    """Makes the recorder for a loop.
 
     Args:
         loop: The loop of the actual robot.
         num_steps: Assessment steps of a window; those of an episode by default.
-        capacity: Finished windows that are kept until they are taken.
+        capacity: Largest number of finished windows kept.
     """
     return FeedbackRecorder(
         episodes_info(loop, seed=NOT_DRAWN),
@@ -133,10 +133,10 @@ def make_recorder(
 
 
 def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
-    """What the nominal twin of a recorded window begins with.
+    """Initial state and plan of the nominal twin of a recorded window.
 
-    Its plan goes through the desired outputs that the actual robot was given, and holds still after
-    what was seen of them.
+    The plan interpolates the desired outputs of the window and of its last preview, and is constant
+    after that.
 
     Args:
         loop: The nominal loop.
@@ -144,7 +144,7 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     """
     preview = window.episode.desired_preview
     num_outputs = len(loop.output_names)
-    # The first sample of every preview is of its own row; the last preview looks further ahead.
+    # The first sample of a preview is that of its own row; the last preview reaches beyond.
     plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
     times = loop.scenario.step_s * np.arange(len(plan))
     q, v = np.split(window.plant_state, [require(loop, CanStartAnywhere).plant_state_sizes[0]])
@@ -163,31 +163,22 @@ def run_twins(
 
     Args:
         scenario: The scenario.
-        windows: What a `FeedbackRecorder` gave.
-        seed: Of the noise.
-        num_workers: Processes; as many as there are cores by default.
-        progress: Called with the number done and the number wanted.
+        windows: Windows of a `FeedbackRecorder`.
+        seed: Seed of the noise.
+        num_workers: Number of processes; that of cores by default.
+        progress: Called with the number done and in all.
 
     Raises:
         ValueError: The task cannot begin with a given start.
     """
     info = episodes_info(scenario.make_loop(), seed)
-    twins: list[Episode] = []
-    results = parallel_map(
+    twins = run_batches(
         _twin_batch,
-        [
-            (scenario, seed, [windows[i] for i in batch])
-            for batch in batches(list(range(len(windows))))
-        ],
-        num_workers,
+        list(range(len(windows))),
+        lambda batch: (scenario, seed, [windows[i] for i in batch]),
+        num_workers=num_workers,
+        progress=progress,
     )
-    try:
-        for batch in results:
-            twins += batch
-            if progress is not None:
-                progress(len(twins), len(windows))
-    finally:
-        results.close()
     return Episodes(info, sorted(twins, key=lambda episode: episode.index))
 
 
@@ -198,13 +189,13 @@ def pair_starts(
     *,
     seed: int = ADAPTATION.first,
 ) -> EpisodePairs:
-    """Simulates, in this process, the nominal twins of episodes whose starts are known.
+    """Simulates the nominal twins of episodes with known starts, in this process.
 
     Args:
         scenario: The scenario.
         actual: Episodes of an actual robot, such as those of a log.
-        starts: What each begins with.
-        seed: Of the noise.
+        starts: Start of each episode.
+        seed: Seed of the noise.
 
     Raises:
         ValueError: The task cannot begin with a given start.
@@ -237,14 +228,14 @@ def feedback_of_windows(
     run: Callable[..., Episodes] = run_twins,
     **options: Any,
 ) -> list[FeedbackSet]:
-    """Feedback of what a running robot has recorded: the twins are simulated here.
+    """Feedback sets of recorded windows, whose nominal twins are simulated.
 
     Args:
         scenario: The scenario.
-        recorder: Who recorded it.
-        windows: What it gave.
-        run: Simulates the twins.
-        **options: For `run`.
+        recorder: The recorder of the windows.
+        windows: The windows.
+        run: Function that simulates the twins.
+        **options: Options of `run`.
     """
     actual = Episodes(recorder.info, [window.episode for window in windows])
     return feedback_sets(actual, run(scenario, windows, **options))

@@ -1,4 +1,4 @@
-"""Motions to a goal: one plan carried out from the standing posture and watched to its end."""
+"""Motions from the standing posture to a goal, and logs of them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _PORTS = ("output", "margins", "plant_state")
 
 @dataclass(kw_only=True, eq=False)
 class Mishap:
-    """What every log of one motion tells of its end.
+    """Outcome of a motion.
 
     Attributes:
-        leave_time_s: When the robot left its safe set [s]; infinite if it did not.
-        fall_time_s: When it fell [s]; infinite if it did not.
+        leave_time_s: Time at which the robot left its safe set [s]; infinite if it did not.
+        fall_time_s: Time of the fall [s]; infinite without one.
     """
 
     leave_time_s: float
@@ -42,17 +42,17 @@ class Mishap:
 
 @dataclass(kw_only=True, eq=False)
 class GoalMotion(Mishap):
-    """One motion: rows every ``log_period_s``, and what came of it.
+    """Log of one motion, with a row every ``log_period_s``.
 
     Attributes:
         goal: In the world, (3,) [m].
-        push: What disturbed it, if anything did.
+        push: The push, if there was one.
         time_s: [s], (N,).
-        output: What shall reach the goal, measured, in the world, (N, 3) [m].
+        output: Measured output, in the world, (N, 3) [m].
         margins: (N, n_c), of the true state.
         plant_state: (N, n_q + n_v) of the robot alone.
-        cause: The constraint that was violated when it left; "" if it did not.
-        extra: Other ports that were asked for, (N, size) each.
+        cause: The first violated constraint; "" if there is none.
+        extra: Other ports, (N, size) each.
     """
 
     goal: np.ndarray
@@ -66,7 +66,7 @@ class GoalMotion(Mishap):
 
     @property
     def miss_m(self) -> float:
-        """Distance from the goal in the end [m]."""
+        """Distance from the goal at the end [m]."""
         return float(np.linalg.norm(self.output[-1] - self.goal))
 
 
@@ -82,18 +82,18 @@ def run_to_goal(
     realtime_rate: float = 0.0,
     until_unsafe: bool = False,
 ) -> GoalMotion:
-    """Carries out the plan from the standing posture to a goal, safe or not.
+    """Simulates the motion from the standing posture to a goal, safe or not.
 
     Args:
         loop: A closed loop whose plans have a goal.
         goal: In the world, (3,) [m].
         push: A push on the robot.
-        duration_s: When to end; a fall ends it sooner.
+        duration_s: End time [s]; a fall ends the motion sooner.
         seed: Seed of the noise.
         log_period_s: Time between two rows [s].
         ports: More output ports to log, into ``extra``.
-        realtime_rate: How fast to run at most, for watching; 0 for as fast as it goes.
-        until_unsafe: Whether it ends where it leaves the safe set, not only at a fall.
+        realtime_rate: Target real-time rate; 0 for as fast as possible.
+        until_unsafe: Whether the motion ends when it leaves the safe set, not only at a fall.
 
     Raises:
         ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.

@@ -1,4 +1,4 @@
-"""LeggedLoop: what the tasks of legged robots share, and where their pictures are taken from."""
+"""LeggedLoop: base of the tasks of legged robots."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,6 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.observation import is_rate
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.physics import Physics, Scene, add_physics
@@ -20,8 +19,9 @@ from drake_safety.robots.robot import ObservationNoise
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
-from drake_safety.simulation.planned_loop import PlannedLoop, WatchedSet
+from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 
 @dataclass(kw_only=True)
@@ -29,11 +29,11 @@ class View:
     """A camera that follows a robot's base over the ground."""
 
     azimuth_rad: float = math.radians(-42.0)
-    """Where it stands, as an angle from the world's x axis [rad]."""
+    """Direction of the camera from the robot, from the world's x axis [rad]."""
     elevation_rad: float = math.radians(15.0)
-    """How far above the robot it stands [rad]."""
+    """Elevation of the camera above the robot [rad]."""
     room: float = 0.95
-    """How much more than the robot's own extent fits into a picture."""
+    """Free space in a picture, by the robot's extent."""
 
     def __post_init__(self) -> None:
         if not abs(self.elevation_rad) < 0.5 * math.pi:
@@ -44,11 +44,11 @@ class View:
             raise ValueError(f"view: room must be positive; got {self.room}")
 
     def mirrored(self) -> "View":
-        """The view from the other side of the x-z plane."""
+        """The view mirrored at the x-z plane."""
         return View(azimuth_rad=-self.azimuth_rad, elevation_rad=self.elevation_rad, room=self.room)
 
 
-class LeggedSafeSet(WatchedSet, Protocol):
+class LeggedSafeSet(FeaturedSafeSet, Protocol):
     """A safe set of a robot that can fall."""
 
     fall_name: str
@@ -59,26 +59,26 @@ class LeggedSafeSet(WatchedSet, Protocol):
 class LeggedLoop(PlannedLoop):
     """A legged robot that follows a plan and is observed with noise.
 
-    A subclass wires in this order: :meth:`_add_robot`, :meth:`_add_observers`,
-    :meth:`_add_planner`, its controller, :meth:`_watch`, :meth:`_export_robot`, :meth:`finish`. It
-    extends :meth:`_set_state` by what its controller begins with, and says in :meth:`_output_of`
-    what its plans are for.
+    A subclass calls in this order: :meth:`_add_robot`, :meth:`_add_observers`,
+    :meth:`_add_planner`, adds its controller, :meth:`_watch`, :meth:`_export_robot`,
+    :meth:`finish`. It extends :meth:`_set_state` by the controller's initial state, and implements
+    :meth:`_output_of`, the output that its plans specify.
 
     Args:
         scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Γ, or None.
+        assessment: The assessment, or None.
 
     Attributes:
         robot: The robot.
-        kinematics: The nominal robot's.
-        plant: A MultibodyPlant with the robot in it, to be read, whatever engine simulates it.
+        kinematics: Kinematics of the nominal robot.
+        plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
         robot_instance: The robot in the plant.
-        scene_graph: What its geometry is in.
+        scene_graph: The SceneGraph of its geometry.
         fall_name: The constraint whose violation is a fall.
-        watched_features: Features that one would set an alarm on by hand, by what they measure;
-            larger is safer.
-        view: Where pictures are taken from.
+        watched_features: Features that a conventional monitor thresholds, by quantity; larger
+            values are safer.
+        view: The camera's pose.
     """
 
     view: View = View()
@@ -95,11 +95,11 @@ class LeggedLoop(PlannedLoop):
 
     @property
     def rate_names(self) -> list[str]:
-        """States that are velocities, and the features that velocities enter."""
-        return [*filter(is_rate, self.state_names), *self._rate_features]
+        """States and features that depend on velocities."""
+        return [*super().rate_names, *self._rate_features]
 
     def _add_robot(self, builder: DiagramBuilder, scene: Scene, *, servos: bool) -> Physics:
-        """Adds the robot in its scene; its joints have position servos, or take torques."""
+        """Adds the robot and its scene; its joints have position servos or torque inputs."""
         physics = self._physics = add_physics(
             builder,
             self.robot,
@@ -113,9 +113,9 @@ class LeggedLoop(PlannedLoop):
         return physics
 
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
-        """Adds what the controller, the assessor and a witness without noise see.
+        """Adds observers of the controller, the assessor and the true state.
 
-        Takes options of every `StateObserver`; returns the state that the controller measures.
+        Takes options of `StateObserver`; returns the controller's measured state.
         """
         noise = self.variation.observation_noise
         self._observers = Observers(
@@ -163,7 +163,7 @@ class LeggedLoop(PlannedLoop):
         desired_preview: OutputPort | None = None,
         meshcat: Meshcat | None,
     ) -> SafetyAssessor | None:
-        """Adds assessor and visualiser, if there are any, and exports; see :meth:`_export`."""
+        """Adds the optional assessor and visualiser, and exports ports; see :meth:`_export`."""
         assessor = self._export(
             builder,
             assessment_period_s=assessment_period_s,
@@ -182,7 +182,7 @@ class LeggedLoop(PlannedLoop):
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Begins with a given state of the robot and plan; see :meth:`PlannedLoop.reset_to`."""
+        """Sets the robot's state and plan; see `CanStartAnywhere`."""
         start.check_robot(self.kinematics)
         self._enter(context, start)
         self._observers.reseed(context, rng)
@@ -190,16 +190,16 @@ class LeggedLoop(PlannedLoop):
             self._observers.silence(context)
 
     def standing_start(self) -> EpisodeStart:
-        """At rest in the robot's posture, which the plan keeps."""
+        """A start at rest in the standing posture, with a constant plan."""
         q = self.kinematics.standing_positions()
         output = self._output_of(q).copy()
-        # The plan is told from the feet.
+        # The plan is in the stance frame.
         output[:2] += self.kinematics.nominal_base_offset
         v = np.zeros(self.kinematics.num_velocities)
         return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial(output[:, None]))
 
     def _output_of(self, q: np.ndarray) -> np.ndarray:
-        """What plans are for, of the robot at positions (n_q,), in the world, (n_z,) [m]."""
+        """The planned output at positions (n_q,), in the world, (n_z,) [m]."""
         raise NotImplementedError
 
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Watched motions on disk: a file a pair, undisturbed and pushed, written as they finish.
+"""Pairs of motions on disk, undisturbed and pushed.
 
-A folder has an ``info.json`` that says which set it is, as that of episodes does, and a
-``motions-NNNNN.npz`` for each pair: arrays by ``undisturbed.NAME`` and ``pushed.NAME``, in SI
-units, without pickles. A file that carries its final name is whole.
+A folder has an ``info.json`` with the metadata of the set, as that of episodes does, and a
+``motions-NNNNN.npz`` for each pair: arrays ``undisturbed.NAME`` and ``pushed.NAME``, in SI units,
+without pickles. A file with its final name is complete.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _FIELDS = tuple(field.name for field in fields(WatchedMotion))
 
 
 class MotionFolder:
-    """Keeps pairs of motions of one set.
+    """A folder of pairs of motions of one set.
 
     Args:
         path: The folder; made if it does not exist.
-        info: What the set shares.
+        info: Metadata of the set.
 
     Raises:
         ValueError: The folder holds another set.
@@ -44,15 +44,15 @@ class MotionFolder:
         open_folder(self.path, info)
 
     def completed(self) -> set[int]:
-        """Indices of the pairs that are there."""
+        """Indices of the pairs in the folder."""
         names = (_NAME.fullmatch(file.name) for file in self.path.iterdir())
         return {int(match[1]) for match in names if match}
 
     def save(self, pair: Pair) -> None:
-        """Writes a pair, all of it or nothing.
+        """Writes a pair atomically.
 
         Raises:
-            ValueError: The two are not of one index.
+            ValueError: The motions have different indices.
         """
         indices = [motion.index for motion in pair]
         if indices[0] != indices[1]:
@@ -69,7 +69,7 @@ class MotionFolder:
         """Reads a pair, bit for bit as it was saved.
 
         Raises:
-            ValueError: It is not there, truncated or damaged.
+            ValueError: The file is missing, truncated or damaged.
         """
         file = self._file(index)
         try:
@@ -77,8 +77,8 @@ class MotionFolder:
                 undisturbed, pushed = (_motion(arrays, kind) for kind in _KINDS)
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise ValueError(
-                f"{file} holds no pair of motions, or is damaged ({error!r}); remove it and go on: "
-                "they will be run again"
+                f"{file} holds no pair of motions, or is damaged ({error!r}); remove it and "
+                "resume: the motions will be simulated again"
             ) from error
         return undisturbed, pushed
 
@@ -88,7 +88,7 @@ class MotionFolder:
 
 def _motion(arrays: np.lib.npyio.NpzFile, kind: str) -> WatchedMotion:
     values: dict[str, Any] = {name: arrays[f"{kind}.{name}"] for name in _FIELDS}
-    # What is no array is a number: an array of no dimension gives it back.
+    # Numbers were stored as arrays without dimensions.
     return WatchedMotion(
         **{name: value if value.ndim else value.item() for name, value in values.items()}
     )

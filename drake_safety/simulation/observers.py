@@ -1,4 +1,4 @@
-"""Observers of one robot in a diagram: as many as there are strengths of noise."""
+"""Observers of one robot in a diagram, one for each noise level."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from drake_safety.systems.state_observer import StateObserver
 
 
 class Observers:
-    """Adds observers to a diagram, each with a source of its noise.
+    """Adds observers to a diagram, each with its own noise source.
 
     Args:
         builder: The diagram's builder.
         kinematics: The robot.
         plant_state: Port of its true state.
-        period_s: Time between two draws of noise [s].
-        **options: Of every `StateObserver`.
+        period_s: Sampling period of the noise [s].
+        **options: Options of every `StateObserver`.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class Observers:
         self._sources: list[RandomSource] = []
 
     def add(self, name: str, noise: ObservationNoise) -> StateObserver:
-        """The observer of a strength of noise: a new one, or the one that is there already.
+        """Returns the observer of a noise level, and adds it if there is none yet.
 
         Args:
-            name: Name of the system, if it is new.
+            name: Name of the system if it is added.
             noise: Standard deviations.
         """
         key = (noise.position, noise.velocity)
@@ -68,11 +68,11 @@ class Observers:
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
-        """Gives every source a seed of its own, and so new noise.
+        """Reseeds every noise source.
 
         Args:
             context: The root Context.
-            rng: Source of the seeds; None for noise that is always the same.
+            rng: Source of the seeds; None for fixed seeds.
         """
         rng = np.random.default_rng(0) if rng is None else rng
         for source in self._sources:
@@ -82,7 +82,7 @@ class Observers:
             )
 
     def silence(self, context: Context) -> None:
-        """Takes the noise out of this instant, up to the next draw.
+        """Sets the noise to zero until the next sample.
 
         Args:
             context: The root Context.
@@ -93,7 +93,7 @@ class Observers:
 
 
 def combined(one: ObservationNoise, other: ObservationNoise) -> ObservationNoise:
-    """The noise of two independent sources together."""
+    """Noise level of the sum of two independent sources."""
     return ObservationNoise(
         position=math.hypot(one.position, other.position),
         velocity=math.hypot(one.velocity, other.velocity),

@@ -1,54 +1,82 @@
-"""PlannedLoop: what tasks share whose robot follows a plan of points and stays in a safe set."""
+"""PlannedLoop: base of tasks that follow a plan of points within a safe set."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Protocol
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.control.observation import is_rate
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop, LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.systems.plan_features import FeatureMap, PlanFeatures
-from drake_safety.systems.safety_monitor import SafeSet, SafetyMonitor
+from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 
 if TYPE_CHECKING:
+    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.systems.safety_assessor import SafetyAssessor
-
-
-class WatchedSet(SafeSet, FeatureMap, Protocol):
-    """A safe set with features."""
 
 
 class PlannedLoop(ClosedLoop):
     """A closed loop with a planner, a monitor and features of its plan.
 
-    A subclass wires in this order: :meth:`_add_planner`, its controller, :meth:`_add_safe_set`,
-    the names of state and output, :meth:`_export`, :meth:`finish`. It says in :meth:`_set_state`
-    how a start becomes the plant's state. Its episodes can then begin with a given start.
+    A subclass calls in this order: :meth:`_add_planner`, adds its controller,
+    :meth:`_add_safe_set`, sets the names of state and output, :meth:`_export`, :meth:`finish`. It
+    implements :meth:`_set_state`, which sets the plant's state. Episodes can then begin with a
+    given start.
 
     Attributes:
+        angular_constraints: Constraints whose margins are angles [rad]; the others are lengths [m].
+        judging_options: Options of the diagram for evaluation, if they differ from training's.
+        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         plant_state_sizes: n_q and n_v.
     """
 
+    angular_constraints: tuple[str, ...] = ()
+    judging_options: Mapping[str, Any] = MappingProxyType({})
+
+    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+        super().__init__(scenario, variation, assessment)
+        self.monitor_period_s = scenario.control_period_s
+
+    @classmethod
+    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+        """Options with which an actual variation and its nominal twin can start alike."""
+        del scenario, variation
+        return {}
+
+    @classmethod
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
+        del robot
+        return stated
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that depend on velocities."""
+        return [*filter(is_rate, self.state_names)]
+
     def _check_variation(self, *varied: str) -> None:
-        """Refuses a variation that changes more of a plant of the task's own than ``varied``."""
+        """Checks that a variation of a task's own plant changes only the entries ``varied``."""
         for entry in fields(PlantVariation):
             is_plain = getattr(self.variation, entry.name) == getattr(PlantVariation(), entry.name)
             if not is_plain and entry.name not in varied:
                 raise ValueError(
                     f"{type(self).__name__.lower()}: variation '{self.variation_name}' sets "
-                    f"{entry.name}, which this plant has not; it has {list(varied)}"
+                    f"{entry.name}; entries of this plant are {list(varied)}"
                 )
 
     def _add_planner(
         self, builder: DiagramBuilder, *, outlook_s: float, num_outlook: int
     ) -> TrajectoryPlanner:
-        """Adds the planner; features look ``outlook_s`` [s] ahead, at ``num_outlook`` instants."""
+        """Adds the planner; its outlook has ``num_outlook`` samples over ``outlook_s`` [s]."""
         scenario = self.scenario
         self._num_outlook = num_outlook
         self._planner: TrajectoryPlanner = builder.AddNamedSystem(
@@ -73,22 +101,22 @@ class PlannedLoop(ClosedLoop):
     def _add_safe_set(
         self,
         builder: DiagramBuilder,
-        safe_set: WatchedSet,
+        safe_set: FeaturedSafeSet,
         sizes: tuple[int, int],
         *,
         plant_state: OutputPort,
         seen_state: OutputPort | None = None,
         outlook: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features, and sets the names of what they say.
+        """Adds monitor and features, and sets the names of their outputs.
 
         Args:
-            builder: Of the task's diagram.
+            builder: The diagram's builder.
             safe_set: The safe set.
             sizes: n_q and n_v.
-            plant_state: The true state, which the monitor looks at, ``[q; v]``.
-            seen_state: What the features see of it, as the assessor does; all by default.
-            outlook: The plan that the features look at; the planner's by default.
+            plant_state: Port of the true state ``[q; v]``, for the monitor.
+            seen_state: Port of the measured state, for the features; ``plant_state`` by default.
+            outlook: Port of the outlook, for the features; the planner's by default.
         """
         self.plant_state_sizes = sizes
         self._plant_state = plant_state
@@ -98,7 +126,7 @@ class PlannedLoop(ClosedLoop):
             "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
         )
         builder.Connect(seen_state or plant_state, self._features.GetInputPort("plant_state"))
-        # The features see the whole plan: where it ends decides, and H steps do not reach it.
+        # The features cover the whole plan: safety depends on its end, beyond the H steps.
         outlook = outlook or self._planner.GetOutputPort("desired_outlook")
         builder.Connect(outlook, self._features.GetInputPort("desired_preview"))
         self.feature_names = self._features.feature_names
@@ -115,19 +143,19 @@ class PlannedLoop(ClosedLoop):
         desired_output: OutputPort | None = None,
         desired_preview: OutputPort | None = None,
     ) -> SafetyAssessor | None:
-        """Adds the assessor, if there is Γ, and exports the contract's ports and ``plant_state``.
+        """Adds the assessor, if there is an assessment, and exports the ports of the contract.
 
         Args:
-            builder: Of the task's diagram.
+            builder: The diagram's builder.
             assessment_period_s: Time between two evaluations of Γ [s].
             state: See the table of :class:`ClosedLoop`, as for all that follow.
-            true_state: Without noise; there is none by default.
-            output: As it is measured.
-            desired_output: As the controller follows it; the planner's by default.
-            desired_preview: What is to come of it as the assessor sees it; by default as planned.
+            true_state: ``state`` by default.
+            output: The measured output.
+            desired_output: The planner's by default.
+            desired_preview: The planner's by default.
 
         Returns:
-            The assessor; None without Γ.
+            The assessor; None without an assessment.
         """
         features = self._features.GetOutputPort("features")
         desired_preview = desired_preview or self._planner.GetOutputPort("desired_preview")
@@ -153,20 +181,20 @@ class PlannedLoop(ClosedLoop):
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks that its ports keep the contract."""
+        """Builds the diagram and checks its ports."""
         super().finish(builder)
         self._default = self.CreateDefaultContext()
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Begins with a given plant state and plan; see `CanStartAnywhere`."""
+        """Sets plant state and plan; see `CanStartAnywhere`."""
         del rng  # There is no noise.
         start.check(f"start of task '{type(self).__name__}'", *self.plant_state_sizes)
         self._enter(context, start)
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """What an episode that goes on from here begins with."""
+        """State and plan of a Context, as a start."""
         q, v = np.split(
             self.GetOutputPort("plant_state").Eval(context), [self.plant_state_sizes[0]]
         )
@@ -174,7 +202,7 @@ class PlannedLoop(ClosedLoop):
         return EpisodeStart(q=q, v=v, plan=plan)
 
     def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
-        """Sets a plan in place of the one that the Context has; the state stays as it is.
+        """Sets the plan and keeps the state.
 
         Args:
             context: The diagram's Context.
@@ -186,7 +214,7 @@ class PlannedLoop(ClosedLoop):
         return self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
 
     def _enter(self, context: Context, start: EpisodeStart) -> None:
-        # The state alone: parameters such as an assessor's beliefs are not an episode's to forget.
+        # Only the state is reset: parameters such as an assessor's beliefs outlive an episode.
         context.SetTime(0.0)
         context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         self._set_state(context, start)
@@ -195,10 +223,10 @@ class PlannedLoop(ClosedLoop):
         )
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
-        """Writes what a start says of the plant, and of the task's controller, into a Context."""
+        """Sets the states of plant and controller to a start."""
         raise NotImplementedError
 
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:
-        """The frame of a start's plan, [x, y, yaw] in the world (3,) [m, rad]."""
+        """Pose of the frame of a start's plan, [x, y, yaw] in the world (3,) [m, rad]."""
         del start
         return np.zeros(3)

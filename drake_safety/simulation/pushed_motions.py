@@ -1,7 +1,8 @@
-"""Pushed motions: motions that are safe by themselves, carried out undisturbed and pushed."""
+"""Pushed motions: safe motions, simulated undisturbed and with a push."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from os import PathLike
 
 from drake_safety.simulation.capabilities import (
@@ -15,10 +16,9 @@ from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.motion_files import MotionFolder, Pair
 from drake_safety.simulation.rollouts import (
     Progress,
-    batches,
     episode_rng,
     episodes_info,
-    parallel_map,
+    run_batches,
     worker_loop,
 )
 from drake_safety.simulation.scenario import Scenario
@@ -28,10 +28,9 @@ _MAX_TRIES = 50
 
 
 def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> Pair:
-    """Carries out a random motion that is safe by itself, and once more with a random push.
+    """Simulates a random motion that is safe undisturbed, and once more with a random push.
 
-    A goal that is not safe by itself is drawn again: who pushes a robot on its way has let it
-    begin.
+    Goals are drawn until the undisturbed motion is safe.
 
     Args:
         loop: A closed loop whose plans have a goal and whose robot can be pushed.
@@ -51,20 +50,20 @@ def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> Pair:
     duration_s = loop.scenario.episode_duration_s
     for _ in range(_MAX_TRIES):
         goal = rng.uniform(*box)
-        calm = run_to_goal(
+        undisturbed = run_to_goal(
             loop, goal, duration_s=duration_s, seed=noise_seed, ports=SEEN, until_unsafe=True
         )
-        if not calm.has_left:
+        if not undisturbed.has_left:
             pushed = run_to_goal(
                 loop, goal, push=push, duration_s=duration_s, seed=noise_seed, ports=SEEN
             )
             return (
-                WatchedMotion.of_goal_motion(index, calm),
+                WatchedMotion.of_goal_motion(index, undisturbed),
                 WatchedMotion.of_goal_motion(index, pushed),
             )
     raise ValueError(
         f"pushed motion {index} of '{loop.scenario.name}': none of {_MAX_TRIES} random goals is "
-        "reached safely even if nobody pushes"
+        "reached safely without a push"
     )
 
 
@@ -78,17 +77,17 @@ def run_pushed_motions(
     path: str | PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> list[WatchedMotion]:
-    """Carries out random safe motions, each undisturbed and pushed, in worker processes.
+    """Simulates random safe motions, each undisturbed and pushed, in worker processes.
 
     Args:
         scenario: The scenario.
-        num_motions: How many; twice as many are returned.
+        num_motions: Number of pairs; twice as many motions are returned.
         seed: Seed of the set.
-        variation: Which plant.
-        num_workers: Processes; as many as there are cores by default.
-        path: Folder where pairs are kept as they finish; those of the same set that it already
-            holds are not simulated again.
-        progress: Called with the number done and the number wanted.
+        variation: The plant.
+        num_workers: Number of processes; that of cores by default.
+        path: Folder for the pairs; pairs of the same set that it already holds are not simulated
+            again.
+        progress: Called with the number done and in all.
 
     Raises:
         ValueError: The folder holds another set or a damaged pair, the task has no goals or
@@ -104,21 +103,19 @@ def run_pushed_motions(
     remaining = [index for index in range(num_motions) if index not in pairs]
     if progress is not None:
         progress(len(pairs), num_motions)
-    results = parallel_map(
+    results = run_batches(
         _motion_batch,
-        [(scenario, variation, seed, batch) for batch in batches(remaining)],
-        num_workers,
+        remaining,
+        lambda batch: (scenario, variation, seed, batch),
+        num_workers=num_workers,
+        progress=progress,
+        num_done=len(pairs),
     )
-    try:
-        for batch in results:
-            for pair in batch:
-                pairs[pair[0].index] = pair
-                if folder is not None:
-                    folder.save(pair)
-            if progress is not None:
-                progress(len(pairs), num_motions)
-    finally:
-        results.close()
+    with closing(results):
+        for pair in results:
+            pairs[pair[0].index] = pair
+            if folder is not None:
+                folder.save(pair)
     return [motion for index in sorted(pairs) for motion in pairs[index]]
 
 

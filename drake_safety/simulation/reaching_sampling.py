@@ -1,4 +1,4 @@
-"""What a reaching episode draws at random: a standing posture, a target and a detour."""
+"""Random postures, targets and detours of the reaching task."""
 
 from dataclasses import dataclass, field
 
@@ -15,24 +15,24 @@ _MAX_TRIES = 100
 
 @dataclass(kw_only=True)
 class PostureSampling:
-    """Random standing postures. Half-widths about the standing one, unless it says otherwise."""
+    """Random standing postures. Offsets are half-widths about the standing posture."""
 
     base_offset_m: list[float] = field(default_factory=lambda: [0.02, 0.02])
     """Along x and along y."""
     base_lowering_m: float = 0.08
-    """How far at most the base is lowered."""
+    """Largest lowering of the base."""
     tilt_rad: float = 0.03
     """Of roll, pitch and yaw of the base, each."""
     joint_offset_rad: float = 0.1
-    """Of every joint that belongs to no leg."""
+    """Of every joint that is not of a leg."""
     clearance_m: float = 0.02
     """Least distance of the arms to an obstacle."""
     joint_margin_rad: float = 0.0
     """Least distance of every joint to the end of its safe range."""
     sink_m: float = 0.0
-    """How deep the contact points begin in the compliant ground: as deep as they are when the robot
-    stands. Where they only touch it, nothing carries the robot in the plant's first step, and
-    torques that count on the ground turn the feet into it."""
+    """Initial penetration of the contact points into the compliant ground, as at rest. Without it
+    there is no contact force in the plant's first step, and the torques press the feet into the
+    ground."""
 
     def __post_init__(self) -> None:
         if len(self.base_offset_m) != 2:
@@ -55,16 +55,15 @@ class PostureSampling:
     def sample(
         self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
     ) -> np.ndarray:
-        """Positions in the safe set with the feet where they stand, (n_q,).
+        """Samples positions in the safe set with the feet of the standing posture, (n_q,).
 
         Args:
-            safe_set: Of the robot and its obstacles.
-            rng: Source of every draw.
-            mirror: Where it is not the trained hand that reaches: the other one begins with the
-                mirror image of what the trained hand's episode of these draws begins with.
+            safe_set: The safe set, with robot and obstacles.
+            rng: Random generator.
+            mirror: If given, the posture is mirrored: that of the other hand's episode.
 
         Raises:
-            RuntimeError: No posture that is drawn is in the safe set.
+            RuntimeError: No sampled posture is in the safe set.
         """
         kinematics = safe_set.kinematics
         robot = kinematics.robot
@@ -102,10 +101,7 @@ class PostureSampling:
 
 @dataclass(kw_only=True)
 class TargetSampling:
-    """The box that targets of the trained hand are drawn from, in the world [m].
-
-    The other hand's targets come from its mirror image.
-    """
+    """The box of the trained hand's targets in the world [m]; the other hand's is mirrored."""
 
     x_m: list[float] = field(default_factory=lambda: [0.45, 1.0])
     y_m: list[float] = field(default_factory=lambda: [-0.3, 1.3])
@@ -125,9 +121,9 @@ class TargetSampling:
 
 @dataclass(kw_only=True)
 class FairTargets:
-    """The part of the target box in which a verdict is neither trivial nor absurd, in the world.
+    """The part of the target box without trivially safe or unsafe targets, in the world [m].
 
-    Bounds that are left empty are the target box's own.
+    Bounds default to those of the target box.
     """
 
     x_m: list[float] = field(default_factory=list)
@@ -148,14 +144,14 @@ class FairTargets:
 
 @dataclass(kw_only=True)
 class Detours:
-    """Plans beside the straight line, so that Γ can judge and choose among them.
+    """Plans that deviate from the straight line, so that Γ can select among them.
 
-    A detour is how far the plan's middle lies beside the straight line's, in the stance frame of
-    the trained hand [m]: x forwards, y to the left, z up.
+    A detour is the offset of the plan's middle from that of the straight line, in the stance frame
+    of the trained hand [m]: x forwards, y to the left, z up.
     """
 
     share: float = 0.0
-    """Share of the training episodes whose plan makes one."""
+    """Share of the training episodes with a detour."""
     lowest_m: list[float] = field(default_factory=lambda: [-0.3, -0.2, -0.1])
     highest_m: list[float] = field(default_factory=lambda: [0.0, 0.2, 0.3])
 
@@ -170,19 +166,11 @@ class Detours:
             )
 
     def sample(self, rng: np.random.Generator) -> np.ndarray | None:
-        """The detour of an episode, (3,) [m], or None for the straight line.
-
-        Args:
-            rng: Source of every draw.
-        """
+        """Samples the detour of an episode, (3,) [m]; None for the straight line."""
         if rng.random() >= self.share:
             return None
         return self.draw(rng)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """A detour, whatever the share of episodes that make one, (3,) [m].
-
-        Args:
-            rng: Source of every draw.
-        """
+        """Samples a detour, regardless of the share, (3,) [m]."""
         return rng.uniform(self.lowest_m, self.highest_m)

@@ -1,4 +1,4 @@
-"""Episodes of any diagram that has the contract's output ports, on all cores."""
+"""Episodes of any diagram with the contract's output ports."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.contract import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
-from drake_safety.simulation.rollouts import (
-    Progress,
-    collect_episodes,
-    episode_rng,
-)
+from drake_safety.simulation.rollouts import Progress, collect_episodes, episode_rng
 from drake_safety.simulation.scenario import source_digest
 
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
@@ -57,70 +53,68 @@ def record_episodes(
     progress: Progress | None = None,
     accept_code_change: bool = False,
 ) -> Episodes:
-    """Simulates a set of episodes of a diagram of one's own, in worker processes.
+    """Simulates a set of episodes of any diagram, in worker processes.
 
-    The diagram exports these ports, under these names or as ``ports`` says:
+    The diagram exports these ports, under these names or those of ``ports``:
 
     =================== ======= ===============================================================
     output port         size    meaning
     =================== ======= ===============================================================
-    ``state``           n_s     what an assessor shall see of the state
-    ``output``          n_z     what shall follow the plan
-    ``desired_preview`` H n_z   the plan at the next H steps, now included, row-major in time;
-                                its size says what H is
+    ``state``           n_s     the assessor's input
+    ``output``          n_z     the output that follows the plan
+    ``desired_preview`` H n_z   the plan at the next H steps, the present included, row-major in
+                                time; its size determines H
     ``margins``         n_c     signed distance to each constraint, negative where violated
     ``true_state``      n_s     optional: ``state`` without noise; ``state`` by default
     ``desired_output``  n_z     optional: the plan now, in the frame of ``output``; the first
                                 sample of ``desired_preview`` by default
-    ``features``        n_f     optional: what else tells how safe the plan is; none by default
-    ``safe``            1       optional: below 1 once the state is unsafe; by default it is as
-                                long as no margin is negative
+    ``features``        n_f     optional: further inputs of the assessor; none by default
+    ``safe``            1       optional: below 1 once the state is unsafe; by default when a
+                                margin is negative
     =================== ======= ===============================================================
 
-    A row shows its ports as they are at its time. A port that a system samples and holds shows
-    what was sampled before. Episode i depends on the diagram, the seed and i alone: its bits are
-    the same for any number of workers.
+    A row has the values of the ports at its time; a port that is sampled and held has its last
+    sample. Episode i depends on the diagram, the seed and i alone: its arrays are identical for
+    any number of workers.
 
     Args:
         make_diagram: Builds the diagram; called with ``parameters``, once in each worker.
         num_episodes: Size of the set.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             which is the diagram's default one. It may return the first row whose future is
-            undisturbed, where that is not 0.
-        duration_s: Length of an episode that stays safe [s].
+            undisturbed, if that is not 0.
+        duration_s: Duration of a safe episode [s].
         step_s: Time between two rows, the unit of H [s].
-        parameters: For ``make_diagram``, part of what a folder's set is known by.
-        ports: The diagram's own names of ports, by those above.
-        state_names: What the entries of ``state`` are called, n_s of them; numbered by default.
-        output_names: The same of ``output``.
-        feature_names: The same of ``features``.
-        constraint_names: The same of ``margins``.
-        name: Of the set; by default that of ``make_diagram``.
-        monitor_period_s: Time between two looks at whether the state is safe [s]; a tenth of
-            ``step_s`` by default.
+        parameters: Arguments of ``make_diagram``; part of the set's hash.
+        ports: The diagram's port names, by those above.
+        state_names: Names of the n_s entries of ``state``; numbered by default.
+        output_names: Names of the entries of ``output``.
+        feature_names: Names of the entries of ``features``.
+        constraint_names: Names of the entries of ``margins``.
+        name: Name of the set; that of ``make_diagram`` by default.
+        monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         seed: Seed of the set.
-        num_workers: Processes; as many as there are cores by default. 1 runs in this process.
-        path: Folder where episodes are kept as they finish; those of the same set that it
-            already holds are not simulated again. A set is the same if name, parameters, ports,
-            times and the source text of ``make_diagram`` and ``reset`` are; what these call is
-            not looked at.
-        progress: Called with the number done and the number wanted.
-        accept_code_change: Whether a folder's set goes on although another version of this
-            package began it.
+        num_workers: Number of processes; that of cores by default. 1 runs in this process.
+        path: Folder for the episodes; episodes of the same set that it already holds are not
+            simulated again. A set is identified by name, parameters, ports, times and the source
+            text of ``make_diagram`` and ``reset``, not by the code that these call.
+        progress: Called with the number done and in all.
+        accept_code_change: Whether to continue a folder's set begun with another version of this
+            package.
 
     Returns:
-        The episodes, as ``SafetyAssessment.fit`` takes them. Those whose simulation failed are
-        among them, with the cause ``diverged``, and are counted in a warning.
+        The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
+        ``diverged`` and are counted in a warning.
 
     Raises:
-        ValueError: A port is missing or of a size that fits no other, there are not as many names
-            as entries, a time does not fit, or the folder holds another set.
+        ValueError: A port is missing or its size fits no other, the number of names is not that
+            of the entries, a time is out of range, or the folder holds another set.
         EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     if not (step_s > 0 and round(duration_s / step_s) >= 1):
         raise ValueError(
-            f"record_episodes: an episode lasts a step at least; got duration_s {duration_s} and "
+            f"record_episodes: an episode has at least one step; got duration_s {duration_s} and "
             f"step_s {step_s}"
         )
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
@@ -148,7 +142,7 @@ def record_episodes(
         num_steps=timing.num_steps,
         code=source_digest(),
     )
-    # Nothing that is known of a function says that what it builds has not changed.
+    # The diagram is built anew for each call: a function does not tell whether its result changed.
     run = uuid.uuid4().hex
     return collect_episodes(
         info,
@@ -195,11 +189,11 @@ def _record_batch(
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
-    """The diagram's name of each port of the contract that it has, and their sizes."""
+    """The diagram's names of the contract's ports, and their sizes."""
     unknown = set(given) - set(REQUIRED_PORTS)
     if unknown:
         raise ValueError(
-            f"record_episodes: ports has {sorted(unknown)}; the contract's are {REQUIRED_PORTS}"
+            f"record_episodes: ports has {sorted(unknown)}; expected some of {REQUIRED_PORTS}"
         )
     there = {
         port.get_name(): port.size()

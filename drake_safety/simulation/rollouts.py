@@ -1,4 +1,4 @@
-"""Rollouts: closed loops simulated to episodes, on one core or many, the same bits either way."""
+"""Rollouts: episodes of closed loops, simulated in worker processes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Callable, Generator
+from contextlib import closing, nullcontext
 from os import PathLike
 from types import BuiltinFunctionType, ModuleType
 from typing import Any
@@ -26,7 +27,6 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.capabilities import (
     CanStartAnywhere,
-    CountsFailures,
     HasGoals,
     OffersPlans,
     monitor_period_s,
@@ -39,14 +39,14 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
 
 _LOGGER = logging.getLogger("drake_safety")
-_BATCH = 4  # Episodes, or throws, that a worker takes at a time.
+_BATCH = 4  # Episodes, or throws, per call of a worker.
 
 Progress = Callable[[int, int], None]
-"""Called with the number done and the number wanted."""
+"""Called with the number done and in all."""
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of an episode: independent of who runs it, and when.
+    """The random generator of an episode, which depends on the seed and the index alone.
 
     Args:
         seed: Seed of the set.
@@ -58,13 +58,12 @@ def episode_rng(seed: int, index: int) -> np.random.Generator:
 def episodes_info(
     loop: ClosedLoop, seed: int, loop_options: dict[str, Any] | None = None
 ) -> EpisodesInfo:
-    """What all episodes of a loop share.
+    """Metadata common to all episodes of a loop.
 
     Args:
         loop: The closed loop.
         seed: Seed of the set.
-        loop_options: Options that the loop was made with; as they decide what is simulated, they
-            are part of the set's hash.
+        loop_options: Options with which the loop was made; part of the set's hash.
     """
     scenario = loop.scenario
     scenario_hash = scenario.simulation_hash(loop.variation_name)
@@ -98,23 +97,22 @@ def run_episode(
     start: EpisodeStart | None = None,
     plan: Any = None,
 ) -> Episode:
-    """Simulates one episode: until it leaves the safe set, or its time is over.
+    """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
     Args:
-        loop: The closed loop; it keeps no state, and can be used again.
+        loop: The closed loop; it has no state and can be used again.
         index: Number of the episode in its set.
         seed: Seed of the set.
-        goal: Where the task's plan shall lead, in place of a random goal; only for tasks whose
-            ``reset`` takes one.
-        is_standing: Whether it begins in the robot's own posture instead of a random one; takes a
+        goal: Goal of the plan, in place of a random one; for tasks with goals.
+        is_standing: Whether it begins in the standing posture instead of a random one; requires a
             goal.
-        start: What it begins with, in place of a random state and plan: the twin of an episode
-            that began so. The noise is that of the set and the index.
-        plan: Replaces the plan that it begins with: one of the loop's ``candidate_plans``.
+        start: Initial state and plan, in place of random ones. The noise is that of the seed and
+            the index.
+        plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
 
     Returns:
-        The episode. When the simulation fails, its cause is ``diverged`` and its rows are those
-        that were finite.
+        The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
+        are finite.
 
     Raises:
         ValueError: The task takes no goal or start, or not this one, or both are given.
@@ -123,7 +121,7 @@ def run_episode(
     if start is not None and (goal is not None or is_standing):
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
     if is_standing and goal is None:
-        raise ValueError("run_episode: an episode from the standing posture takes a goal")
+        raise ValueError("run_episode: an episode from the standing posture requires a goal")
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
@@ -152,8 +150,9 @@ def run_episode(
         index=index,
         first_step=first_step,
     )
-    if isinstance(loop, CountsFailures):
-        episode.num_controller_failures = loop.num_controller_failures(context)
+    if loop.HasOutputPort("num_controller_failures"):
+        num_failures = loop.GetOutputPort("num_controller_failures").Eval(context)[0]
+        episode.num_controller_failures = int(num_failures)
     return episode
 
 
@@ -174,33 +173,32 @@ def run_episodes(
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
 
-    Episode i depends on the scenario, the variation, the seed and i alone: the arrays are the
-    same to the last bit for any number of workers.
+    Episode i depends on the scenario, the variation, the seed and i alone: the arrays are
+    identical for any number of workers.
 
     Args:
         scenario: The scenario.
         num_episodes: Size of the set.
-        variation: Which plant.
+        variation: The plant.
         seed: Seed of the set.
-        num_workers: Processes; as many as there are cores by default. 1 runs in this process.
-        path: Folder where episodes are kept as they finish; those of the same set that it
-            already holds are not simulated again.
-        progress: Called with the number done and the number wanted.
-        extra: Stored beside the episodes' info.
+        num_workers: Number of processes; that of cores by default. 1 runs in this process.
+        path: Folder for the episodes; episodes of the same set that it already holds are not
+            simulated again.
+        progress: Called with the number done and in all.
+        extra: Stored with the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
-            are not kept.
-        is_standing: Whether episodes begin in the robot's own posture; takes goals.
-        accept_code_change: Whether a folder's set goes on although other source code began it.
-        **loop_options: For the task; part of what a folder's set is known by.
+            cannot be stored.
+        is_standing: Whether episodes begin in the standing posture; requires goals.
+        accept_code_change: Whether to continue a folder's set begun with other source code.
+        **loop_options: Options of the task; part of the set's hash.
 
     Raises:
         ValueError: The folder holds another set or one of other source code, the task takes no
-            goals, there is not one finite goal an episode, or a folder was given for what is not
-            kept.
+            goals, there is not one finite goal per episode, or both goals and a folder are given.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if path is not None and goals is not None:
-        # What a folder holds is known by scenario, variation, options and seed alone.
+        # The hash of a folder's set does not cover goals.
         raise ValueError("run_episodes: episodes with goals are not kept; leave out 'path'")
     loop = scenario.make_loop(variation, **loop_options)
     if goals is not None:
@@ -237,18 +235,18 @@ def collect_episodes(
     extra: dict[str, Any] | None = None,
     accept_code_change: bool = False,
 ) -> Episodes:
-    """Has a set of episodes simulated in worker processes, but for those that a folder holds.
+    """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
     Args:
-        info: What the set shares.
+        info: Metadata of the set.
         num_episodes: Size of the set.
-        task: Gives, for the numbers of a few episodes, a function at module level and its
-            arguments; it returns those episodes.
-        num_workers: As :func:`run_episodes`, and so are all that follow.
+        task: Maps a batch of indices to a function at module level and its arguments; the function
+            returns the episodes.
+        num_workers: See :func:`run_episodes`, as for all that follow.
         path: The folder.
-        progress: What is called.
-        extra: What is stored beside the info.
-        accept_code_change: Whether other source code may have begun the set.
+        progress: The callback.
+        extra: Stored with the info.
+        accept_code_change: Whether to continue a set begun with other source code.
     """
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
@@ -259,24 +257,19 @@ def collect_episodes(
     if path is not None:
         writer = EpisodeWriter(path, info, extra, accept_code_change=accept_code_change)
         episodes += (e for e in load_episodes(path) if e.index in done) if done else ()
-    results = parallel_map(_call, [task(batch) for batch in batches(remaining)], num_workers)
-    try:
-        for batch in results:
-            for episode in batch:
-                episodes.append(episode)
-                if writer is not None:
-                    writer.append(episode)
-            if progress is not None:
-                progress(len(episodes), num_episodes)
-    finally:
-        results.close()
-        if writer is not None:
-            writer.close()
+    results = run_batches(
+        _call, remaining, task, num_workers=num_workers, progress=progress, num_done=len(done)
+    )
+    with writer or nullcontext(), closing(results):
+        for episode in results:
+            episodes.append(episode)
+            if writer is not None:
+                writer.append(episode)
     collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
     if collected.num_diverged:
         which = [episode.index for episode in collected if episode.cause == DIVERGED]
         _LOGGER.warning(
-            "%d of %d simulations of '%s' diverged and say nothing about safety: episodes %s",
+            "%d of %d simulations of '%s' diverged and have no safety label: episodes %s",
             len(which),
             num_episodes,
             info.scenario,
@@ -294,8 +287,8 @@ def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np
     goals = np.asarray(goals, dtype=float)
     if goals.ndim != 2 or len(goals) != num_episodes:
         raise ValueError(
-            f"run_episodes: goals must be one row an episode, of {num_episodes} episodes; got "
-            f"shape {goals.shape}"
+            f"run_episodes: goals must have one row per episode, {num_episodes} in all; got shape "
+            f"{goals.shape}"
         )
     is_finite = np.isfinite(goals).all(axis=1)
     if not is_finite.all():
@@ -305,8 +298,37 @@ def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np
 
 
 def batches(indices: list[int]) -> list[list[int]]:
-    """Cuts a list into what a worker takes at a time."""
+    """Splits a list into batches, one for each call of a worker."""
     return [indices[i : i + _BATCH] for i in range(0, len(indices), _BATCH)]
+
+
+def run_batches(
+    function: Callable[..., list[Any]],
+    indices: list[int],
+    arguments: Callable[[list[int]], tuple],
+    *,
+    num_workers: int | None = None,
+    progress: Progress | None = None,
+    num_done: int = 0,
+) -> Generator[Any, None, None]:
+    """Calls a function for batches of indices in worker processes; yields results as they finish.
+
+    Args:
+        function: A function at module level; returns one result per index.
+        indices: The indices.
+        arguments: Maps a batch of indices to the function's arguments.
+        num_workers: Number of processes; that of cores by default.
+        progress: Called with the number done and in all, after each batch.
+        num_done: Number done beforehand.
+    """
+    num_wanted = num_done + len(indices)
+    results = parallel_map(function, [arguments(batch) for batch in batches(indices)], num_workers)
+    with closing(results):
+        for batch in results:
+            yield from batch
+            num_done += len(batch)
+            if progress is not None:
+                progress(num_done, num_wanted)
 
 
 def parallel_map(
@@ -314,13 +336,13 @@ def parallel_map(
 ) -> Generator[Any, None, None]:
     """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
 
-    Every worker has one BLAS thread, this process too when it does the work, so results do not
-    depend on the number of workers. On Ctrl-C or any error the workers end.
+    Every worker has one BLAS thread, and so has this process if it does the work, so that results
+    do not depend on the number of workers. On Ctrl-C or any error the workers end.
 
     Args:
         function: A function at module level.
-        arguments: One tuple a call.
-        num_workers: Processes; as many as there are cores by default.
+        arguments: One tuple per call.
+        num_workers: Number of processes; that of cores by default.
     """
     import joblib
     from threadpoolctl import threadpool_limits
@@ -344,7 +366,7 @@ def parallel_map(
 
             get_reusable_executor().shutdown(wait=False, kill_workers=True)
             with warnings.catch_warnings():
-                # Joblib says that not all results were consumed: that is what a stop means.
+                # Joblib warns that not all results were consumed.
                 warnings.simplefilter("ignore")
                 results.close()
             raise
@@ -356,9 +378,9 @@ def _reduce_builtin(function: Any) -> Any:
     return function.__reduce__()
 
 
-# Functions of a notebook or a script are sent to the workers with all that they use. Of pydrake
-# two things lack a name that a worker could find them by: functions that it binds, such as
-# StabilizingLQRController, and the metaclass of its systems, whose module does not exist.
+# Functions of a notebook or a script are pickled for the workers with all that they use. Two kinds
+# of pydrake objects cannot be pickled by name: bound functions such as StabilizingLQRController,
+# and the metaclass of its systems, whose module does not exist.
 copyreg.pickle(BuiltinFunctionType, _reduce_builtin)
 _METACLASS = type(LeafSystem)
 vars(sys.modules.setdefault(_METACLASS.__module__, ModuleType(_METACLASS.__module__))).setdefault(
@@ -372,8 +394,8 @@ _LOOPS: dict[tuple, ClosedLoop] = {}
 def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> ClosedLoop:
     """The loop of a worker process, built once per scenario, variation, options and robot.
 
-    The scenario's text does not say what stands in the robot's files; the hash does, but not what
-    it leaves out, such as a threshold.
+    The key has the hash, which covers the robot's files, and the scenario's text, which covers
+    what the hash leaves out, such as a threshold.
     """
     hash_ = scenario.simulation_hash(variation)
     key = (hash_, scenario.to_yaml(), variation, repr(sorted(options.items())))

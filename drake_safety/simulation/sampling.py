@@ -1,4 +1,4 @@
-"""What an episode draws at random: a start on the feet, a plan, and balls that are thrown."""
+"""Random starts, plans and balls of the balancing task."""
 
 import math
 from dataclasses import dataclass, field
@@ -49,7 +49,7 @@ class StartSampling:
             _check_size("start", name, getattr(self, name), size)
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
-        """A start with the base anywhere in the ranges and moving, and the feet at rest."""
+        """Samples a start with a moving base within the ranges and the feet at rest."""
         xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * self.foot_offset_m
         p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
         X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
@@ -74,10 +74,10 @@ class StartSampling:
 
 @dataclass(kw_only=True)
 class PushSampling:
-    """Random balls, and the calm motion during which they are thrown."""
+    """Random balls, and the undisturbed motion during which they are thrown."""
 
     share: float = 0.25
-    """Share of nominal episodes that begin as a ball hits."""
+    """Share of nominal episodes that begin with the impact of a ball."""
     mass_kg: list[float] = field(default_factory=lambda: [2.0, 4.0])
     """Lowest and highest."""
     speed_m_s: list[float] = field(default_factory=lambda: [2.0, 11.0])
@@ -87,7 +87,7 @@ class PushSampling:
     height_m: float = 0.03
     """Half-width of a throw's ``height_m``."""
     target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
-    """Half-widths of where the calm motion starts and ends, about the stance, x and y."""
+    """Half-widths of the start and goal of the undisturbed motion, about the stance, x and y."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
@@ -97,11 +97,11 @@ class PushSampling:
         _check_size("push", "target_offset_m", self.target_offset_m, 2)
 
     def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """A random ball from any horizontal direction.
+        """Samples a ball from any horizontal direction.
 
         Args:
-            rng: Source of every draw.
-            time_s: When it touches [s].
+            rng: Random generator.
+            time_s: Time of impact [s].
         """
         return Throw(
             time_s=time_s,
@@ -121,14 +121,14 @@ def calm_start(
     plan_duration_s: list[float],
     elapsed_s: float = 0.0,
 ) -> EpisodeStart:
-    """A start in a motion near the standing posture, as if it had been tracked well.
+    """Samples a start on a plan near the standing posture, without tracking error.
 
     Args:
         kinematics: The robot.
-        rng: Source of every draw.
-        half_widths_m: Of where the motion begins and ends, about the stance, (2,) [m].
-        plan_duration_s: Shortest and longest duration of the motion [s].
-        elapsed_s: How long the motion has lasted already [s].
+        rng: Random generator.
+        half_widths_m: Half-widths of the plan's start and goal, about the stance, (2,) [m].
+        plan_duration_s: Shortest and longest duration of the plan [s].
+        elapsed_s: Time since the plan's start [s].
     """
     half = np.array([*half_widths_m, 0.0])
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
@@ -149,7 +149,7 @@ def calm_start(
 def resting_feet(
     kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
 ) -> np.ndarray:
-    """Velocities in which the base moves and the feet are at rest: 0 = J_b V_WB + J_j dq.
+    """Velocities with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq.
 
     Args:
         kinematics: The robot.

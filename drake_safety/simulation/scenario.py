@@ -1,4 +1,4 @@
-"""A scenario: the YAML file that marries a robot and a task."""
+"""Scenarios: YAML files that combine a robot and a task."""
 
 import hashlib
 import importlib
@@ -19,8 +19,8 @@ from pydrake.common.yaml import yaml_dump_typed
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
-from drake_safety.simulation.capabilities import CompletesParameters
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.planned_loop import PlannedLoop
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Scenario:
-    """What a scenario file holds. The fields under ``parameters`` are the task's own."""
+    """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
 
     name: str = ""
     """File name without suffix; filled in by the loader."""
     task: str = ""
     """Import path ``package.module:Class`` of a ClosedLoop."""
     robot: str = ""
-    """Name of a robot that comes with the package, or the path of a ``robot.yaml``; empty for a
-    task that brings a plant of its own."""
+    """Name of a robot of the package, or the path of a ``robot.yaml``; empty for a task with a
+    plant of its own."""
     episode_duration_s: float = 2.0
     """T [s]."""
     step_s: float = 0.04
@@ -48,9 +48,9 @@ class Scenario:
     control_period_s: float = 0.01
     """Period of the controller and of the safety monitor [s]."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
-    """Plants by name; ``nominal`` is the one that is learned from."""
+    """Plants by name; training episodes are those of ``nominal``."""
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
-    """How Γ is learned."""
+    """Parameters of the assessment."""
 
     parameters = cast(Any, None)  # Set by the loader: an instance of the task's Parameters.
 
@@ -87,7 +87,7 @@ class Scenario:
         """The task, imported.
 
         Raises:
-            ValueError: The import path is malformed or leads to no ClosedLoop.
+            ValueError: The import path is malformed or is not that of a ClosedLoop.
         """
         return _import_task(self.task, self.name)
 
@@ -102,36 +102,35 @@ class Scenario:
         """Builds the task's diagram.
 
         Args:
-            variation: Which plant.
-            assessment: Γ; adds the assessor and what the task does with it.
+            variation: The plant.
+            assessment: Adds an assessor and, for example, recovery.
             meshcat: Adds a visualiser.
-            **options: The task's own, such as ``recovery=False``.
+            **options: Options of the task, such as ``recovery=False``.
 
         Raises:
-            ValueError: Unknown variation, an option that the task does not have, or an assessment
-                made for something else.
+            ValueError: Unknown variation or option, or an assessment of another diagram.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
         return task(self, variation, assessment=assessment, meshcat=meshcat, **options)
 
     def to_yaml(self) -> str:
-        """The scenario as canonical text, defaults included, that `load_scenario` reads."""
+        """The scenario as canonical YAML text with all defaults."""
         head = yaml_dump_typed(self, schema=Scenario)
         body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
         return head + "parameters:\n" + textwrap.indent(body, "  ")
 
     def simulation_hash(self, variation: str = "nominal") -> str:
-        """SHA-256 of all that decides what a rollout does and records, robot included.
+        """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
-        Defaults count, so that episodes of before and after a default was changed do not mix. How Γ
-        is learned is left out, but for the horizon that shapes the preview, and so are the task's
-        online parameters and the other variations: episodes stay valid when only the learning, a
-        threshold or another plant changes. Source code is known by :meth:`code_digest`.
+        Defaults are included, so that episodes from before and after a change of one do not mix.
+        The assessment's parameters except the horizon, the task's online parameters and the other
+        variations are left out: episodes stay valid when only these change. Source code is covered
+        by :meth:`code_digest`.
 
         Args:
-            variation: The plant that is simulated. The nominal one always counts: controllers
-                take it for the robot.
+            variation: The simulated plant. The nominal one is always included, because it is the
+                controllers' model.
 
         Raises:
             ValueError: No such variation.
@@ -145,7 +144,7 @@ class Scenario:
             for name in ("nominal", variation)
             if name in self.variations
         }
-        # A robot of one's own is known by its files, wherever their folder lies.
+        # The robot's files are hashed; their folder is irrelevant.
         text["robot"] = Path(self.robot).name
         task = self.task_class()
         for name in task.online_parameters:
@@ -156,18 +155,18 @@ class Scenario:
         return digest.hexdigest()
 
     def code_digest(self) -> str:
-        """SHA-256 of the source code that simulates: this package's, and the task's module's.
+        """SHA-256 of the source code of this package's simulation and of the task's module.
 
-        Of the task's module count the modules beside it that it imports, too.
+        Modules in the folder of the task's module that it imports are included.
         """
         return source_digest(_own_files(sys.modules[self.task_class().__module__]))
 
 
 def source_digest(files: Iterable[Path] = ()) -> str:
-    """SHA-256 of this package's source code that decides a simulation, and of further files.
+    """SHA-256 of this package's source code that determines a simulation, and of further files.
 
     Args:
-        files: Of a task's module; they are known by their names, wherever their folder lies.
+        files: Files of a task's module; identified by name, whatever their folder.
     """
     root = Path(__file__).parents[1]
     package = [path for room in _SIMULATING_ROOMS for path in (root / room).rglob("*.py")]
@@ -183,7 +182,7 @@ _SIMULATING_ROOMS = ("control", "plants", "robots", "simulation", "systems")
 
 
 def _own_files(module: ModuleType) -> set[Path]:
-    """The file of a module, and those in its folder that it imports from, directly or not."""
+    """The files of a module and of the modules in its folder that it imports, recursively."""
     files: dict[Path, ModuleType] = {}
     waiting = [module]
     while waiting:
@@ -198,14 +197,14 @@ def _own_files(module: ModuleType) -> set[Path]:
 
 
 _LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
-"""What a robot.yaml says that decides nothing."""
+"""Lines of a robot.yaml that do not affect a simulation."""
 
 
 def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
     parameters = inspect.signature(task).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
-    # What every task takes goes through make_loop's own arguments.
+    # Arguments of make_loop itself.
     common = ("scenario", "variation", "assessment", "meshcat")
     known = [parameter.name for parameter in parameters if parameter.name not in common]
     unknown = [name for name in options if name not in known]
@@ -225,13 +224,13 @@ def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise ValueError(
-            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks "
-            f"that come with the package are {task_names()}"
+            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks of "
+            f"the package are {task_names()}"
         ) from error
     known = {
         name: value
         for name, value in vars(module).items()
-        # What has no parameters of its own is a base that tasks share.
+        # A class without parameters is a base class of tasks.
         if isinstance(value, type)
         and issubclass(value, ClosedLoop)
         and hasattr(value, "Parameters")
@@ -249,23 +248,23 @@ def _scenario_folder() -> Path:
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that come with the package."""
+    """Names of the package's scenarios."""
     return sorted(path.stem for path in _scenario_folder().glob("*.yaml"))
 
 
 def task_names() -> list[str]:
-    """Import paths of the modules of tasks that come with the package: those of its scenarios."""
+    """Import paths of the modules of the package's tasks."""
     texts = (path.read_text(encoding="utf-8") for path in _scenario_folder().glob("*.yaml"))
     return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
 
 
 def load_scenario(name: str | Path) -> Scenario:
-    """Loads a scenario by name, or by the path of a YAML file of your own.
+    """Loads a scenario by name, or by the path of a YAML file.
 
-    A relative ``robot`` path is taken from the scenario file's folder.
+    A relative ``robot`` path is relative to the scenario file's folder.
 
     Args:
-        name: ``"NAME"`` of one that comes with the package, or a path.
+        name: Name of a scenario of the package, or a path.
 
     Raises:
         ValueError: No such scenario, unknown or ill-typed keys, or no such task.
@@ -291,10 +290,10 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     Args:
         text: The YAML.
         name: The scenario's name.
-        folder: Where a relative robot path starts.
+        folder: Folder of relative robot paths.
 
     Raises:
-        ValueError: As :func:`load_scenario`.
+        ValueError: See :func:`load_scenario`.
     """
     try:
         raw = yaml.safe_load(text)
@@ -302,15 +301,15 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
         raise ValueError(f"scenario '{name}' is not YAML: {error}") from error
     if not isinstance(raw, dict) or "task" not in raw:
         raise ValueError(
-            f"scenario '{name}' must be a mapping with the key 'task', and 'robot' for a task that "
-            "takes one"
+            f"scenario '{name}' must be a mapping with the key 'task', and 'robot' if the task has "
+            "one"
         )
     parameters = raw.pop("parameters", None) or {}
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
     task = scenario.task_class()
-    if isinstance(parameters, dict) and isinstance(task, CompletesParameters):
+    if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
         parameters = task.complete_parameters(scenario.robot, parameters)
     scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
     return scenario

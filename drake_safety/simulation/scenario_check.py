@@ -1,11 +1,10 @@
-"""A scenario, looked over before rollouts are wasted on it: what is missing, and how to mend it."""
+"""Check of a scenario before rollouts: what is wrong, and how to correct it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from pydrake.geometry import Sphere
@@ -13,149 +12,129 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.capabilities import HasBall
-from drake_safety.simulation.contract import Finding, check_contract
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_Value = TypeVar("_Value")
-
-_LEVEL_M = 2e-3  # How unequal the feet's heights may be.
-_SINK_SHARE = 0.1  # Of the standing height, that a robot may sink while it stands.
+_LEVEL_M = 2e-3  # Largest difference of the feet's heights.
+_SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
 
 
 @dataclass
 class _State:
-    """What one check finds and a later one needs."""
+    """Results of checks that later ones need."""
 
     scenario: Scenario | None = None
     robot: RobotModel | None = None
     kinematics: RobotKinematics | None = None
-    loop: Any = None  # A ClosedLoop; one of a robot is a LeggedLoop.
+    loop: ClosedLoop | None = None
 
 
 def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -> Iterator[Finding]:
-    """Looks a scenario over, item by item, the cheap ones first.
+    """Checks a scenario item by item, the cheap ones first.
 
-    What a user's files do wrong is a finding, never an exception. Once the scenario, the robot or
-    the diagram cannot be made, what depends on it is left out.
+    An error in a user's files is a finding, never an exception. Checks that depend on a scenario,
+    robot or diagram that cannot be made are left out.
 
     Args:
-        name: Of a scenario that comes with the package, or the path of one.
-        num_episodes: Episodes that are simulated for the share of unsafe ones; 0 for none.
-        seed: Their seed.
+        name: Name of a scenario of the package, or the path of one.
+        num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
+        seed: Seed of the episodes.
 
     Yields:
-        The findings, as they are found.
+        The findings.
     """
     state = _State()
     yield from _guarded("scenario", lambda: _scenario(state, name))
-    if state.scenario is None:
+    if (scenario := state.scenario) is None:
         return
-    if state.scenario.robot:
-        yield from _guarded("robot.yaml", lambda: _robot(state))
-        if state.robot is None:
+    if scenario.robot:
+        yield from _guarded("robot.yaml", lambda: _robot(state, scenario))
+        if (robot := state.robot) is None:
             return
-        yield from _guarded("bodies and joints", lambda: _kinematics(state))
-        if state.kinematics is None:
+        yield from _guarded("bodies and joints", lambda: _kinematics(state, robot))
+        if (kinematics := state.kinematics) is None:
             return
-        yield from _guarded("standing posture", lambda: _posture(state))
-        yield from _guarded("motors", lambda: _motors(state))
-    yield from _guarded("diagram", lambda: _diagram(state))
-    if state.loop is None:
+        yield from _guarded("standing posture", lambda: _posture(kinematics))
+        yield from _guarded("motors", lambda: _motors(kinematics))
+    yield from _guarded("diagram", lambda: _diagram(state, scenario))
+    if (loop := state.loop) is None:
         return
-    if isinstance(state.loop, LeggedLoop):
-        yield from _guarded("contact spheres", lambda: _contacts(state))
-        yield from _guarded("shape of the base", lambda: _target(state))
-        yield from _guarded("stands for 1 s", lambda: _stands(state))
-    loop = state.loop
+    if isinstance(loop, LeggedLoop):
+        yield from _guarded("contact spheres", lambda: _contacts(loop))
+        yield from _guarded("shape of the base", lambda: _target(loop))
+        yield from _guarded("stands for 1 s", lambda: _stands(loop))
     yield from _guarded("contract", lambda: iter(check_contract(loop, seed=seed)))
     if num_episodes:
-        yield from _guarded("episodes", lambda: _episodes(state, num_episodes, seed))
+        yield from _guarded("episodes", lambda: _episodes(loop, num_episodes, seed))
 
 
 def _guarded(item: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from check()
-    # A task of one's own may raise anything, and so may Drake's parser.
+    # A user's task may raise anything, and so may Drake's parser.
     except Exception as error:
-        yield Finding(
-            item=item,
-            is_ok=False,
-            message=f"{error}" if isinstance(error, ValueError) else f"{_kind(error)}: {error}",
-            remedy="mend what the message names",
-        )
-
-
-def _kind(error: Exception) -> str:
-    return type(error).__name__
-
-
-def _ok(item: str, message: str) -> Finding:
-    return Finding(item=item, is_ok=True, message=message)
-
-
-def _bad(item: str, message: str, remedy: str) -> Finding:
-    return Finding(item=item, is_ok=False, message=message, remedy=remedy)
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        yield failed(item, f"{kind}{error}", "correct what the message names")
 
 
 def _scenario(state: _State, name: str | Path) -> Iterator[Finding]:
     scenario = load_scenario(name)
     task = scenario.task_class()
-    yield _ok("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
+    yield passed("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
     state.scenario = scenario
     if "nominal" not in scenario.variations:
-        yield _bad(
+        yield failed(
             "plants",
             f"no variation 'nominal'; it has {list(scenario.variations)}",
-            "add `nominal: {}` under 'variations': it is what Γ learns from",
+            "add `nominal: {}` under 'variations': the plant of the training episodes",
         )
         state.scenario = None
     elif "actual" not in scenario.variations:
-        yield _bad(
+        yield failed(
             "plants",
             "no variation 'actual', which `run` and throws simulate",
-            "add `actual: {}` under 'variations', with how the real robot differs",
+            "add `actual: {}` under 'variations', with the differences of the real robot",
         )
     else:
-        yield _ok("plants", ", ".join(scenario.variations))
+        yield passed("plants", ", ".join(scenario.variations))
 
 
-def _robot(state: _State) -> Iterator[Finding]:
-    scenario = _of(state.scenario)
+def _robot(state: _State, scenario: Scenario) -> Iterator[Finding]:
     robot = load_robot(scenario.robot)
-    yield _ok("robot.yaml", f"'{robot.name}' fits the schema")
+    yield passed("robot.yaml", f"'{robot.name}' fits the schema")
     missing = [str(path) for path in robot_files(scenario.robot) if not path.is_file()]
     if missing:
-        yield _bad("files", f"not found: {missing}", "set 'urdf' to a path beside robot.yaml")
+        yield failed("files", f"not found: {missing}", "set 'urdf' to a path beside robot.yaml")
         return
-    yield _ok("files", "found")
+    yield passed("files", "found")
     state.robot = robot
 
 
-def _kinematics(state: _State) -> Iterator[Finding]:
-    kinematics = RobotKinematics(_of(state.robot))
-    state.kinematics = kinematics
-    yield _ok(
+def _kinematics(state: _State, robot: RobotModel) -> Iterator[Finding]:
+    kinematics = state.kinematics = RobotKinematics(robot)
+    yield passed(
         "bodies and joints",
         f"{len(kinematics.foot_names)} feet, {kinematics.num_joints} joints, "
         f"{kinematics.total_mass:.1f} kg",
     )
 
 
-def _posture(state: _State) -> Iterator[Finding]:
-    kinematics = _of(state.kinematics)
+def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
     q = kinematics.standing_positions()
     low, high = kinematics.position_limits.T
     beyond = (kinematics.posture < low) | (kinematics.posture > high)
     if beyond.any():
         names = [name for name, wrong in zip(kinematics.joint_names, beyond, strict=True) if wrong]
-        yield _bad("joint stops", f"the posture is beyond those of {names}", "change 'posture'")
+        yield failed("joint stops", f"the posture is beyond those of {names}", "change 'posture'")
     p_WC = kinematics.contact_positions(q)
     heights = p_WC[:, 2] - kinematics.foot_radii
     if np.ptp(heights) > _LEVEL_M:
@@ -164,13 +143,13 @@ def _posture(state: _State) -> Iterator[Finding]:
             for name, points in zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
             if heights[points].max() > _LEVEL_M
         ]
-        yield _bad(
+        yield failed(
             "feet level",
             f"feet {high_feet} hang up to {100 * np.ptp(heights):.1f} cm over the ground",
             "change 'posture' until all feet are equally low, or their contact points",
         )
     else:
-        yield _ok(
+        yield passed(
             "feet level",
             f"within {1000 * np.ptp(heights):.1f} mm, base {kinematics.standing_height:.3f} m high",
         )
@@ -181,37 +160,36 @@ def _posture(state: _State) -> Iterator[Finding]:
     ):
         distance = signed_distance_to_polygon(point[:2], corners)
         if distance > 0:
-            yield _ok(item, f"{100 * distance:.1f} cm inside their polygon")
+            yield passed(item, f"{100 * distance:.1f} cm inside their polygon")
         else:
-            yield _bad(
+            yield failed(
                 item,
                 f"{-100 * distance:.1f} cm outside their polygon",
                 "change 'posture' so that the feet surround it, or 'contact_points'",
             )
 
 
-def _diagram(state: _State) -> Iterator[Finding]:
-    state.loop = _of(state.scenario).make_loop()
-    yield _ok("diagram", f"{type(state.loop).__name__} is built")
+def _diagram(state: _State, scenario: Scenario) -> Iterator[Finding]:
+    state.loop = scenario.make_loop()
+    yield passed("diagram", f"{type(state.loop).__name__} is built")
 
 
-def _motors(state: _State) -> Iterator[Finding]:
-    kinematics, robot = _of(state.kinematics), _of(state.robot)
-    plant = kinematics.plant
+def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
+    plant, robot = kinematics.plant, kinematics.robot
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
     limits = {actuator.joint().name(): actuator.effort_limit() for actuator in actuators}
     without = [name for name in kinematics.joint_names if name not in limits]
     if without:
-        yield _bad(
+        yield failed(
             "motors",
             f"joints {without} have none",
             "give them an effort limit [N·m] under 'effort_limits' in robot.yaml",
         )
     else:
-        yield _ok("motors", f"one on each of {len(limits)} joints")
+        yield passed("motors", f"one on each of {len(limits)} joints")
     unlimited = [name for name, limit in limits.items() if not np.isfinite(limit)]
     if unlimited:
-        yield _bad(
+        yield failed(
             "effort limits",
             f"the motors of joints {unlimited} have none, so that no load is too heavy",
             "give them one [N·m] under 'effort_limits' in robot.yaml",
@@ -223,7 +201,7 @@ def _motors(state: _State) -> Iterator[Finding]:
             if by_pattern(robot.joint_gains, name, "gains", robot.name) is None
         ]
         if loose:
-            yield _bad(
+            yield failed(
                 "servo gains", f"joints {loose} have none", "add them under 'joint_gains' [N·m/rad]"
             )
     q = kinematics.standing_positions()
@@ -234,7 +212,7 @@ def _motors(state: _State) -> Iterator[Finding]:
         if name in limits and abs(torque) > limits[name]
     ]
     if weak:
-        yield _bad(
+        yield failed(
             "effort against gravity",
             "; ".join(weak),
             "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
@@ -245,34 +223,31 @@ def _motors(state: _State) -> Iterator[Finding]:
             for name, torque in zip(kinematics.joint_names, torques, strict=True)
             if name in limits
         ]
-        yield _ok("effort against gravity", f"{100 * max(shares, default=0):.0f} % at most")
+        yield passed("effort against gravity", f"{100 * max(shares, default=0):.0f} % at most")
 
 
-def _target(state: _State) -> Iterator[Finding]:
-    """Whether a ball can hit the base, of a task that throws some."""
-    loop, robot = _of(state.loop), _of(state.robot)
-    if not isinstance(state.loop, HasBall):
+def _target(loop: LeggedLoop) -> Iterator[Finding]:
+    """Checks that a thrown ball can hit the base."""
+    if not isinstance(loop, HasBall):
         return
-    plant = loop.plant
+    plant, robot = loop.plant, loop.robot
     base = plant.GetBodyByName(robot.base, loop.robot_instance)
     bodies = plant.GetBodiesWeldedTo(base)
     count = sum(len(plant.GetCollisionGeometriesForBody(body)) for body in bodies)
     if count:
-        yield _ok("shape of the base", f"{count} collision shapes for balls to hit")
+        yield passed("shape of the base", f"{count} collision shapes for balls to hit")
     else:
-        yield _bad(
+        yield failed(
             "shape of the base",
-            f"base '{robot.base}' has no collision geometry, so balls, also those that episodes "
-            "begin with, fly through it",
+            f"base '{robot.base}' has no collision geometry, so balls fly through it",
             f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
             f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in "
             "robot.yaml",
         )
 
 
-def _contacts(state: _State) -> Iterator[Finding]:
-    loop, kinematics, robot = _of(state.loop), _of(state.kinematics), _of(state.robot)
-    plant = loop.plant
+def _contacts(loop: LeggedLoop) -> Iterator[Finding]:
+    plant, robot = loop.plant, loop.robot
     inspector = loop.GetSubsystemByName("scene_graph").model_inspector()
     missing = []
     for name, foot in robot.feet.items():
@@ -290,17 +265,17 @@ def _contacts(state: _State) -> Iterator[Finding]:
                 found = [f"{np.round(c, 4).tolist()} r {r:.4f}" for c, r in spheres]
                 missing.append(f"{name} at {point} r {foot.radius_m}; it has {found or 'none'}")
     if missing:
-        yield _bad(
+        yield failed(
             "contact spheres",
             "the model file has no such sphere: " + "; ".join(missing),
             "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
         )
     else:
-        yield _ok("contact spheres", f"{kinematics.num_contacts} in the model file")
+        yield passed("contact spheres", f"{loop.kinematics.num_contacts} in the model file")
 
 
-def _stands(state: _State) -> Iterator[Finding]:
-    loop, kinematics = _of(state.loop), _of(state.kinematics)
+def _stands(loop: LeggedLoop) -> Iterator[Finding]:
+    kinematics = loop.kinematics
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     start = loop.standing_start()
@@ -311,14 +286,14 @@ def _stands(state: _State) -> Iterator[Finding]:
     names = loop.constraint_names
     if found.min() < 0:
         wrong = [name for name, margin in zip(names, found, strict=True) if margin < 0]
-        yield _bad(
+        yield failed(
             "safe while it stands",
             f"the standing posture violates {wrong}",
             "scale 'safe_set' to the robot: its heights [m] must include the standing height "
             f"{kinematics.standing_height:.3f}",
         )
     else:
-        yield _ok("safe while it stands", "the posture is in the safe set")
+        yield passed("safe while it stands", "the posture is in the safe set")
     simulator.AdvanceTo(1.0)
     state_now = loop.GetOutputPort("plant_state").Eval(context)
     q, v = np.split(state_now, [kinematics.num_positions])
@@ -331,33 +306,32 @@ def _stands(state: _State) -> Iterator[Finding]:
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
     if abs(sunk) > _SINK_SHARE * kinematics.standing_height or speed > 1.0 or not touching:
-        yield _bad(
+        yield failed(
             "stands for 1 s",
             message,
             "raise 'joint_gains' [N·m/rad] if it sinks, lower them if it trembles; look for shapes "
             "that overlap",
         )
     else:
-        yield _ok("stands for 1 s", message)
+        yield passed("stands for 1 s", message)
 
 
-def _episodes(state: _State, num_episodes: int, seed: int) -> Iterator[Finding]:
-    loop = _of(state.loop)
+def _episodes(loop: ClosedLoop, num_episodes: int, seed: int) -> Iterator[Finding]:
     episodes = [run_episode(loop, index, seed=seed) for index in range(num_episodes)]
     causes: dict[str, int] = {}
     for episode in episodes:
         if not episode.is_safe:
             causes[episode.cause] = causes.get(episode.cause, 0) + 1
-    yield _ok("starts can be sampled", f"{num_episodes} episodes simulated")
+    yield passed("starts can be sampled", f"{num_episodes} episodes simulated")
     lost = sum(episode.num_steps == 0 for episode in episodes)
     if lost > num_episodes / 4:
-        yield _bad(
+        yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
             "narrow the ranges under 'start', or widen 'safe_set'",
         )
-    if causes.pop("diverged", 0):
-        yield _bad(
+    if causes.pop(DIVERGED, 0):
+        yield failed(
             "simulation", "an episode diverged", "lower time_step_s [s], or the gains; see masses"
         )
     share = sum(causes.values()) / num_episodes
@@ -366,19 +340,12 @@ def _episodes(state: _State, num_episodes: int, seed: int) -> Iterator[Finding]:
     )
     low, high = _UNSAFE_SHARES
     if low <= share <= high:
-        yield _ok("share of unsafe episodes", message)
+        yield passed("share of unsafe episodes", message)
     else:
-        yield _bad(
+        yield failed(
             "share of unsafe episodes",
             message,
             "widen the ranges of start and plan, or narrow 'safe_set': Γ learns from both kinds"
             if share < low
             else "narrow the ranges of start and plan, or widen 'safe_set': Γ learns from both",
         )
-
-
-def _of(value: _Value | None) -> _Value:
-    """What an earlier check has set."""
-    if value is None:
-        raise ValueError("an earlier item has failed")
-    return value

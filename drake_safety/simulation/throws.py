@@ -1,8 +1,8 @@
-"""Throws: balls thrown at a balancing robot, logged once, judged and recovered from by anyone.
+"""Throws: balls thrown at a balancing robot, and logs of them.
 
-What happens before a recovery starts does not depend on there being one. A throw is therefore
-logged without recovery; any Γ or classifier is evaluated on the log; and only the recovery itself
-is simulated again, from the same seed, with the trigger at the instant that was found.
+The motion before a recovery does not depend on the trigger. A throw is therefore logged once
+without recovery, every Γ or baseline is evaluated on the log, and only the recovery is simulated
+again, from the same seed, with the trigger at the time found.
 """
 
 from __future__ import annotations
@@ -25,36 +25,35 @@ from drake_safety.simulation.goal_motion import Mishap
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import (
     Progress,
-    batches,
     episode_rng,
-    parallel_map,
+    run_batches,
     worker_loop,
 )
 from drake_safety.simulation.scenario import Scenario
 
-_FLIGHT_S = 0.1  # From the ball's appearance to its touch.
-_EARLIEST_S, _LATEST_S = 0.4, 1.2  # When a random ball touches.
-_AFTER_S = 2.5  # What follows the touch.
+_FLIGHT_S = 0.1  # From the ball's release to its impact.
+_EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
+_AFTER_S = 2.5  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
 
 @dataclass(kw_only=True, eq=False)
 class ThrowLog(Mishap):
-    """One throw: rows every ``log_period_s``, and what came of it.
+    """Log of one throw, with a row every ``log_period_s``.
 
     Attributes:
         index: Number of the throw in its set.
-        throw: Mass, speed, direction; ``throw.time_s`` is the touch [s].
+        throw: Mass, speed, direction; ``throw.time_s`` is the time of impact [s].
         time_s: [s], (N,).
-        state: (N, n_s), as the assessor sees it.
+        state: (N, n_s), the assessor's input.
         desired_preview: (N, H n_z).
         features: (N, n_f).
         margins: (N, n_c), of the true state.
         plant_state: (N, n_q + n_v) of the robot alone.
-        trigger_time_s: When recovery was triggered [s]; NaN without.
-        recovery_active: (N,), whether a recovery step was under way.
-        violations: Rows in which what must not happen did: see :class:`ViolationCounter`.
-        extra: Other ports that were asked for, (N, size) each.
+        trigger_time_s: Time at which recovery was triggered [s]; NaN if it was not.
+        recovery_active: (N,), whether recovery was active.
+        violations: Number of rows with each violation: see :class:`ViolationCounter`.
+        extra: Other ports, (N, size) each.
     """
 
     index: int
@@ -72,7 +71,7 @@ class ThrowLog(Mishap):
 
     @property
     def recovery_intervals_s(self) -> list[tuple[float, float]]:
-        """First and last instant of each recovery step [s]; one under way at the end ends there."""
+        """First and last time of each recovery [s]; one still active at the end ends there."""
         is_first = np.diff(self.recovery_active, prepend=0.0) > 0
         is_last = np.diff(self.recovery_active, append=0.0) < 0
         starts, ends = self.time_s[is_first].tolist(), self.time_s[is_last].tolist()
@@ -80,7 +79,7 @@ class ThrowLog(Mishap):
 
 
 class ViolationCounter:
-    """Counts the rows of a log in which something happens that no success may rest on.
+    """Counts the rows of a log with physically implausible states, which invalidate a success.
 
     - ``legs_collide``: two bodies of the robot that are not neighbours penetrate each other;
     - ``joint_position``: a joint more than 0.02 rad beyond a stop;
@@ -122,7 +121,7 @@ class ViolationCounter:
         )
 
     def count(self, context: Context) -> None:
-        """Looks at one instant.
+        """Counts the violations at one time.
 
         Args:
             context: The loop's root Context.
@@ -162,8 +161,8 @@ def play_throws(
     Args:
         loop: A closed loop with a ball.
         simulator: Its initialised simulator.
-        throws: The balls; each appears shortly before ``time_s``, when it touches.
-        duration_s: When to end [s].
+        throws: The balls; each is released shortly before its impact at ``time_s``.
+        duration_s: End time [s].
         log_period_s: Time between two rows [s].
 
     Yields:
@@ -194,19 +193,19 @@ def run_throw(
     ports: tuple[str, ...] = (),
     realtime_rate: float = 0.0,
 ) -> ThrowLog:
-    """Throws one random ball, or given ones, at a robot in calm motion.
+    """Throws one random ball, or given ones, at a robot in undisturbed motion.
 
     Args:
-        loop: A closed loop with a ball. With an input port ``safety_probability`` (recovery
-            without Γ) recovery is triggered at ``trigger_time_s``; with Γ it triggers itself.
-        index: Number of the throw: start, plan and ball follow from it and the seed.
+        loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
+            without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
+        index: Number of the throw; it and the seed determine start, plan and ball.
         seed: Seed of the set.
-        trigger_time_s: When to trigger; NaN for never.
+        trigger_time_s: Time of the trigger [s]; NaN for never.
         throws: Balls in place of the random one.
-        duration_s: When to end; by default 2.5 s after the first touch.
+        duration_s: End time [s]; by default 2.5 s after the first impact.
         log_period_s: Time between two rows [s].
         ports: More output ports to log, into ``extra``.
-        realtime_rate: How fast to run at most, for watching; 0 for as fast as it goes.
+        realtime_rate: Target real-time rate; 0 for as fast as possible.
 
     Returns:
         The log, which ends at a fall.
@@ -246,7 +245,7 @@ def run_throw(
             fall_s = time
             break
         if probability is not None and time >= trigger_time_s - 1e-9:
-            # One low value is enough: the trigger latches.
+            # One low value suffices: the trigger latches.
             probability.FixValue(context, [0.0 if math.isnan(triggered_s) else 1.0])
             triggered_s = time if math.isnan(triggered_s) else triggered_s
     arrays = recorder.arrays()
@@ -281,27 +280,31 @@ def run_throws(
 
     Args:
         scenario: The scenario.
-        indices: Which throws of the set.
+        indices: Numbers of the throws.
         seed: Seed of the set.
-        variation: Which plant.
-        trigger_times_s: Per throw, when recovery is triggered [s]; by default there is none.
-        num_workers: Processes; as many as there are cores by default.
-        progress: Called with the number done and the number wanted.
+        variation: The plant.
+        trigger_times_s: Time of the trigger by index [s]; by default there is no recovery.
+        num_workers: Number of processes; that of cores by default.
+        progress: Called with the number done and in all.
 
     Returns:
         The logs, in the order of ``indices``.
     """
     options = {"ball": True, "recovery": trigger_times_s is not None}
     times = trigger_times_s or {}
-    arguments = [
-        (scenario, variation, options, seed, [(i, times.get(i, math.nan)) for i in batch])
-        for batch in batches(indices)
-    ]
-    logs: list[ThrowLog] = []
-    for batch in parallel_map(_throw_batch, arguments, num_workers):
-        logs += batch
-        if progress is not None:
-            progress(len(logs), len(indices))
+    logs = run_batches(
+        _throw_batch,
+        indices,
+        lambda batch: (
+            scenario,
+            variation,
+            options,
+            seed,
+            [(i, times.get(i, math.nan)) for i in batch],
+        ),
+        num_workers=num_workers,
+        progress=progress,
+    )
     by_index = {log.index: log for log in logs}
     return [by_index[index] for index in indices]
 
@@ -318,11 +321,11 @@ def _throw_batch(
 
 
 def trigger_time(log: ThrowLog, probability: np.ndarray, threshold: float) -> float:
-    """When a probability first falls below a threshold [s]; NaN if it never does.
+    """Time at which a probability first falls below a threshold [s]; NaN if it never does.
 
     Args:
         log: The log of a throw without recovery.
-        probability: Safety probability of every row, (N,); NaN triggers.
+        probability: Safety probability of every row, (N,); NaN counts as below.
         threshold: Γ_thre.
     """
     below = ~(probability >= threshold)

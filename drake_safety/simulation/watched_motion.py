@@ -1,4 +1,4 @@
-"""What somebody who watches a robot sees of a motion, and when it went wrong."""
+"""Motions as a monitor sees them, with the outcome."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from drake_safety.simulation.goal_motion import GoalMotion, Mishap
 from drake_safety.simulation.throws import ThrowLog
 
 SEEN = ("state", "desired_preview", "features")
-"""Output ports that a monitor sees."""
+"""Output ports that are a monitor's inputs."""
 
 
 @dataclass(kw_only=True, eq=False)
 class WatchedMotion(Mishap):
-    """One motion, pushed or not: rows of what a monitor sees, and what came of it.
+    """One motion, pushed or not: the monitor's inputs and the outcome.
 
     Attributes:
-        index: Number of the motion in its set; what begins alike has the same.
-        push_time_s: When the push begins [s]; infinite if nobody pushes.
+        index: Number of the motion in its set; an undisturbed and a pushed one share it.
+        push_time_s: Start of the push [s]; infinite without one.
         time_s: [s], (N,).
-        state: (N, n_s), as the assessor sees it.
+        state: (N, n_s), the assessor's input.
         desired_preview: (N, H n_z).
         features: (N, n_f).
         margins: (N, n_c), of the true state.
@@ -38,7 +38,7 @@ class WatchedMotion(Mishap):
 
     @classmethod
     def of_throw(cls, log: ThrowLog) -> WatchedMotion:
-        """A throw without recovery; the push is the ball's touch."""
+        """Makes a motion of a throw without recovery; the push is the ball's impact."""
         return cls(
             index=log.index,
             push_time_s=log.throw.time_s,
@@ -53,7 +53,7 @@ class WatchedMotion(Mishap):
 
     @classmethod
     def of_goal_motion(cls, index: int, motion: GoalMotion) -> WatchedMotion:
-        """A motion to a goal that was run with the ports that a monitor sees."""
+        """Makes a motion of a motion to a goal that was logged with the ports ``SEEN``."""
         return cls(
             index=index,
             push_time_s=math.inf if motion.push is None else motion.push.time_s,

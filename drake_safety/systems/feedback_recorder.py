@@ -1,4 +1,4 @@
-"""FeedbackRecorder: a running robot's motion, cut into windows that adaptation can learn from."""
+"""FeedbackRecorder: labelled windows of a running robot's motion, for adaptation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from drake_safety.systems.float_system import FloatSystem
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedWindow:
-    """A stretch of a robot's motion that is labelled.
+    """A labelled window of a robot's motion.
 
     Attributes:
-        episode: The stretch as an episode; its time starts at zero.
-        plant_state: [q; v] of the robot at its first row, (n_q + n_v,).
-        start_time_s: When it began [s].
+        episode: The window as an episode; its time starts at zero.
+        plant_state: [q; v] of the robot at the first row, (n_q + n_v,).
+        start_time_s: Time of the first row [s].
     """
 
     episode: Episode
@@ -30,15 +30,15 @@ class RecordedWindow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """What a recorder's Context holds: immutable, so that copies of the Context share it.
+    """State of a recorder; immutable, so that copies of the Context share it.
 
     Attributes:
         rows: Rows of the open window, each the ports' vectors in order.
-        times_s: When they were sampled [s].
-        plant_state: [q; v] at the first of them.
-        windows: Finished windows.
-        num_finished: How many there have been.
-        num_dropped: How many of them were dropped, as nobody took them.
+        times_s: Times of the rows [s].
+        plant_state: [q; v] at the first row.
+        windows: Finished windows that were not taken yet.
+        num_finished: Number of windows finished so far.
+        num_dropped: Number of finished windows dropped because the capacity was exceeded.
     """
 
     rows: tuple[tuple[np.ndarray, ...], ...] = ()
@@ -53,7 +53,7 @@ class Recording:
 
 
 class FeedbackRecorder(FloatSystem, LeafSystem):
-    """Records windows of a running robot; each is labelled by how it ended.
+    """Records windows of a running robot's motion; the label of each is how it ended.
 
     .. pydrake_system::
 
@@ -71,18 +71,18 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
         output_ports:
         - num_finished
 
-    A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` of them, and the
-    next one begins with its last row; or unsafe as soon as ``safe``, looked at every
+    A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
+    next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
     ``watch_period_s``, is below one, and the next one begins when it is one again. When time
-    jumps, as at a reset, the open window is dropped. All of it lives in the Context:
-    :meth:`take_windows` empties it. Without ``true_state``, as on a robot, it is ``state``.
+    jumps, as at a reset, the open window is dropped. The windows are state of the Context;
+    :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a robot.
 
     Args:
-        info: What the windows share as episodes.
-        num_steps: Rows of a safe window after its first.
+        info: Metadata of the windows as episodes.
+        num_steps: Steps of a safe window.
         plant_state_size: n_q + n_v.
-        watch_period_s: Time between two looks at ``safe`` [s].
-        capacity: Finished windows that are kept until they are taken; then the oldest go.
+        watch_period_s: Sampling period of ``safe`` [s].
+        capacity: Largest number of finished windows kept; the oldest are dropped.
 
     Raises:
         ValueError: A window is shorter than the horizon.
@@ -120,7 +120,7 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
             "plant_state": plant_state_size,
         }
         self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
-        # Whether the safe set was left since the last row, and the margins then.
+        # A latch: whether the safe set was left since the last row, and the margins at that time.
         self.DeclareDiscreteState(1 + num_margins)
         self._index = self.DeclareAbstractState(Value(Recording()))
         self.DeclarePeriodicDiscreteUpdateEvent(watch_period_s, 0.0, self._watch)
@@ -128,14 +128,14 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
         self.DeclareVectorOutputPort("num_finished", BasicVector(1), self._calc_num_finished)
 
     def recording(self, context: Context) -> Recording:
-        """What a Context holds."""
+        """Returns the recorder's state in a Context."""
         return context.get_abstract_state(int(self._index)).get_value()
 
     def take_windows(self, context: Context) -> list[RecordedWindow]:
-        """The finished windows of a Context, which then holds none.
+        """Removes the finished windows from a Context and returns them.
 
         Args:
-            context: This system's Context; the open window goes on.
+            context: This system's Context; the open window is kept.
         """
         recording = self.recording(context)
         context.SetAbstractState(int(self._index), replace(recording, windows=()))
@@ -151,13 +151,10 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
             discrete_state.set_value(np.concatenate([[1.0], margins]))
 
     def _row(self, context: Context) -> tuple[np.ndarray, ...]:
-        row = []
-        for name in RECORDED:
-            source = name
-            if name == "true_state" and not self._ports[name].HasValue(context):
-                source = "state"
-            row.append(self._ports[source].Eval(context).copy())
-        return tuple(row)
+        ports = dict(self._ports)
+        if not ports["true_state"].HasValue(context):
+            ports["true_state"] = ports["state"]
+        return tuple(ports[name].Eval(context).copy() for name in RECORDED)
 
     def _record(self, context: Context, state: State) -> None:
         recording = self.recording(context)
@@ -210,7 +207,7 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
             is_safe=is_safe,
             cause="" if is_safe else self.info.constraint_names[worst],
         )
-        Episodes(self.info, [episode])  # Refuses what does not fit.
+        Episodes(self.info, [episode])  # Checks the shapes.
         if recording.plant_state is None:
             raise ValueError("feedback recorder: a window without its first plant state")
         window = RecordedWindow(

@@ -1,4 +1,4 @@
-"""FloatSystem: what systems of floats can offer of Drake's cloning and scalar conversion."""
+"""FloatSystem: cloning of systems that support no scalar conversion."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any, NoReturn, Self
 
 
 class FloatSystem:
-    """A system, or a diagram, that is built anew to be cloned and has no other scalar type.
+    """A system or diagram of scalar type float that is cloned by calling its constructor again.
 
-    Drake clones by scalar conversion, of which systems written in Python are no part unless they
-    are templates on the scalar type. Those here cannot be: they ask networks, QP solvers and a
-    MultibodyPlant of floats. :meth:`Clone` therefore calls the constructor again with the same
-    arguments. What is immutable, or was passed in, is shared: a robot's kinematics keeps a
-    scratch Context, so clones do not belong in different threads. Drake's own ``Diagram.Clone()``
-    and ``copy.deepcopy`` of a diagram with such a system in it still raise.
+    Drake clones by scalar conversion, which systems written in Python support only as templates on
+    the scalar type. The systems of this package evaluate networks, QP solvers and a MultibodyPlant
+    of floats, so :meth:`Clone` calls the constructor with the same arguments. Objects passed to the
+    constructor are shared: a robot's kinematics has a scratch Context, so clones must not be used
+    in different threads. Drake's own ``Diagram.Clone()`` and ``copy.deepcopy`` of a diagram with
+    such a system still raise.
 
-    Comes before the Drake class among the bases: ``class Planner(FloatSystem, LeafSystem)``.
+    Must precede the Drake class among the bases: ``class Planner(FloatSystem, LeafSystem)``.
     """
 
     _constructed_with: tuple[tuple[Any, ...], dict[str, Any]]
@@ -24,13 +24,13 @@ class FloatSystem:
     set_name: Callable[[str], None]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Keeps the arguments, whatever the constructor makes of them."""
+        """Stores the constructor's arguments."""
         system = super().__new__(cls, *args, **kwargs)
         system._constructed_with = args, kwargs
         return system
 
     def Clone(self) -> Self:
-        """Another system of the same constructor arguments and name."""
+        """Returns a new system with the same constructor arguments and name."""
         args, kwargs = self._constructed_with
         clone = type(self)(*args, **kwargs)
         clone.set_name(self.get_name())
@@ -40,11 +40,11 @@ class FloatSystem:
         return self.Clone()
 
     def ToAutoDiffXd(self) -> NoReturn:
-        """Raises `TypeError`, which says why."""
+        """Raises `TypeError`."""
         self._refuse("AutoDiffXd")
 
     def ToSymbolic(self) -> NoReturn:
-        """Raises `TypeError`, which says why."""
+        """Raises `TypeError`."""
         self._refuse("symbolic Expression")
 
     def _refuse(self, scalar: str) -> NoReturn:

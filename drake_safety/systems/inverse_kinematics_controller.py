@@ -1,4 +1,4 @@
-"""InverseKinematicsController: a desired base position becomes joint position commands."""
+"""InverseKinematicsController: joint position commands from a desired base position."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
 from drake_safety.systems.float_system import FloatSystem
 
-_RATE_SHARE = 0.7  # Of a joint's speed limit; the servo overshoots a ramp by the rest.
-_LIFTED_M = 0.005  # A foot whose set point is this far over the ground carries no weight.
+_RATE_SHARE = 0.7  # Of a joint's speed limit; the rest is left for the servo's overshoot.
+_LIFTED_M = 0.005  # Height of a foot's set point above which the foot carries no weight.
 
 
 class InverseKinematicsController(FloatSystem, LeafSystem):
-    """Joint positions that carry a level base over given feet, with a gravity offset.
+    """Joint positions of a level base over given feet, with a gravity offset.
 
     .. pydrake_system::
 
@@ -30,17 +30,17 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         - desired_joint_state
 
     The command is a discrete state, so the output has no direct feedthrough. Base yaw is
-    ``desired_yaw``, or follows the planar fit of the feet where that is not connected. The joint
-    servos are the plant's own implicit ones (q̇ of the command is the rate of the set point); to
-    their set point the static offset τ/k_p is added, with τ from the robot model's weight split
-    over the feet that are down, which removes the sag of a servo of finite stiffness. Commands
-    respect the joint limits, and set points move no faster than 0.7 of the joints' speed limits.
+    ``desired_yaw``, or that of the planar fit of the feet if this is not connected. The joint
+    servos are the plant's implicit ones (q̇ of the command is the rate of the set point). The
+    static offset τ/k_p is added to their set points, with τ from the model's weight distributed
+    over the feet on the ground; it removes the sag of a servo of finite stiffness. Commands
+    respect the joint limits, and set points move at most at 0.7 of the joints' speed limits.
 
     Args:
-        kinematics: The robot as the controller believes it to be.
+        kinematics: The controller's model of the robot.
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
         period_s: Control period [s].
-        offset_s: Time of the first tick; commands of what drives it are then fresh [s].
+        offset_s: Time of the first update, after those of its inputs [s].
 
     Raises:
         ValueError: A stiffness is not positive.
@@ -68,7 +68,7 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         self._period_s = period_s
         n_j = kinematics.num_joints
         self._limits = np.ascontiguousarray(kinematics.position_limits.T)
-        # Looked up by name in every tick, ports would cost more than what they carry.
+        # Looking up ports by name in every update would cost more than evaluating them.
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", kinematics.num_positions + kinematics.num_velocities
         )
@@ -86,7 +86,7 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
-        """Sets where the feet stand while ``desired_foot_positions`` is not connected.
+        """Sets the foot positions used while ``desired_foot_positions`` is not connected.
 
         Args:
             context: This system's Context.
@@ -95,7 +95,7 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
 
     def foot_positions(self, context: Context) -> np.ndarray:
-        """Where the feet are to stand now: centres of the contact spheres, (n_c, 3) [m]."""
+        """The present set points of the feet: centres of the contact spheres, (n_c, 3) [m]."""
         if self._feet_port.HasValue(context):
             feet = self._feet_port.Eval(context)
         else:
@@ -135,9 +135,9 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         previous = context.get_discrete_state(self._set_point).get_value()
         last_rate = context.get_discrete_state(self._command).get_value()[len(previous) :]
-        # Smooth set points go on as they went: most ticks then need no Newton step at all.
-        wanted, torques = self._solve(context, previous + self._period_s * last_rate)
-        rate = (wanted - previous) / self._period_s
+        # Extrapolation of smooth set points: most updates then need no Newton step.
+        desired, torques = self._solve(context, previous + self._period_s * last_rate)
+        rate = (desired - previous) / self._period_s
         rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
         joints = previous + self._period_s * rate
         command = np.concatenate([self._add_offset(joints, torques), rate])

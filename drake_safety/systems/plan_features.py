@@ -1,23 +1,11 @@
-"""PlanFeatures: the safe set's margins now and along the plan, as inputs of the assessor."""
+"""PlanFeatures: the safe set's features of state and plan, as inputs of the assessor."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
-import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.systems.float_system import FloatSystem
-
-
-class FeatureMap(Protocol):
-    """What a safe set with features offers beside its margins."""
-
-    feature_names: list[str]
-
-    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """Features (n_f,) of a measured state and the preview (H, n_z)."""
-        ...
+from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 
 class PlanFeatures(FloatSystem, LeafSystem):
@@ -33,7 +21,7 @@ class PlanFeatures(FloatSystem, LeafSystem):
         - features
 
     Args:
-        feature_map: The safe set.
+        safe_set: The safe set.
         num_positions: n_q of the plant state.
         num_velocities: n_v of the plant state.
         horizon: H, samples of the preview.
@@ -42,7 +30,7 @@ class PlanFeatures(FloatSystem, LeafSystem):
 
     def __init__(
         self,
-        feature_map: FeatureMap,
+        safe_set: FeaturedSafeSet,
         num_positions: int,
         num_velocities: int,
         *,
@@ -50,10 +38,10 @@ class PlanFeatures(FloatSystem, LeafSystem):
         num_outputs: int = 3,
     ):
         super().__init__()
-        self._feature_map = feature_map
+        self._safe_set = safe_set
         self._n_q = num_positions
         self._preview_shape = (horizon, num_outputs)
-        self.feature_names = list(feature_map.feature_names)
+        self.feature_names = list(safe_set.feature_names)
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", num_positions + num_velocities
         )
@@ -66,5 +54,5 @@ class PlanFeatures(FloatSystem, LeafSystem):
         state = self._state_port.Eval(context)
         preview = self._preview_port.Eval(context).reshape(self._preview_shape)
         output.SetFromVector(
-            self._feature_map.features(state[: self._n_q], state[self._n_q :], preview)
+            self._safe_set.features(state[: self._n_q], state[self._n_q :], preview)
         )

@@ -1,4 +1,4 @@
-"""PushSource: a force on a body of the robot, from one instant to another."""
+"""PushSource: a force on a body of the robot during an interval."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TOLERANCE_S = 1e-9
 
 
 class PushSource(FloatSystem, LeafSystem):
-    """Pushes one body of a robot at its centre of mass; which one, how and when is a parameter.
+    """Pushes one body of a robot at its centre of mass; the push is a parameter of the Context.
 
     .. pydrake_system::
 
@@ -31,7 +31,7 @@ class PushSource(FloatSystem, LeafSystem):
     Args:
         plant: The finalized plant.
         instance: The robot in it.
-        period_s: Time between two looks at the clock [s].
+        period_s: Update period [s].
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
@@ -60,14 +60,14 @@ class PushSource(FloatSystem, LeafSystem):
         start_s: float,
         duration_s: float,
     ) -> None:
-        """Plans the push of a run; it replaces an earlier one.
+        """Sets the push; it replaces an earlier one.
 
         Args:
             context: This system's Context.
             body: Name of the body.
             force_n: Force in the world, (3,) [N].
-            start_s: When it begins [s].
-            duration_s: How long it lasts [s].
+            start_s: Start time [s].
+            duration_s: Duration [s].
 
         Raises:
             ValueError: The robot has no such body.
@@ -83,7 +83,7 @@ class PushSource(FloatSystem, LeafSystem):
         )
 
     def clear_push(self, context: Context) -> None:
-        """Nothing pushes the robot from the next look at the clock on.
+        """Removes the push from the next update on.
 
         Args:
             context: This system's Context.

@@ -1,4 +1,4 @@
-"""RecoveryStepPlanner: steps that catch a robot, planned again at every tick."""
+"""RecoveryStepPlanner: capture steps, replanned at every update."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _IDLE, _STEPPING, _RETURNING, _DONE = 0.0, 1.0, 2.0, 3.0
 
 
 class RecoveryStepPlanner(FloatSystem, LeafSystem):
-    """Catches the robot by swinging groups of feet in turn, then returns the base over them.
+    """Steps with alternating groups of feet, then returns the base to the nominal set point.
 
     .. pydrake_system::
 
@@ -45,26 +45,26 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         - stance_pose
         - recovery_done
 
-    While idle, the feet stay where they were set (:meth:`set_stance`). When
-    ``recovery_active`` rises, the group of feet whose partners' line is nearest the capture
-    point swings to Raibert footholds that follow the base at every tick; the base set point
-    follows the measured base at the standing height, so the stance legs carry the weight without
-    pulling it back. The heading of the stance that the recovery began in is held: the stance legs
-    twist the base towards it and against its yaw rate, and the footholds follow the base. Groups
-    alternate until the robot can stand: its capture point is well inside the support polygon, and
-    it is about at the heading. The base then comes to rest as an inverted pendulum does over its
-    capture point, and is led to the nominal planner's set point, which stands in the stance pose of
-    the new footholds; should the capture point come near the polygon's edge meanwhile, the robot
-    steps on. After that ``recovery_done`` is 1 until ``recovery_active`` has fallen.
+    While idle, the feet keep the positions of :meth:`set_stance`. When ``recovery_active`` rises,
+    the group of feet whose partners' line is nearest to the capture point swings to Raibert
+    footholds, which follow the base at every update; the base set point follows the measured base
+    at the standing height, so that the stance legs carry the weight without pulling the base back.
+    The heading of the initial stance is held: the stance legs twist the base towards it and damp
+    its yaw rate, and the footholds follow the base. Groups alternate until the capture point is
+    well inside the support polygon and the heading error is small. The base then comes to rest
+    like an inverted pendulum over its capture point, and moves to the nominal planner's set point
+    in the stance frame of the new footholds; if the capture point comes near the polygon's edge
+    meanwhile, the robot steps again. After that ``recovery_done`` is 1 until ``recovery_active``
+    has fallen.
 
-    Preview and outlook are the base set point, held, in the frame of the stance as it is to be
-    now. No output has direct feedthrough.
+    Preview and outlook are the base set point, held constant, in the stance frame of the present
+    set points. No output has direct feedthrough.
 
     Args:
-        kinematics: The robot as the controller believes it to be.
-        parameters: Numbers of the step.
+        kinematics: The controller's model of the robot.
+        parameters: Parameters of the recovery steps.
         period_s: Planning period [s].
-        offset_s: Time of the first tick [s].
+        offset_s: Time of the first update [s].
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """
@@ -92,16 +92,16 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         )
         self._active_port = self.DeclareVectorInputPort("recovery_active", 1)
         self._nominal_port = self.DeclareVectorInputPort("nominal_desired_output", 3)
-        # Discrete state groups, each of which is one thing.
+        # One discrete state group per quantity.
         self._mode = self.DeclareDiscreteState(1)
         self._swinging_group = self.DeclareDiscreteState(1)
         self._num_steps = self.DeclareDiscreteState(1)
         self._start_s = self.DeclareDiscreteState(1)  # Of the swing, or of the return.
-        self._heading = self.DeclareDiscreteState(1)  # To be held.
+        self._heading = self.DeclareDiscreteState(1)  # Desired.
         self._return_start = self.DeclareDiscreteState(6)  # Position and velocity of the base.
-        self._planted = self.DeclareDiscreteState(n_p)  # Where feet stand, or left the ground.
+        self._planted = self.DeclareDiscreteState(n_p)  # Last contact positions.
         self._set_point = self.DeclareDiscreteState(3)
-        self._feet = self.DeclareDiscreteState(n_p)  # As the controller is told them.
+        self._feet = self.DeclareDiscreteState(n_p)  # Set points for the controller.
         self._yaw = self.DeclareDiscreteState(1)
         self._stance = self.DeclareDiscreteState(3)  # x, y, yaw
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
@@ -122,7 +122,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         self.DeclareVectorOutputPort("recovery_done", BasicVector(1), self._calc_done, ticket)
 
     def set_stance(self, context: Context, p_WC: np.ndarray, stance_pose: np.ndarray) -> None:
-        """Sets where the feet stand, and puts the planner to rest.
+        """Sets the foot positions, and the planner to idle.
 
         Args:
             context: This system's Context.
@@ -180,7 +180,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         discrete_state.set_value(self._start_s, [time])
 
     def _plant(self, discrete_state: DiscreteValues, q: np.ndarray, time: float) -> None:
-        """Ends a swing where the feet are, and lets the other group swing."""
+        """Ends a swing at the measured foot positions, and starts that of the other group."""
         kinematics = self._kinematics
         group = int(discrete_state.get_value(self._swinging_group)[0])
         contacts, measured = self._contacts(discrete_state), kinematics.contact_positions(q)
@@ -251,8 +251,8 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         twist = error - parameters.yaw_damping_s * v[2]
         twist = min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         base = np.array([p_WB[0], p_WB[1], kinematics.standing_height])
-        # The controller solves for a level base at the set point; a swinging foot must reach its
-        # place from the base as it is.
+        # The controller solves for a level base at the set point; a swinging foot is given relative
+        # to the measured base.
         X_adjust = (
             RigidTransform(RotationMatrix.MakeZRotation(yaw + twist), base)
             @ RigidTransform(R_WB, p_WB).inverse()
@@ -262,7 +262,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         remaining_s = parameters.step_duration_s - elapsed_s
         R_WF = RotationMatrix.MakeZRotation(yaw).matrix()[:2, :2]
         feet = self._contacts(discrete_state)
-        told = feet.copy()
+        set_points = feet.copy()
         group = int(discrete_state.get_value(self._swinging_group)[0])
         for foot in self._groups[group]:
             rows = kinematics.foot_slices[foot]
@@ -272,9 +272,9 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
             for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
                 target = np.append(centre + R_WF @ offset, kinematics.foot_radii[i])
                 feet[i] = swing_position(feet[i], target, phase, parameters.lift_m)
-                told[i] = X_adjust @ feet[i]
+                set_points[i] = X_adjust @ feet[i]
         discrete_state.set_value(self._set_point, base)
-        discrete_state.set_value(self._feet, told.ravel())
+        discrete_state.set_value(self._feet, set_points.ravel())
         discrete_state.set_value(self._yaw, [yaw + twist])
         discrete_state.set_value(self._stance, fit_stance(feet, kinematics.nominal_contacts))
 

@@ -1,4 +1,4 @@
-"""RecoverySwitch: trigger, step planner and Drake's PortSwitch as one block."""
+"""RecoverySwitch: a diagram of recovery trigger, step planner and PortSwitches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 
 class RecoverySwitch(FloatSystem, Diagram):
-    """Passes the nominal set point through until Γ falls, then plays recovery steps.
+    """Passes the nominal set point until Γ falls below its threshold, then recovery steps.
 
     .. pydrake_system::
 
@@ -33,17 +33,17 @@ class RecoverySwitch(FloatSystem, Diagram):
         - stance_pose
         - recovery_active
 
-    Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan goes on over the new
-    footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. What the robot
-    is about to do is told by preview and outlook alike: connect whatever judges it to these.
+    Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
+    footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. Connect
+    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
 
     Args:
-        kinematics: The robot as the controller believes it to be.
-        parameters: Numbers of the step.
+        kinematics: The controller's model of the robot.
+        parameters: Parameters of the recovery steps.
         threshold: Γ_thre.
         period_s: Period of trigger and step planner [s].
-        offset_s: Delay of the trigger behind Γ, and of the step planner behind the trigger [s].
-            Simultaneous discrete updates would each add a whole period.
+        offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].
+            Simultaneous discrete updates would add a period of delay each.
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """

@@ -1,4 +1,4 @@
-"""RecoveryTrigger: latches when the safety probability falls below its threshold."""
+"""RecoveryTrigger: a latch that is set when Γ falls below its threshold."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drake_safety.systems.float_system import FloatSystem
 
 
 class RecoveryTrigger(FloatSystem, LeafSystem):
-    """Switches to recovery when Γ < Γ_thre, and back when the recovery reports that it is done.
+    """Switches to recovery when Γ < Γ_thre, and back when the recovery is done.
 
     .. pydrake_system::
 
@@ -21,14 +21,14 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         - port_selector
         - recovery_active
 
-    The trigger latches: once fired it stays active, whatever Γ does, until ``recovery_done``
-    is 1. A Γ that is NaN fires. ``port_selector`` drives a PortSwitch whose ports were declared
-    ``nominal`` first, ``recovery`` second.
+    The trigger latches: once active it stays active until ``recovery_done`` is 1. A Γ that is NaN
+    activates it. ``port_selector`` drives a PortSwitch whose ports were declared ``nominal``
+    first, ``recovery`` second.
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6.
-        period_s: Time between two looks at Γ [s].
-        offset_s: Time of the first look [s].
+        period_s: Update period [s].
+        offset_s: Time of the first update [s].
 
     Raises:
         ValueError: The threshold is outside [0, 1].

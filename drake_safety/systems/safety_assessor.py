@@ -1,4 +1,4 @@
-"""SafetyAssessor: the belief grid at work inside a diagram."""
+"""SafetyAssessor: a fitted assessment as a system."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class SafetyAssessor(FloatSystem, LeafSystem):
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
-    b_safe / (1 - μ), 0 where nothing is known; ``calibrated_safety_probability`` is what the maps'
-    heads say, corrected by what feedback has shown. The beliefs of the grid and the correction are
-    numeric parameters of the Context: :meth:`adopt` replaces them by those of an adapted
-    assessment, between simulations and during them. The embedding is immutable. A state, preview or
-    feature that is not finite has the EMPTY belief (0, 0, 1).
+    b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
+    heads with the correction from feedback. The beliefs of the grid and the correction are numeric
+    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
+    between simulations and during them. The embedding is immutable. The belief of a state, preview
+    or feature that is not finite is (0, 0, 1).
 
     Args:
         assessment: A fitted assessment.
@@ -59,7 +59,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         info = assessment.info_
         self._assessment = assessment
         self._shape = assessment.beliefs_.shape
-        # A diagram without features has nothing to connect.
+        # A diagram without features has no port to connect.
         self.reads_features = assessment.uses_features and bool(info.feature_names)
         self._no_features = np.empty(0) if assessment.uses_features else None
         self.constraint_names = list(info.constraint_names)
@@ -70,7 +70,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         correction = assessment.correction_
         self._correction_shapes = [getattr(correction, name).shape for name in _CORRECTION]
         self._correction_index = self.DeclareNumericParameter(BasicVector(_packed(correction)))
-        # Where there are no heads there is no logit to correct.
+        # Without heads there is no logit to correct.
         self._has_heads = assessment.base_logit_ is not None
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
@@ -103,7 +103,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             )
 
     def get_beliefs(self, context: Context) -> np.ndarray:
-        """The beliefs in a Context, shaped as the assessment's ``beliefs_``."""
+        """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
         return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
 
     def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
@@ -114,13 +114,13 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             beliefs: Shaped as the assessment's ``beliefs_``.
 
         Raises:
-            ValueError: Another shape.
+            ValueError: The beliefs have another shape.
         """
         _check_shape("beliefs", beliefs, self._shape)
         _replace(context, self._belief_index, beliefs)
 
     def get_correction(self, context: Context) -> Correction:
-        """The correction in a Context."""
+        """Returns the correction in a Context."""
         values = context.get_numeric_parameter(self._correction_index).get_value()
         parts, start = [], 0
         for shape in self._correction_shapes:
@@ -130,14 +130,14 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         return Correction(*parts)
 
     def set_correction(self, context: Context, correction: Correction) -> None:
-        """Replaces what is added to the maps' logit.
+        """Replaces the correction of the maps' logit.
 
         Args:
             context: This system's Context.
-            correction: Of the shapes that the assessment's own has.
+            correction: Its arrays are shaped as those of the assessment.
 
         Raises:
-            ValueError: Another shape; nothing is replaced.
+            ValueError: An array has another shape; nothing is replaced.
         """
         for name, shape in zip(_CORRECTION, self._correction_shapes, strict=True):
             _check_shape(f"the correction's {name}", getattr(correction, name), shape)
@@ -148,10 +148,10 @@ class SafetyAssessor(FloatSystem, LeafSystem):
 
         Args:
             context: This system's Context.
-            adapted: What ``adapt`` returned.
+            adapted: The result of ``adapt``.
 
         Raises:
-            ValueError: It has other maps.
+            ValueError: The adapted assessment has other maps.
         """
         if adapted.embedding_ is not self._assessment.embedding_ and not (
             adapted.embedding_.is_same(self._assessment.embedding_)
@@ -163,7 +163,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         self.set_correction(context, adapted.correction_)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        said = self._assessment.predict_one(
+        prediction = self._assessment.predict_one(
             self._state_port.Eval(context),
             self._preview_port.Eval(context),
             self._features_port.Eval(context) if self.reads_features else self._no_features,
@@ -174,12 +174,12 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         discrete_state.set_value(
             np.concatenate(
                 [
-                    (said.safety_probability, said.normalized),
-                    said.belief,
-                    said.cause_probability,
-                    said.embedding,
-                    said.predicted_margins,
-                    (said.calibrated,),
+                    (prediction.safety_probability, prediction.normalized),
+                    prediction.belief,
+                    prediction.cause_probability,
+                    prediction.embedding,
+                    prediction.predicted_margins,
+                    (prediction.calibrated,),
                 ]
             )
         )
@@ -197,19 +197,19 @@ def AddSafetyAssessor(
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
 
     Args:
-        builder: Of the diagram.
+        builder: The diagram's builder.
         assessment: A fitted assessment.
-        state: What it was fitted with as ``state``.
-        desired_preview: The same of ``desired_preview``.
-        features: The same of ``features``; not needed where it was fitted without.
-        period_s: Time between two evaluations [s]; that between two rows of an episode by default.
+        state: Port of the state, as in the training episodes.
+        desired_preview: Port of the desired preview, as in the training episodes.
+        features: Port of the features; not needed if the assessment reads none.
+        period_s: Time between two evaluations [s]; the step of the training episodes by default.
 
     Returns:
-        The assessor; its outputs are free to be connected, exported and logged.
+        The assessor, with its outputs unconnected.
 
     Raises:
-        ValueError: The assessment reads features and there are none, or a port has another size
-            than what it was fitted with.
+        ValueError: The assessment reads features and there is no port for them, or a port has
+            another size than in the training episodes.
     """
     info = assessment.info_
     assessor = SafetyAssessor(assessment, period_s=info.step_s if period_s is None else period_s)

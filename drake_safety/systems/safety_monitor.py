@@ -1,4 +1,4 @@
-"""SafetyMonitor: is the robot inside its safe set, and by how much."""
+"""SafetyMonitor: the signed margins of the safe set."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drake_safety.systems.float_system import FloatSystem
 
 
 class SafeSet(Protocol):
-    """What a safe set offers: the names of its constraints and their signed margins."""
+    """A safe set: named constraints with signed margins."""
 
     names: tuple[str, ...]
 
@@ -20,8 +20,18 @@ class SafeSet(Protocol):
         ...
 
 
+class FeaturedSafeSet(SafeSet, Protocol):
+    """A safe set with features, the assessor's inputs besides the state."""
+
+    feature_names: list[str]
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """Features (n_f,) of a measured state and the preview (H, n_z)."""
+        ...
+
+
 class SafetyMonitor(FloatSystem, LeafSystem):
-    """Watches the plant's true state against the safe set.
+    """Evaluates the safe set on the plant's true state.
 
     .. pydrake_system::
 
@@ -32,9 +42,9 @@ class SafetyMonitor(FloatSystem, LeafSystem):
         - margins
         - safe
 
-    Both are direct functions of the state, so that what is recorded of an instant belongs to it:
-    margins that were sampled and held would be those of the period before. ``safe`` is 1 while no
-    margin is negative. A state that is not finite has margins of minus infinity.
+    Both outputs are direct functions of the state: margins that were sampled and held would lag a
+    recorded row by one period. ``safe`` is 1 while no margin is negative. The margins of a state
+    that is not finite are minus infinity.
 
     Args:
         safe_set: The constraints.

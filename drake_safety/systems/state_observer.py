@@ -1,4 +1,4 @@
-"""StateObserver: what is measured of the robot, and the state as the assessor sees it."""
+"""StateObserver: the measured plant state, and the assessor's state derived from it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StateObserver(FloatSystem, LeafSystem):
         kinematics: The robot.
         noise: Standard deviations that scale the standard normal ``noise`` input, which has
             2 n_v entries: for positions (tangent space), then for velocities.
-        hand: Name of the reaching frame whose position is the output z_k; the base's by default.
+        hand: Name of the reaching frame whose position is the output z_k; the base by default.
         mirror: If given, the state s_k is that of the robot's mirror image.
 
     Raises:

@@ -1,4 +1,4 @@
-"""TrajectoryPlanner: a desired trajectory with a preview of what is coming."""
+"""TrajectoryPlanner: a desired trajectory with a preview."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def interpolate(
     """The minimum-jerk motion from rest at ``start`` to rest at ``goal``.
 
     With s the minimum-jerk progress from 0 to 1, ``z*(s) = start + s (goal - start) + 4 s (1 - s)
-    detour``: half-way the motion passes beside the straight line's middle by the detour.
+    detour``: at s = 0.5 the motion is offset from the straight line by the detour.
 
     Args:
         start: (n_z,) [m].
@@ -52,17 +52,15 @@ def interpolate(
 
 
 def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
-    """Start, goal and detour of a plan, from its first samples.
-
-    The plan is one of :func:`interpolate`.
+    """Start, goal and detour of a plan of :func:`interpolate`, from its first samples.
 
     Args:
-        preview: Samples from the plan's begin on; they may end before it does, (M, n_z) [m].
+        preview: Samples from the plan's start; they may end before the plan, (M, n_z) [m].
         step_s: Time between them [s].
         duration_s: Duration of the whole plan [s].
 
     Returns:
-        One a row, (3, n_z) [m].
+        Start, goal and detour, (3, n_z) [m].
     """
     seen_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
@@ -72,7 +70,7 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
 
 
 def points_of_plan(shape: np.ndarray, num_points: int) -> np.ndarray:
-    """Points of a plan from its start to its goal, evenly spread over its progress.
+    """Points of a plan at equal intervals of its progress s.
 
     Args:
         shape: Start, goal and detour, (3, n_z) [m].
@@ -90,14 +88,14 @@ def _shares(progress: np.ndarray) -> np.ndarray:
 
 
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) [m] of the stance frame ``[x, y, yaw]``, in the world."""
+    """Transforms points (..., 3) [m] from the stance frame ``[x, y, yaw]`` to the world."""
     x, y, yaw = stance_pose.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
 
 
 class TrajectoryPlanner(FloatSystem, LeafSystem):
-    """Plays a plan z*(t) and previews its next H samples.
+    """Evaluates a plan z*(t) and its next H samples.
 
     .. pydrake_system::
 
@@ -112,22 +110,21 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
     Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
-    ``desired_preview`` is z*_{k:k+H}, row-major in time, in S: what the feet must do does not
-    depend on where they stand. ``desired_outlook`` looks further at fewer instants: M samples
-    spread evenly from now to ``outlook_s`` ahead, in S. Before its start and after its end the
-    plan holds still. The stance pose [x, y, yaw] comes from the input if it is connected, else
-    from the parameter.
+    ``desired_preview`` is z*_{k:k+H}, row-major in time, in S, so that it does not depend on the
+    robot's position. ``desired_outlook`` has M samples at equal intervals from now to ``outlook_s``
+    ahead, in S. Before its start and after its end the plan is constant. The stance pose
+    [x, y, yaw] is the input if it is connected, else a parameter.
 
     Args:
         horizon: H, samples of the preview.
         step_s: Time between them [s].
         num_outputs: n_z, a multiple of three.
-        outlook_s: How far the outlook reaches [s]; as far as the preview by default.
+        outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
 
     Raises:
-        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or the outlook's
-            samples are too few.
+        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or number of
+            samples of the outlook is too small.
     """
 
     def __init__(
@@ -149,9 +146,7 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
         if num_outlook < 2:
             raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
         self._num_outputs = num_outputs
-        self._offsets = step_s * np.arange(horizon)
-        reach_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
-        self._outlook_offsets = np.linspace(0.0, reach_s, num_outlook)
+        outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
         self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
@@ -160,18 +155,18 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
         self.DeclareVectorOutputPort(
             "desired_output_rate", BasicVector(num_outputs), self._calc_rate
         )
-        self.DeclareVectorOutputPort(
-            "desired_preview",
-            BasicVector(horizon * num_outputs),
-            self._calc_preview,
-            {self.time_ticket(), self.all_parameters_ticket()},
-        )
-        self.DeclareVectorOutputPort(
-            "desired_outlook",
-            BasicVector(num_outlook * num_outputs),
-            self._calc_outlook,
-            {self.time_ticket(), self.all_parameters_ticket()},
-        )
+        for name, offsets in (
+            ("desired_preview", step_s * np.arange(horizon)),
+            ("desired_outlook", np.linspace(0.0, outlook_s, num_outlook)),
+        ):
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(len(offsets) * num_outputs),
+                lambda context, output, offsets=offsets: self._calc_samples(
+                    context, output, offsets
+                ),
+                {self.time_ticket(), self.all_parameters_ticket()},
+            )
 
     def set_plan(
         self,
@@ -179,7 +174,7 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
         plan: PiecewisePolynomial,
         stance_pose: np.ndarray | None = None,
     ) -> None:
-        """Sets the plan and, where no input says it, the stance pose.
+        """Sets the plan and, for an unconnected input, the stance pose.
 
         Args:
             context: This system's Context.
@@ -200,11 +195,11 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
             context.get_mutable_numeric_parameter(self._stance_index).SetFromVector(stance_pose)
 
     def get_plan(self, context: Context) -> PiecewisePolynomial:
-        """The plan in a Context, in the stance frame."""
+        """Returns the plan in a Context, in the stance frame."""
         return context.get_abstract_parameter(self._plan_index).get_value()[0]
 
     def plan_from_now(self, context: Context) -> PiecewisePolynomial:
-        """The plan in a Context over the time from now on, in the stance frame."""
+        """Returns the plan in a Context over the time since now, in the stance frame."""
         plan = copy.copy(self.get_plan(context))
         plan.shiftRight(-context.get_time())
         return plan
@@ -228,10 +223,6 @@ class TrajectoryPlanner(FloatSystem, LeafSystem):
         yaw = self._stance_pose(context)[2]
         output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate).ravel())
 
-    def _calc_preview(self, context: Context, output: BasicVector) -> None:
-        times = context.get_time() + self._offsets
-        output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))
-
-    def _calc_outlook(self, context: Context, output: BasicVector) -> None:
-        times = context.get_time() + self._outlook_offsets
+    def _calc_samples(self, context: Context, output: BasicVector, offsets: np.ndarray) -> None:
+        times = context.get_time() + offsets
         output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))

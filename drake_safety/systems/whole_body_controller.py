@@ -1,4 +1,4 @@
-"""WholeBodyController: set points of the hand and the body become joint torques."""
+"""WholeBodyController: joint torques from set points of the hand and the body."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp,
 from drake_safety.systems.float_system import FloatSystem
 
 NOT_FINITE = 1
-"""Solver status of a tick whose state or set point no controller could use."""
+"""Solver status of an update with a non-finite state or set point."""
 
 
 class WholeBodyController(FloatSystem, LeafSystem):
-    """Torques that follow weighted tasks while the feet stand still, by one QP a tick.
+    """Torques that track weighted tasks with the feet at rest, from one QP per update.
 
     .. pydrake_system::
 
@@ -34,23 +34,24 @@ class WholeBodyController(FloatSystem, LeafSystem):
         output_ports:
         - actuation
         - solver_status
+        - num_failures
 
-    ``desired_output`` is where the hand goes, or the centre of mass for a controller without a
-    hand, in the world [m], and ``desired_output_rate`` its rate [m/s]; while they are not
-    connected, the point is the one of :meth:`set_reference`, at rest. The command is a discrete
-    state, so the outputs have no direct feedthrough. ``solver_status`` is 0 after a tick whose
-    program was solved, negative when it was not (daqp's exit flag: -1 infeasible) and
-    ``NOT_FINITE`` when there was none to solve; the last good command then stays, zero torque
-    if there was none since the initialisation.
+    ``desired_output`` is the set point of the hand, or of the centre of mass for a controller
+    without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]; while they are
+    not connected, the set point is that of :meth:`set_reference`, at rest. The command is a
+    discrete state, so the outputs have no direct feedthrough. ``solver_status`` is 0 if the last
+    program was solved, negative if it was not (daqp's exit flag: -1 infeasible) and ``NOT_FINITE``
+    if its inputs were not finite; the last command is then held, initially zero torque.
+    ``num_failures`` counts the updates since the initialisation whose status was not 0.
 
     Args:
-        kinematics: The robot as the controller believes it to be.
+        kinematics: The controller's model of the robot.
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
         actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
             :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
             default.
         period_s: Control period [s].
-        offset_s: Time of the first tick; commands of what drives it are then fresh [s].
+        offset_s: Time of the first update, after those of its inputs [s].
 
     Raises:
         ValueError: The robot has no such hand, or the matrix is of another size.
@@ -77,7 +78,7 @@ class WholeBodyController(FloatSystem, LeafSystem):
         self._kinematics = kinematics
         self._matrix = matrix
         self._n_q = kinematics.num_positions
-        # Looked up by name in every tick, ports would cost more than what they carry.
+        # Looking up ports by name in every update would cost more than evaluating them.
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", kinematics.num_positions + kinematics.num_velocities
         )
@@ -89,16 +90,17 @@ class WholeBodyController(FloatSystem, LeafSystem):
         self._status = self.DeclareDiscreteState(1)
         self._num_failures = self.DeclareDiscreteState(1)  # Since the initialisation.
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._tick)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self.DeclareStateOutputPort("actuation", self._actuation)
         self.DeclareStateOutputPort("solver_status", self._status)
+        self.DeclareStateOutputPort("num_failures", self._num_failures)
 
     def set_reference(self, context: Context, reference: WholeBodyReference) -> None:
-        """Sets where the robot stands and how: stance, centre of mass, orientations, posture.
+        """Sets the reference: stance, centre of mass, orientations, posture.
 
         Args:
             context: This system's Context, which keeps a copy.
-            reference: For instance ``model.reference(q)`` of the positions an episode starts in.
+            reference: For instance ``model.reference(q)`` of an episode's initial positions.
 
         Raises:
             ValueError: A part of the reference does not fit the robot.
@@ -106,10 +108,6 @@ class WholeBodyController(FloatSystem, LeafSystem):
         self.model.check_reference(reference)
         parameter = context.get_mutable_abstract_parameter(self._reference_index)
         parameter.set_value(copy.deepcopy(reference))
-
-    def num_failures(self, context: Context) -> int:
-        """Ticks since the initialisation whose ``solver_status`` was not 0."""
-        return int(context.get_discrete_state(self._num_failures).GetAtIndex(0))
 
     def _reference(self, context: Context) -> WholeBodyReference:
         reference = context.get_abstract_parameter(self._reference_index).get_value()
@@ -125,7 +123,7 @@ class WholeBodyController(FloatSystem, LeafSystem):
             reference.reaching = point
         return reference
 
-    def _tick(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
         try:
             qp = build_qp(
@@ -146,4 +144,4 @@ class WholeBodyController(FloatSystem, LeafSystem):
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._actuation, np.zeros(len(self._matrix)))
         discrete_state.set_value(self._num_failures, [0])
-        self._tick(context, discrete_state)
+        self._update(context, discrete_state)

@@ -1,0 +1,74 @@
+"""Which constraint a motion is most likely to violate: one rule for all who name a cause."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+NO_CAUSE = -1
+"""Where nothing speaks for any constraint."""
+
+
+def likely_causes(
+    cause_probability: np.ndarray,
+    predicted_margins: np.ndarray,
+    margin_unit: float | np.ndarray = 1.0,
+) -> np.ndarray:
+    """Returns the constraint that is most likely to be violated first.
+
+    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
+    the paper's mode, the one with the largest unsafe mass. Cells contain segments that end alike
+    for different reasons, so for a single motion the margins are more specific than the mass.
+
+    Args:
+        cause_probability: b_unsafe split by constraint, (N, n_c).
+        predicted_margins: Predicted smallest margin of each constraint [m, rad], (N, n_c); NaN
+            where none is predicted.
+        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
+
+    Returns:
+        Columns of the constraints, (N,); `NO_CAUSE` without margins and mass.
+    """
+    probability = np.asarray(cause_probability, dtype=float)
+    relative = np.asarray(predicted_margins, dtype=float) / margin_unit
+    if probability.shape[1] == 0:
+        return np.full(len(probability), NO_CAUSE)
+    by_mass = np.where(probability.max(axis=1) > 0.0, probability.argmax(axis=1), NO_CAUSE)
+    has_margins = np.isfinite(relative).any(axis=1)
+    by_margin = np.where(np.isfinite(relative), relative, np.inf).argmin(axis=1)
+    return np.where(has_margins, by_margin, by_mass)
+
+
+def likely_cause(
+    names: Sequence[str],
+    cause_probability: np.ndarray,
+    predicted_margins: np.ndarray,
+    margin_unit: float | np.ndarray = 1.0,
+) -> str:
+    """Name of the constraint that is most likely to be violated first; "" without evidence.
+
+    Args:
+        names: The n_c constraints.
+        cause_probability: b_unsafe split by constraint, (n_c,).
+        predicted_margins: Smallest margin predicted for each [m, rad], (n_c,), or NaN.
+        margin_unit: See :func:`likely_causes`.
+    """
+    (column,) = likely_causes(cause_probability[None], predicted_margins[None], margin_unit)
+    return "" if column == NO_CAUSE else names[column]
+
+
+def describe_margin(name: str, margin: float, angular_constraints: Collection[str]) -> str:
+    """Text of a constraint and its margin, such as ``collision, -1.2 cm``.
+
+    Args:
+        name: The constraint.
+        margin: Its margin [m, rad]; the text is the name alone if it is not finite.
+        angular_constraints: Names of the constraints whose margins are angles.
+    """
+    if not math.isfinite(margin):
+        return name
+    if name in angular_constraints:
+        return f"{name}, {math.degrees(margin):+.1f}°"
+    return f"{name}, {100 * margin:+.1f} cm"
