@@ -34,7 +34,7 @@ from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from studies import command_line
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.learning.assessment import AssessmentParameters
     from drake_safety.simulation.scenario import Scenario
     from studies.ablation import AblationSets, EpisodeSet
@@ -145,9 +145,11 @@ def ablate(
         counting = _counting(loaded, assessment)
     if counting:
         file.entries["n_f"] = {
-            f"{variation}.{mode}.{who}": {key: figure.to_json() for key, figure in figures.items()}
+            f"{variation}.{mode}.{who}": {
+                key: estimate.to_json() for key, estimate in estimates.items()
+            }
             for (variation, mode), found in counting.items()
-            for who, figures in found.items()
+            for who, estimates in found.items()
         }
     else:
         left_out["n_f"] = "there are no pairs with fresh episodes: `python -m studies adaptation`"
@@ -206,12 +208,12 @@ def _sets(
 
 def _counting(
     scenario: Scenario, folder: Path
-) -> dict[tuple[str, str], dict[str, dict[str, Figure]]]:
+) -> dict[tuple[str, str], dict[str, dict[str, Estimate]]]:
     """What n_f counts, for each plant that `adapt` has left pairs and fresh episodes of."""
     from drake_safety.learning.feedback import feedback_sets
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.dataset import load_episodes
-    from studies.ablation_adaptation import counting_figures
+    from studies.ablation_adaptation import counting_estimates
     from studies.adaptation_study import TestSet
 
     found = {}
@@ -232,12 +234,12 @@ def _counting(
             for mode in MODES:
                 prior = load_assessment(folder, mode)
                 test = TestSet.of(load_episodes(fresh), prior.parameters.shortest)
-                found[variation, mode] = counting_figures(prior, feedback, test)
+                found[variation, mode] = counting_estimates(prior, feedback, test)
     return found
 
 
 def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
-    n = rows[0].figures["k0.auc"].n
+    n = rows[0].estimates["k0.auc"].n
     table = new_table(
         "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
     )
@@ -245,8 +247,8 @@ def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
     table.columns[0].no_wrap = True
     for i, row in enumerate(rows):
         is_last = i + 1 == len(rows) or rows[i + 1].group != row.group
-        figures = (interval(row.figures[key]) for key in _COLUMNS)
-        table.add_row(row.name, *figures, end_section=is_last)
+        estimates = (interval(row.estimates[key]) for key in _COLUMNS)
+        table.add_row(row.name, *estimates, end_section=is_last)
     table.caption = (
         f"baseline: δ {base.score_weight:g}, H {base.horizon}, perplexity {base.perplexity:g}, "
         f"{base.resolution} × {base.resolution} cells, k_min {base.min_count}, mode '{base.mode}'"
@@ -254,13 +256,13 @@ def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
     return table
 
 
-def _counting_table(found: dict[str, dict[str, Figure]], variation: str, mode: str) -> Table:
+def _counting_table(found: dict[str, dict[str, Estimate]], variation: str, mode: str) -> Table:
     columns = [key for key in _COLUMNS if not key.startswith(("k0.", "calibrated"))]
     table = new_table(
         "n_f",
         *(_COLUMNS[key] for key in columns),
         title=f"{mode}, the paper's adaptation to '{variation}'",
     )
-    for who, figures in found.items():
-        table.add_row(who, *(interval(figures[key]) for key in columns))
+    for who, estimates in found.items():
+        table.add_row(who, *(interval(estimates[key]) for key in columns))
     return table

@@ -17,10 +17,10 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import (
     Bootstrap,
-    Figure,
+    Estimate,
     auc,
     auc_difference,
-    segment_figures,
+    segment_estimates,
     threshold_at,
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
@@ -282,14 +282,14 @@ def judged_segments(episodes: Episodes, base: AssessmentParameters) -> Segments:
     return split(episodes, stride=1, discount=1.0, shortest=base.shortest)
 
 
-def variant_figures(
+def variant_estimates(
     scores: VariantScores,
     baseline_score: np.ndarray,
     calibration: Segments,
     test: Segments,
     *,
     bootstrap: Bootstrap | None = None,
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """How well a variant judges, and by how much better than the baseline.
 
     Args:
@@ -306,14 +306,14 @@ def variant_figures(
     """
     bootstrap = bootstrap or Bootstrap()
     calibration_score, score = scores.calibration, scores.test
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     rows_of = {
         "": (np.ones(len(test), dtype=bool), np.ones(len(calibration), dtype=bool)),
         "k0.": (test.is_first, calibration.is_first),
     }
     for prefix, (rows, seen) in rows_of.items():
         threshold = threshold_at(calibration_score[seen], calibration.is_unsafe[seen])
-        found = segment_figures(
+        found = segment_estimates(
             test.take(rows), score[rows], threshold=threshold, bootstrap=bootstrap
         )
         found["auc_gain"] = auc_difference(
@@ -326,5 +326,5 @@ def variant_figures(
         found["calibrated_auc"] = auc(
             scores.calibrated[rows], test.is_unsafe[rows], test.episode[rows], bootstrap=bootstrap
         )
-        figures |= {f"{prefix}{key}": figure for key, figure in found.items()}
-    return figures
+        estimates |= {f"{prefix}{key}": estimate for key, estimate in found.items()}
+    return estimates

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure, auc_difference, segment_figures
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc_difference, segment_estimates
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from studies.adaptation_study import THRESHOLD, TestSet
@@ -16,13 +16,13 @@ from studies.adaptation_study import THRESHOLD, TestSet
 BEFORE, PER_CELL, TOTAL = "before_feedback", "n_f_per_cell", "n_f_total"
 
 
-def counting_figures(
+def counting_estimates(
     prior: SafetyAssessment,
     feedback: Sequence[FeedbackSet],
     test: TestSet,
     *,
     bootstrap: Bootstrap | None = None,
-) -> dict[str, dict[str, Figure]]:
+) -> dict[str, dict[str, Estimate]]:
     """Judges an assessment before feedback, and after it with either count.
 
     Args:
@@ -45,7 +45,7 @@ def counting_figures(
     scores = {name: _unsafe_score(one, test) for name, one in judged.items()}
     found = {}
     for name, score in scores.items():
-        found[name] = segment_figures(
+        found[name] = segment_estimates(
             segments, score, threshold=1.0 - THRESHOLD, bootstrap=bootstrap
         )
         found[name]["auc_gain"] = auc_difference(

@@ -41,12 +41,14 @@ def ablation_figure(rows: Sequence[AblationRow], panels: Mapping[str, str] | Non
         all_axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (key, title) in zip(all_axes, panels.items(), strict=True):
             for row, height in zip(rows, heights, strict=True):
-                figure = row.figures[key]
+                estimate = row.estimates[key]
                 colour = INK if row.name == BASELINE else SAFE_COLOUR
-                axes.plot([figure.low, figure.high], [height, height], color=colour, linewidth=1.6)
-                axes.plot(figure.value, height, "o", color=colour, markersize=5)
+                axes.plot(
+                    [estimate.low, estimate.high], [height, height], color=colour, linewidth=1.6
+                )
+                axes.plot(estimate.value, height, "o", color=colour, markersize=5)
                 if row.name == BASELINE:
-                    axes.axvline(figure.value, color=FAINT_INK, linewidth=0.8, zorder=0)
+                    axes.axvline(estimate.value, color=FAINT_INK, linewidth=0.8, zorder=0)
             axes.set_title(title)
             axes.grid(axis="x", color="#eceef0", linewidth=0.7)
         all_axes[0].set_yticks(heights, [spoken(row.name).replace("=", " = ") for row in rows])

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.metrics import Bootstrap, Figure
-from drake_safety.evaluation.report.results import as_figure
+from drake_safety.evaluation.metrics import Bootstrap, Estimate
+from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation.rollouts import parallel_map
 from studies.ablation import (
@@ -25,7 +25,7 @@ from studies.ablation import (
     VariantScores,
     judged_segments,
     unsafe_scores,
-    variant_figures,
+    variant_estimates,
 )
 
 _SCHEMA = "drake_safety.ablation"
@@ -39,13 +39,13 @@ class AblationRow:
         name: Of the variant.
         group: Which choice it is about.
         fingerprint: Of all that decides the figures.
-        figures: By key.
+        estimates: By key.
     """
 
     name: str
     group: str
     fingerprint: str
-    figures: Mapping[str, Figure]
+    estimates: Mapping[str, Estimate]
 
 
 @dataclass(kw_only=True)
@@ -90,8 +90,8 @@ class AblationFile:
                 raise ValueError(f"its schema is not '{_SCHEMA}'")
             rows = {}
             for row in content.pop("rows"):
-                figures = {key: as_figure(value) for key, value in row.pop("figures").items()}
-                rows[row["name"]] = AblationRow(**row, figures=figures)
+                estimates = {key: as_estimate(value) for key, value in row.pop("figures").items()}
+                rows[row["name"]] = AblationRow(**row, estimates=estimates)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} holds no ablation: {error!r}") from error
         return cls(path=path, entries=content, rows=rows)
@@ -109,7 +109,8 @@ class AblationFile:
     def write(self) -> None:
         """Writes the file, first under a temporary name."""
         rows = [
-            {**vars(row), "figures": {key: f.to_json() for key, f in row.figures.items()}}
+            {key: value for key, value in vars(row).items() if key != "estimates"}
+            | {"figures": {key: one.to_json() for key, one in row.estimates.items()}}
             for row in self.rows.values()
         ]
         text = json.dumps({"schema": _SCHEMA, **self.entries, "rows": rows}, indent=2)
@@ -120,7 +121,7 @@ class AblationFile:
 
 def rows_to_csv(rows: Sequence[AblationRow]) -> str:
     """The rows as CSV: value, ends of the interval and n of every figure."""
-    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    keys = list(dict.fromkeys(key for row in rows for key in row.estimates))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     ends = ("value", "low", "high", "n")
@@ -129,8 +130,8 @@ def rows_to_csv(rows: Sequence[AblationRow]) -> str:
     for row in rows:
         cells: list[Any] = [row.group, row.name]
         for key in keys:
-            figure = row.figures.get(key)
-            fields = {} if figure is None else figure.to_json()
+            estimate = row.estimates.get(key)
+            fields = {} if estimate is None else estimate.to_json()
             cells += ["" if fields.get(end) is None else fields[end] for end in ends]
         writer.writerow(cells)
     return out.getvalue()
@@ -201,13 +202,13 @@ def run_ablation(
         return variant.name in file.rows
 
     def keep(variant: Variant, scores: VariantScores, reference: np.ndarray) -> None:
-        figures = variant_figures(scores, reference, calibration, test, bootstrap=bootstrap)
+        estimates = variant_estimates(scores, reference, calibration, test, bootstrap=bootstrap)
         file.keep(
             AblationRow(
                 name=variant.name,
                 group=variant.group,
                 fingerprint=marks[variant.name],
-                figures=figures,
+                estimates=estimates,
             )
         )
 
@@ -265,7 +266,7 @@ def ablation_verdict(rows: Sequence[AblationRow]) -> str:
     """
     ahead, behind, num_open = [], [], 0
     for row in rows:
-        gain = row.figures.get("auc_gain")
+        gain = row.estimates.get("auc_gain")
         if row.name == BASELINE or gain is None:
             continue
         if gain.low > 0.0:
@@ -279,9 +280,9 @@ def ablation_verdict(rows: Sequence[AblationRow]) -> str:
         return "There is nothing yet to compare the baseline with."
 
     def named(which: list[AblationRow]) -> str:
-        best_first = sorted(which, key=lambda row: -row.figures["auc_gain"].value)
+        best_first = sorted(which, key=lambda row: -row.estimates["auc_gain"].value)
         return ", ".join(
-            f"{_spoken_name(row)} ({row.figures['auc_gain'].value:+.3f})" for row in best_first
+            f"{_spoken_name(row)} ({row.estimates['auc_gain'].value:+.3f})" for row in best_first
         )
 
     winner = f"No variant beats the baseline's AUC beyond chance ({total} tried)"

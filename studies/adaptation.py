@@ -106,7 +106,7 @@ def adaptation(
                 prior, sets, test, num_orders=orders, seed=seed, rivals=rivals, progress=stages
             )
             if mode == "paper" and oracle:
-                studies[mode].figures |= losses(prior, sets, learned_from["oracle"], test)
+                studies[mode].estimates |= losses(prior, sets, learned_from["oracle"], test)
             if len(sets) >= prior.parameters.adaptation.update_interval:
                 pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
     for published in ("calibrated", "grid"):
@@ -124,9 +124,9 @@ def adaptation(
         "differing_pairs": differing,
         "versions": versions(),
         **{
-            f"{mode}.{key}": figure.to_json()
+            f"{mode}.{key}": estimate.to_json()
             for mode, found in studies.items()
-            for key, figure in found.figures.items()
+            for key, estimate in found.estimates.items()
         },
     }
     file = folder / "study.json"
@@ -134,7 +134,7 @@ def adaptation(
     for mode, found in studies.items():
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             console.print(_study_table(found, mode, published, variation))
-        if "losses.x.brier" in found.figures:
+        if "losses.x.brier" in found.estimates:
             console.print(_losses_table(found, mode))
     print_path("figures", file)
     for path in pictures:
@@ -142,7 +142,7 @@ def adaptation(
 
 
 def _losses_table(found: AdaptationStudy, mode: str) -> Table:
-    brier = {name: found.figures[f"losses.{name}.brier"].value for name in STEPS}
+    brier = {name: found.estimates[f"losses.{name}.brier"].value for name in STEPS}
     table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
     table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
     for name, before, label in (
@@ -157,7 +157,7 @@ def _losses_table(found: AdaptationStudy, mode: str) -> Table:
 
 def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
     columns = ("brier", "auc", "unsafe_recall", "safe_recall")
-    figures = found.figures
+    estimates = found.estimates
     table = new_table(
         "",
         *columns,
@@ -172,12 +172,12 @@ def _study_table(found: AdaptationStudy, mode: str, published: str, variation: s
     names["oracle"] = "oracle"
     for who, label in names.items():
         key = f"{who}.{published}"
-        if f"{key}.brier" not in figures:
+        if f"{key}.brier" not in estimates:
             continue
-        won, closed = figures.get(f"{key}.orders_won"), figures.get(f"{key}.gap_closed")
+        won, closed = estimates.get(f"{key}.orders_won"), estimates.get(f"{key}.gap_closed")
         table.add_row(
             label,
-            *(interval(figures[f"{key}.{column}"]) for column in columns),
+            *(interval(estimates[f"{key}.{column}"]) for column in columns),
             f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
             f"{100 * closed.value:.0f} %"
             if closed is not None and math.isfinite(closed.value)

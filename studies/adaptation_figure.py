@@ -220,19 +220,19 @@ def study_figure(studies: Mapping[str, AdaptationStudy], *, published: str) -> F
 
 
 def _draw_study(axes: Axes, found: AdaptationStudy, name: str, colour: str, key: str) -> None:
-    figures = found.figures
+    estimates = found.estimates
     sizes = [0, *found.sizes]
-    adapted = [figures[f"prior.{key}"], *(figures[f"adapted.{n}.{key}"] for n in found.sizes)]
+    adapted = [estimates[f"prior.{key}"], *(estimates[f"adapted.{n}.{key}"] for n in found.sizes)]
     axes.plot(sizes, [f.value for f in adapted], "o-", color=colour, label=f"{name}, adapted")
     axes.fill_between(
         sizes, [f.low for f in adapted], [f.high for f in adapted], color=colour, alpha=0.18
     )
-    scratch = [n for n in found.sizes if f"scratch.{n}.{key}" in figures]
+    scratch = [n for n in found.sizes if f"scratch.{n}.{key}" in estimates]
     if scratch:
-        values = [figures[f"scratch.{n}.{key}"].value for n in scratch]
+        values = [estimates[f"scratch.{n}.{key}"].value for n in scratch]
         axes.plot(scratch, values, "s:", color=colour, label=f"{name}, from scratch")
-    if f"oracle.{key}" in figures:
+    if f"oracle.{key}" in estimates:
         axes.axhline(
-            figures[f"oracle.{key}"].value, color=colour, linestyle="--", label=f"{name}, oracle"
+            estimates[f"oracle.{key}"].value, color=colour, linestyle="--", label=f"{name}, oracle"
         )
     axes.grid(color=FAINT_INK, alpha=0.2)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_safety.evaluation.baselines import DirectClassifier
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.segments import Episodes, split
@@ -21,7 +21,7 @@ STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
 
 def losses(
     prior: SafetyAssessment, feedback: Sequence[FeedbackSet], learned: Episodes, test: TestSet
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
 
     - "x": gradient boosting on x, learned from many actual episodes: what can be known of x.
@@ -79,7 +79,7 @@ def losses(
     found = {}
     for name in STEPS:
         value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
-        found[f"losses.{name}.brier"] = Figure(value, value, value, len(test.episodes))
+        found[f"losses.{name}.brier"] = Estimate(value, value, value, len(test.episodes))
     return found
 
 

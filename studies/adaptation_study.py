@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, area_under_curve, proportion
+from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.evaluation.scorers import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
@@ -101,14 +101,14 @@ class AdaptationStudy:
     """What was found of one gap.
 
     Attributes:
-        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N" or a
+        estimates: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N" or a
             rival's name; of several orders it is the mean, and the interval their least and
             largest.
         sizes: The N.
         num_orders: In how many orders the feedback came.
     """
 
-    figures: dict[str, Figure] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
     num_orders: int = 1
 
@@ -157,17 +157,17 @@ def study(
             if progress is not None:
                 stage = f"{assessment.parameters.mode}: orders of feedback"
                 progress(stage, order * len(sizes) + i + 1, total)
-    figures = {}
+    estimates = {}
     num_test = len(test.episodes)
     for who, orders in found.items():
         for published in PUBLISHED:
             for metric in orders[0][published]:
                 values = [one[published][metric] for one in orders]
-                figures[f"{who}.{published}.{metric}"] = Figure(
+                estimates[f"{who}.{published}.{metric}"] = Estimate(
                     float(np.mean(values)), min(values), max(values), num_test
                 )
     differing = sum(one.differs for one in feedback)
-    figures["gap"] = proportion(differing, len(feedback))
+    estimates["gap"] = proportion(differing, len(feedback))
     for size in sizes:
         # In how many orders the adapted one is better than the prior.
         prior = found["prior"][0]
@@ -176,17 +176,17 @@ def study(
                 one[published]["brier"] < prior[published]["brier"]
                 for one in found[f"adapted.{size}"]
             )
-            figures[f"adapted.{size}.{published}.orders_won"] = proportion(won, num_orders)
+            estimates[f"adapted.{size}.{published}.orders_won"] = proportion(won, num_orders)
             if "oracle" in found:
                 gap = prior[published]["brier"] - found["oracle"][0][published]["brier"]
                 closed = prior[published]["brier"] - np.mean(
                     [one[published]["brier"] for one in found[f"adapted.{size}"]]
                 )
                 share = float(closed / gap) if gap > 0.0 else math.nan
-                figures[f"adapted.{size}.{published}.gap_closed"] = Figure(
+                estimates[f"adapted.{size}.{published}.gap_closed"] = Estimate(
                     share, share, share, num_test
                 )
-    return AdaptationStudy(figures=figures, sizes=list(sizes), num_orders=num_orders)
+    return AdaptationStudy(estimates=estimates, sizes=list(sizes), num_orders=num_orders)
 
 
 def trained_rivals(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasStatePlanes, require
@@ -173,7 +173,7 @@ def agreement(
     )
 
 
-def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Figure]:
+def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Estimate]:
     """How far Γ and the truth agree at k = 0 on random starts and plans, not on chosen ones.
 
     Args:

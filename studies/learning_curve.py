@@ -29,17 +29,17 @@ from drake_safety.cli.training_folder import (
     run_fresh_episodes,
 )
 from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.plan_study import (
     Plans,
     plans_of,
     promised_miss_rate,
     scorer_rule,
-    verdict_figures,
+    verdict_estimates,
 )
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Table
-from drake_safety.evaluation.report.verdicts import columns_of, figure_rows
+from drake_safety.evaluation.report.verdicts import columns_of, estimate_rows
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -104,7 +104,7 @@ def train_fewer(
             num_workers=workers,
             progress=stages,
         )
-    figures = {f"plans.learning_curve.{key}": figure for key, figure in curve.items()}
+    estimates = {f"plans.learning_curve.{key}": estimate for key, estimate in curve.items()}
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -112,7 +112,7 @@ def train_fewer(
         "seed": seed,
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
-        **{key: figure.to_json() for key, figure in figures.items()},
+        **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / CURVE_FILE
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
@@ -125,7 +125,7 @@ def train_fewer(
         meaning="The same test, after learning from fewer simulated episodes.",
         corner="training episodes",
         columns=columns,
-        rows=figure_rows(Results(figures=figures), prefixes, columns),
+        rows=estimate_rows(Results(estimates=estimates), prefixes, columns),
     )
     console.print(figures_table(table))
     print_path("figures", file)
@@ -174,7 +174,7 @@ def learning_curve(
     known: Mapping[int, SafetyAssessment] | None = None,
     num_workers: int | None = None,
     progress: StageProgress | None = None,
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """Trains on the first n episodes, for several n, and judges the same plans each time.
 
     Args:
@@ -207,7 +207,7 @@ def learning_curve(
         done += 1
         if progress is not None:
             progress("learning curve", done, len(wanted))
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     miss_rate = promised_miss_rate(calibration)
     for size in wanted:
         rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
@@ -219,11 +219,11 @@ def learning_curve(
             (f"{size}", test, score),
             (f"{size}.fair", test.fair(), score[test.is_fair]),
         ):
-            found = verdict_figures(plans, chosen, threshold)
+            found = verdict_estimates(plans, chosen, threshold)
             limit = 1.0 - threshold
-            found["threshold"] = Figure(limit, limit, limit, len(calibration))
-            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
-    return figures
+            found["threshold"] = Estimate(limit, limit, limit, len(calibration))
+            estimates |= {f"{key}.{what}": estimate for what, estimate in found.items()}
+    return estimates
 
 
 def _learn(path: str, size: int, parameters: AssessmentParameters) -> tuple[int, SafetyAssessment]:

@@ -85,11 +85,11 @@ def plan_study(
         "executed",
         "safe [%]",
         title=f"{episodes} fresh starts, {candidates} plans each; Γ accepts a plan of "
-        f"{interval(study.figures['accepted'], 100, 1)} %",
+        f"{interval(study.estimates['accepted'], 100, 1)} %",
     )
     for key, name in PLANS.items():
-        figure = study.figures[key]
-        table.add_row(name, f"{figure.n}", interval(figure, 100, 1))
+        estimate = study.estimates[key]
+        table.add_row(name, f"{estimate.n}", interval(estimate, 100, 1))
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -99,18 +99,18 @@ def plan_study(
         "candidates": candidates,
         "threshold": rule.threshold,
         "versions": versions(),
-        **{f"planning.{key}": figure.to_json() for key, figure in study.figures.items()},
+        **{f"planning.{key}": estimate.to_json() for key, estimate in study.estimates.items()},
     }
     folder = out or learned.out
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "planning.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(table)
-    console.print(planning_verdict(study.figures), highlight=False, soft_wrap=True)
+    console.print(planning_verdict(study.estimates), highlight=False, soft_wrap=True)
     if rule.remark:
         console.print(rule.remark, highlight=False, soft_wrap=True)
     print_path("figures", file)
-    for picture in save(planning_figure(study.figures), folder / "planning"):
+    for picture in save(planning_figure(study.estimates), folder / "planning"):
         print_path("picture", picture)
 
 

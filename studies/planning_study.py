@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
@@ -66,15 +66,15 @@ class PlanningStudy:
     """What :func:`planning_study` found.
 
     Attributes:
-        figures: `default`, `chosen`, `best_in_hindsight` and `any_candidate` are safe shares of the
-            executed motions; `gain` is how far `chosen` comes from the first to the third, 1 for
-            all the way; `accepted` is the share of starts with a plan that Γ accepts, and
+        estimates: `default`, `chosen`, `best_in_hindsight` and `any_candidate` are safe shares of
+            the executed motions; `gain` is the share of the way from the first to the third that
+            `chosen` covers; `accepted` is the share of starts with a plan that Γ accepts, and
             `chosen_if_accepted` the safe share of these.
         safety_probability: Γ of every start's candidates.
         trials: The starts.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     safety_probability: list[np.ndarray]
     trials: list[PlanTrial]
 
@@ -254,11 +254,11 @@ def planning_study(
         possible = float(weight @ (hindsight.astype(float) - default))
         return float(weight @ (chosen.astype(float) - default)) / possible if possible else math.nan
 
-    def share(is_safe: np.ndarray) -> Figure:
+    def share(is_safe: np.ndarray) -> Estimate:
         return proportion(int(is_safe.sum()), len(is_safe))
 
     return PlanningStudy(
-        figures={
+        estimates={
             "default": share(default),
             "chosen": share(chosen),
             "best_in_hindsight": share(hindsight),
@@ -274,13 +274,13 @@ def planning_study(
     )
 
 
-def planning_verdict(figures: Mapping[str, Figure]) -> str:
+def planning_verdict(estimates: Mapping[str, Estimate]) -> str:
     """Who wins, in a sentence.
 
     Args:
-        figures: Those of a `PlanningStudy`.
+        estimates: Those of a `PlanningStudy`.
     """
-    default, chosen, gain = (figures.get(key) for key in ("default", "chosen", "gain"))
+    default, chosen, gain = (estimates.get(key) for key in ("default", "chosen", "gain"))
     if default is None or chosen is None or gain is None:
         return "The study's figures are incomplete: make it again."
     shares = (
@@ -300,6 +300,6 @@ def planning_verdict(figures: Mapping[str, Figure]) -> str:
     return f"Nobody wins beyond chance: {shares}, {way}, an interval that includes zero."
 
 
-def _percent(figure: Figure, digits: int = 1) -> str:
-    value, low, high = (100.0 * x for x in (figure.value, figure.low, figure.high))
+def _percent(estimate: Estimate, digits: int = 1) -> str:
+    value, low, high = (100.0 * x for x in (estimate.value, estimate.low, estimate.high))
     return f"{value:.{digits}f} % ({low:.{digits}f}–{high:.{digits}f})"

@@ -87,7 +87,7 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
             raise ValueError(f"{curve} is of another training or other seeds than {file}")
         results = replace(
             results,
-            figures=results.figures | drawn.figures,
+            estimates=results.estimates | drawn.estimates,
             entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
         )
     return results, extra

@@ -18,7 +18,7 @@ from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.report.verdicts import (
     INPUTS,
     columns_of,
-    figure_rows,
+    estimate_rows,
     label_of,
     plan_sets,
     set_title,
@@ -130,13 +130,15 @@ def summary_text(results: Results) -> str:
         cells = []
         for key, column in columns.values():
             wanted = (key.format(judge), key.format(f"{judge}_literal_0.6"))
-            found = next((results.figures[one] for one in wanted if one in results.figures), None)
+            found = next(
+                (results.estimates[one] for one in wanted if one in results.estimates), None
+            )
             cells.append("" if found is None else column.text(found))
         if any(cells):
             lines.append(f"| {_named(judge)} | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
-    if "throws.falls_without_recovery" in results.figures:
-        alone = results.figures["throws.falls_without_recovery"]
+    if "throws.falls_without_recovery" in results.estimates:
+        alone = results.estimates["throws.falls_without_recovery"]
         parts.insert(1, f"Of {alone.n} fresh throws {_PERCENT.text(alone)} fall without recovery.")
     return "\n\n".join(parts)
 
@@ -152,14 +154,14 @@ def _commands(results: Results) -> str:
 
 
 def _counts(results: Results) -> str:
-    entries, figures = results.entries, results.figures
-    judged = figures.get("plans.outcomes.safe") or figures.get("episodes.share_unsafe")
+    entries, estimates = results.entries, results.estimates
+    judged = estimates.get("plans.outcomes.safe") or estimates.get("episodes.share_unsafe")
     words = [
         f"Learned from {entries.get('training_episodes')} episodes of seed "
         f"{entries.get('training_seed')}."
     ]
     if judged is not None:
-        kind = "safe" if "plans.outcomes.safe" in figures else "unsafe"
+        kind = "safe" if "plans.outcomes.safe" in estimates else "unsafe"
         words.append(
             f"Judged on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
             f"{_PERCENT.text(judged)} are {kind}."
@@ -181,9 +183,9 @@ def _moments(results: Results) -> list[str]:
         if table.key in titles
     ]
     ahead = [
-        f"{_SHARE.text(results.figures[key])} {place}"
+        f"{_SHARE.text(results.estimates[key])} {place}"
         for kind, place in (("segments", "per segment"), ("episodes", "at k = 0"))
-        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.figures
+        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.estimates
     ]
     if ahead:
         parts.append(f"`sharpened` minus the better classifier, AUC: {', '.join(ahead)}.")
@@ -192,7 +194,7 @@ def _moments(results: Results) -> list[str]:
 
 def _throws(results: Results) -> list[str]:
     (table,) = (table for table in verdict_tables(results) if table.key == "throws")
-    alone = results.figures["throws.falls_without_recovery"]
+    alone = results.estimates["throws.falls_without_recovery"]
     remark = (
         f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
         f"falls in {_PERCENT.text(alone)}."
@@ -204,14 +206,14 @@ def _broken(results: Results) -> str:
     """In how many of the successful recoveries something happened that hardware would not bear."""
     prefix = "throws.sharpened.recoveries_with_"
     found = {
-        key.removeprefix(prefix).replace("_", " "): figure
-        for key, figure in results.figures.items()
+        key.removeprefix(prefix).replace("_", " "): estimate
+        for key, estimate in results.estimates.items()
         if key.startswith(prefix)
     }
     if not found:
         return ""
-    counts = [f"{kind} {round(figure.value * figure.n)}" for kind, figure in found.items()]
-    (n,) = {figure.n for figure in found.values()}
+    counts = [f"{kind} {round(estimate.value * estimate.n)}" for kind, estimate in found.items()]
+    (n,) = {estimate.n for estimate in found.values()}
     return (
         f"Of {n} successful recoveries by `sharpened`, so many break a limit: {', '.join(counts)}."
     )
@@ -225,7 +227,8 @@ def _targets(results: Results) -> list[str]:
         if table.key != "plans":
             continue
         rows = [
-            Row(key=row.key, label=row.label, figures=row.figures[:columns]) for row in table.rows
+            Row(key=row.key, label=row.label, estimates=row.estimates[:columns])
+            for row in table.rows
         ]
         narrow = replace(
             table, corner=set_title("plans"), columns=table.columns[:columns], rows=rows
@@ -242,14 +245,14 @@ def _targets(results: Results) -> list[str]:
         names = {f"{prefix}.sharpened": set_title(prefix) for prefix in prefixes}
         parts.append(_rows(results, "`sharpened` on", names))
     parts.append(_differences(results))
-    right = results.figures.get("plans.causes.right_cause")
+    right = results.estimates.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
             f"The right cause is named for {_PERCENT.text(right)} of the {right.n} rightly "
             "refused targets."
         )
     pattern = re.compile(r"(plans\.learning_curve\.(\d+))\.safe_recall")
-    found = (pattern.fullmatch(key) for key in results.figures)
+    found = (pattern.fullmatch(key) for key in results.estimates)
     sizes = {match[1]: match[2] for match in found if match}
     if sizes:
         ordered = sorted(sizes, key=lambda prefix: int(sizes[prefix]))
@@ -261,7 +264,7 @@ def _targets(results: Results) -> list[str]:
 def _rows(results: Results, corner: str, prefixes: Mapping[str, str]) -> str:
     """Recalls and AUC of figures by prefix, as Markdown."""
     columns = columns_of("targets")[:3]
-    rows = figure_rows(results, prefixes, columns)
+    rows = estimate_rows(results, prefixes, columns)
     return Table(
         key="", title="", meaning="", corner=corner, columns=columns, rows=rows
     ).to_markdown()
@@ -274,21 +277,21 @@ def _points(loss: float) -> str:
 def _differences(results: Results) -> str:
     """What `sharpened` gains or loses from the trained hand to the other."""
     lost = {
-        what: results.figures.get(f"plans.other_hand.sharpened.{what}_recall_loss")
+        what: results.estimates.get(f"plans.other_hand.sharpened.{what}_recall_loss")
         for what in ("safe", "unsafe")
     }
-    told = [
-        f"{_points(figure.value)} ({_points(figure.high)} to {_points(figure.low)}) points of "
+    losses = [
+        f"{_points(loss.value)} ({_points(loss.high)} to {_points(loss.low)}) points of "
         f"{what} recall"
-        for what, figure in lost.items()
-        if figure is not None
+        for what, loss in lost.items()
+        if loss is not None
     ]
-    if not told:
+    if not losses:
         return ""
-    (n,) = {figure.n for figure in lost.values() if figure is not None}
+    (n,) = {loss.n for loss in lost.values() if loss is not None}
     return (
         f"On the same {n} targets, mirrored, the other hand minus the trained one: "
-        f"{', '.join(told)}."
+        f"{', '.join(losses)}."
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from drake_safety.evaluation.report.results import Results, as_figure, read_object
+from drake_safety.evaluation.report.results import Results, as_estimate, read_object
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
@@ -31,8 +31,8 @@ def read_results(path: Path) -> Results:
         )
     try:
         return Results(
-            figures={
-                key: as_figure(dict(zip(("value", "low", "high", "n"), row, strict=True)))
+            estimates={
+                key: as_estimate(dict(zip(("value", "low", "high", "n"), row, strict=True)))
                 for key, row in content["figures"].items()
             },
             entries=dict(content["entries"]),
@@ -60,7 +60,7 @@ def store_results(results: Results, path: Path, *, train_command: str | None = N
             entries[key] = _portable(entries[key])
     rows = ",\n".join(
         f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (f.value, f.low, f.high)), f.n])}"
-        for key, f in results.figures.items()
+        for key, f in results.estimates.items()
     )
     text = (
         "{\n"

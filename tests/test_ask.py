@@ -51,8 +51,8 @@ def folder(trained, tmp_path):
 
 def calibrate(folder, threshold):
     """Writes what `evaluate` would; above one, nothing is accepted."""
-    figure = {"value": threshold, "low": threshold, "high": threshold, "n": 100}
-    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": figure}))
+    estimate = {"value": threshold, "low": threshold, "high": threshold, "n": 100}
+    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": estimate}))
 
 
 @pytest.fixture

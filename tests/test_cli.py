@@ -205,8 +205,8 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     )
     for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
         for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
-            figure = report[f"{prefix}.{name}.unsafe_recall"]
-            assert set(figure) == {"value", "low", "high", "n"}
+            estimate = report[f"{prefix}.{name}.unsafe_recall"]
+            assert set(estimate) == {"value", "low", "high", "n"}
     assert report["plans.outcomes.safe"]["n"] == 30
     assert report["plans.other_hand.outcomes.safe"]["n"] == 10
     assert report["plans.sharpened.threshold"]["n"] == report["calibration_episodes"] == 20

@@ -52,7 +52,7 @@ def test_what_is_learned_already_is_not_learned_again(folder, plans, curve, monk
         progress=lambda *report: reports.append(report[1:]),
     )
     # The first 30 episodes are what the size of 30 means.
-    assert again == {key: figure for key, figure in curve.items() if key.startswith("30.")}
+    assert again == {key: estimate for key, estimate in curve.items() if key.startswith("30.")}
     assert reports == [(1, 1)]
 
 

@@ -151,9 +151,9 @@ def test_every_figure_is_there_as_svg_and_png_and_every_table_as_csv_and_json(wh
         assert {f"{stem}.csv", f"{stem}.json"} <= tables
     with (whole.folder / "report/tables/segments.csv").open() as file:
         rows = {row["who judges"]: row for row in csv.DictReader(file)}
-    figure = make_figures()["segments.sharpened.auc"]
-    assert float(rows["sharpened"]["auc"]) == figure.value
-    assert float(rows["sharpened"]["auc.low"]) == figure.low
+    estimate = make_figures()["segments.sharpened.auc"]
+    assert float(rows["sharpened"]["auc"]) == estimate.value
+    assert float(rows["sharpened"]["auc.low"]) == estimate.low
     assert int(rows["sharpened"]["auc.n"]) == 60
 
 

@@ -114,7 +114,7 @@ def test_a_learning_curve_is_drawn_and_stored_with_the_evaluation(monkeypatch, c
     (folder / "evaluation.json").write_text(json.dumps(report))
     stored = folder / "stored.json"
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) in (0, None)
-    found = read_results(stored).figures
+    found = read_results(stored).estimates
     assert {"plans.sharpened.auc", "plans.learning_curve.40.auc"} <= found.keys()
     (folder / "evaluation.json").write_text(json.dumps(report | {"seed": 7}))
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) == 2

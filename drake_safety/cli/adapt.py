@@ -36,7 +36,7 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.feedback import EpisodePairs
@@ -99,7 +99,7 @@ def adapt(
     name = logs[0].stem if logs else variation
     print_shipped(learned)
     folder = adapted_folder(learned.out, name)
-    judged: dict[str, Figure] = {}
+    judged: dict[str, Estimate] = {}
     with open_stages() as stages:
         if log_map is not None:
             pairs = _logged_pairs(loaded, logs, log_map, seed)
@@ -122,9 +122,9 @@ def adapt(
             )
             for mode in MODES:
                 judged |= {
-                    f"{mode}.{who}.{key}": figure
+                    f"{mode}.{who}.{key}": estimate
                     for who, one in (("before", priors[mode]), ("after", adapted[mode]))
-                    for key, figure in _judge(one, fresh).items()
+                    for key, estimate in _judge(one, fresh).items()
                 }
     differing, num_pairs = pairs.gap
     report = {
@@ -139,7 +139,7 @@ def adapt(
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
-        **{key: figure.to_json() for key, figure in judged.items()},
+        **{key: estimate.to_json() for key, estimate in judged.items()},
     }
     file = folder / "adaptation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
@@ -234,9 +234,9 @@ def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int
     return pair_starts(scenario, actual, starts, seed=seed)
 
 
-def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Figure]:
+def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
     """How well Γ judges every segment of fresh actual episodes, by its heads and by its grid."""
-    from drake_safety.evaluation.metrics import segment_figures
+    from drake_safety.evaluation.metrics import segment_estimates
     from drake_safety.learning.segments import split
 
     segments = split(fresh, stride=1, discount=1.0, shortest=assessment.parameters.shortest)
@@ -246,10 +246,10 @@ def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Figure]:
         segments.desired_preview,
         segments.features if assessment.uses_features else None,
     )
-    found: dict[str, Figure] = {}
+    found: dict[str, Estimate] = {}
     for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
-        figures = segment_figures(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
-        found |= {f"{name}.{key}": figure for key, figure in figures.items()}
+        estimates = segment_estimates(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
+        found |= {f"{name}.{key}": estimate for key, estimate in estimates.items()}
     return found
 
 
@@ -273,12 +273,12 @@ def _adaptation_table(
     return table
 
 
-def _judged_table(judged: dict[str, Figure], variation: str) -> Table:
+def _judged_table(judged: dict[str, Estimate], variation: str) -> Table:
     n = judged[f"{MODES[0]}.before.grid.auc"].n
     table = new_table("", *_COLUMNS, title=f"{n} fresh episodes of '{variation}'")
     for mode in MODES:
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             for who, label in _JUDGED.items():
-                figures = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
-                table.add_row(f"{mode}, {published}, {label}", *map(interval, figures))
+                estimates = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
+                table.add_row(f"{mode}, {published}, {label}", *map(interval, estimates))
     return table

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from drake_safety.cli.training_folder import AssessmentFolder
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.report.tables import Table as Figures
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
@@ -73,7 +73,8 @@ def figures_table(found: Figures) -> Table:
     table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
     for row in found.rows:
         cells = [
-            column.text(figure) for column, figure in zip(found.columns, row.figures, strict=True)
+            column.text(estimate)
+            for column, estimate in zip(found.columns, row.estimates, strict=True)
         ]
         table.add_row(row.label, *cells)
     ahead = found.rivals_ahead()
@@ -83,11 +84,11 @@ def figures_table(found: Figures) -> Table:
     return table
 
 
-def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
+def interval(estimate: Estimate, scale: float = 1.0, digits: int = 3) -> str:
     """A figure with its interval, as tables show it; a dash where there was nothing to see."""
-    if math.isnan(figure.value):
+    if math.isnan(estimate.value):
         return "-"
-    value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
+    value, low, high = (scale * x for x in (estimate.value, estimate.low, estimate.high))
     return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
 
 

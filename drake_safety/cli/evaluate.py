@@ -39,9 +39,9 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Picture
+    from matplotlib.figure import Figure
 
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.throw_study import ThrowStudy
     from drake_safety.learning.segments import Episodes
 
@@ -198,7 +198,7 @@ def evaluate(
                     judged,
                     pushes,
                     pushes,
-                    threshold=findings.figures["plans.sharpened.threshold"].value,
+                    threshold=findings.estimates["plans.sharpened.threshold"].value,
                     seed=seeds["disturbances"],
                     calibration_seed=seeds["disturbance thresholds"],
                 )
@@ -213,11 +213,11 @@ def evaluate(
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
         **findings.entries,
-        **{key: figure.to_json() for key, figure in findings.figures.items()},
+        **{key: estimate.to_json() for key, estimate in findings.estimates.items()},
     }
     file = folder / "evaluation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for table in verdict_tables(Results(figures=findings.figures)):
+    for table in verdict_tables(Results(estimates=findings.estimates)):
         console.print(figures_table(table))
     print_path("figures", file)
     for picture in findings.pictures:
@@ -236,10 +236,10 @@ def _evaluate_segments(judged: Judged) -> Findings:
         assessment_scorer("paper", judged.paper, "calibrated"),
         *judged.classifiers,
     ]
-    figures, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
+    estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
     curves = {name: (score, labels) for name, score in scores.items()}
     return Findings(
-        figures=figures,
+        estimates=estimates,
         pictures=save(roc_figure(curves), judged.folder / "roc"),
     )
 
@@ -270,10 +270,10 @@ def _evaluate_throws(
         num_workers=judged.workers,
         progress=judged.stages,
     )
-    figures = dict(study.figures)
-    figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
+    estimates = dict(study.estimates)
+    estimates["throws.falls_with_recovery"] = estimates["throws.sharpened.falls_with_recovery"]
     findings = Findings(
-        figures=figures,
+        estimates=estimates,
         pictures=save(_throws_picture(study), judged.folder / "throws"),
     )
     findings.add(
@@ -286,7 +286,7 @@ def _evaluate_throws(
     return findings
 
 
-def _throws_picture(study: ThrowStudy) -> Picture:
+def _throws_picture(study: ThrowStudy) -> Figure:
     from drake_safety.evaluation.throws_figure import throws_figure
 
     balls = [log.throw for log in study.logs]
@@ -312,7 +312,7 @@ def _evaluate_calibration(judged: Judged) -> Findings:
     from drake_safety.learning.segments import split
 
     segments = split(judged.test_set, stride=1, discount=1.0, shortest=1)
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     curves = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
         score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
@@ -325,12 +325,15 @@ def _evaluate_calibration(judged: Judged) -> Findings:
             drawn = np.repeat(np.arange(len(p)), weight.astype(int))
             return reliability(p[drawn], label[drawn]).calibration_error
 
-        figures[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
+        estimates[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
             num_resamples=100
         ).over_episodes(error, np.arange(len(expected)))
         for kind, one in gamma.calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            figures |= {f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()}
+            estimates |= {
+                f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()
+            }
     return Findings(
-        figures=figures, pictures=save(reliability_figure(curves), judged.folder / "reliability")
+        estimates=estimates,
+        pictures=save(reliability_figure(curves), judged.folder / "reliability"),
     )

@@ -63,7 +63,7 @@ def evaluate_pushes(
     calibration = run("calibration pushes", num_calibration, calibration_seed)
     accepted = begun(test, verdict, threshold)
     findings = Findings(
-        figures={"monitoring.motions.refused": proportion(len(test) - len(accepted), len(test))}
+        estimates={"monitoring.motions.refused": proportion(len(test) - len(accepted), len(test))}
     )
     findings.add(evaluate_monitoring(judged, begun(calibration, verdict, threshold), accepted))
     return findings
@@ -98,6 +98,6 @@ def evaluate_monitoring(
     ]
     study = evaluate_alarms(alarms, calibration, test)
     return Findings(
-        figures=study.figures,
+        estimates=study.estimates,
         pictures=save(monitoring_figure(study), judged.folder / "monitoring"),
     )

@@ -102,7 +102,7 @@ def evaluate_plans(
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     twins = [key for key in sets if key != "plans"]
     study = evaluate_plans(rules, sharpened, calibration, sets, twins)
-    figures = dict(study.figures)
+    estimates = dict(study.estimates)
     pictures = _pictures(study, test, judged.folder)
     if options.plane_step:
         region = reachable_region(
@@ -114,11 +114,13 @@ def evaluate_plans(
             num_workers=judged.workers,
             progress=judged.stages,
         )
-        figures |= {f"plans.plane.{key}": figure for key, figure in region.figures().items()}
+        estimates |= {
+            f"plans.plane.{key}": estimate for key, estimate in region.estimates().items()
+        }
         picture = region_figure(region, test.constraint_names)
         pictures += save(picture, judged.folder / "reachable_region")
     return Findings(
-        figures=figures,
+        estimates=estimates,
         entries={"calibration_episodes": len(judged.calibration_set)},
         pictures=pictures,
     )

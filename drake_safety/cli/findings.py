@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drake_safety.cli.console import Stages
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.scorers import Scorer
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
@@ -52,17 +52,17 @@ class Findings:
     """What was found.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         entries: What else belongs in the report.
         pictures: Files that were written.
     """
 
-    figures: dict[str, Figure] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
     entries: dict[str, Any] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
 
     def add(self, other: Findings) -> None:
         """Takes over what another part has found."""
-        self.figures |= other.figures
+        self.estimates |= other.estimates
         self.entries |= other.entries
         self.pictures += other.pictures

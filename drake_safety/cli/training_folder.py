@@ -224,10 +224,10 @@ def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> Goa
     if calibration is not None:
         return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.promise)
     file = folder / "evaluation.json"
-    figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    figure = figures.get(f"plans.{mode}.threshold")
-    if figure is not None:
-        return GoalThreshold(float(figure["value"]), float(figure["value"]))
+    estimates = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    estimate = estimates.get(f"plans.{mode}.threshold")
+    if estimate is not None:
+        return GoalThreshold(float(estimate["value"]), float(estimate["value"]))
     return GoalThreshold(
         DEFAULT_THRESHOLD,
         DEFAULT_THRESHOLD,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.calibration import (
     SAFE,
     UNKNOWN,
@@ -44,18 +44,18 @@ class PromiseKept:
     confidence: float | None
     num_needed: int
     num_calibration: int
-    observed: Figure
+    observed: Estimate
     share_broken: float
-    safe_recall: Figure
+    safe_recall: Estimate
 
     @property
     def is_kept(self) -> bool:
         """Whether what was observed does not speak against the promise."""
         return not self.observed.low > self.miss_rate
 
-    def figures(self) -> dict[str, Figure]:
+    def estimates(self) -> dict[str, Estimate]:
         """The figures by key."""
-        splits = Figure(self.share_broken, self.share_broken, self.share_broken, self.observed.n)
+        splits = Estimate(self.share_broken, self.share_broken, self.share_broken, self.observed.n)
         return {
             "observed_miss_rate": self.observed,
             "share_broken": splits,
@@ -123,25 +123,25 @@ def repeated_splits(
     return kept
 
 
-def _observed(missed: list[float], num_unsafe: int) -> Figure:
+def _observed(missed: list[float], num_unsafe: int) -> Estimate:
     if not missed:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate(math.nan, math.nan, math.nan, 0)
     mean = float(np.mean(missed))
     # Splits of the same episodes are no further evidence: there are no more than these.
     binomial = proportion(round(mean * num_unsafe), num_unsafe)
-    return Figure(mean, min(binomial.low, mean), max(binomial.high, mean), num_unsafe)
+    return Estimate(mean, min(binomial.low, mean), max(binomial.high, mean), num_unsafe)
 
 
-def _spread(values: list[float], n: int) -> Figure:
+def _spread(values: list[float], n: int) -> Estimate:
     if not values:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate(math.nan, math.nan, math.nan, 0)
     low, high = np.quantile(values, [0.05, 0.95])
-    return Figure(float(np.mean(values)), float(low), float(high), n)
+    return Estimate(float(np.mean(values)), float(low), float(high), n)
 
 
 def verdict_shares(
     calibration: Calibration, unsafe_score: np.ndarray, is_unsafe: np.ndarray
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """What a stored calibration does to other fresh episodes.
 
     Args:
@@ -156,12 +156,12 @@ def verdict_shares(
     verdict = calibration.verdicts(1.0 - np.asarray(unsafe_score, dtype=float))
     label = np.asarray(is_unsafe, dtype=bool)
 
-    def share(of: np.ndarray, said: str) -> Figure:
+    def share(of: np.ndarray, said: str) -> Estimate:
         return proportion(int(np.sum(verdict[of] == said)), int(of.sum()))
 
     promised = calibration.miss_rate
     return {
-        "promised_miss_rate": Figure(promised, promised, promised, calibration.num_unsafe),
+        "promised_miss_rate": Estimate(promised, promised, promised, calibration.num_unsafe),
         "miss_rate": share(label, SAFE),
         "unsafe_unknown": share(label, UNKNOWN),
         "safe_recall": share(~label, SAFE),

@@ -12,8 +12,8 @@ from typing import Any
 
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.metrics import Figure
-from drake_safety.evaluation.report.results import as_figure
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
@@ -24,7 +24,7 @@ from drake_safety.simulation.capabilities import HasBall, judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
-_FIGURES = {
+_ESTIMATES = {
     "share_unsafe": "episodes.share_unsafe",
     "auc": "episodes.sharpened.auc",
     "safe_recall": "episodes.sharpened.safe_recall",
@@ -122,7 +122,7 @@ def compare_scenario(
     if recovery is not None:
         published = "normalized" if recovery.is_normalized else "safety_probability"
     scorer = assessment_scorer("sharpened", assessment, published)
-    figures, _, _ = evaluate_episodes([scorer], calibration, fresh)
+    estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
     if recovery is not None:
         study = evaluate_throws(
             scenario,
@@ -134,14 +134,14 @@ def compare_scenario(
             num_workers=num_workers,
             progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
         )
-        figures |= study.figures
+        estimates |= study.estimates
     row = {
         "scenario": scenario.name,
         # A task of one's own may call its robot as it likes.
         "robot": load_robot(robot).name if Path(robot).suffix else robot,
         "episodes": effort.num_episodes,
         "throws": effort.num_throws if recovery is not None else 0,
-        **{name: figures[key].to_json() for name, key in _FIGURES.items() if key in figures},
+        **{name: estimates[key].to_json() for name, key in _ESTIMATES.items() if key in estimates},
     }
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"made_by": made_by, "row": row}, indent=2)
@@ -151,23 +151,23 @@ def compare_scenario(
     return row
 
 
-def row_figure(row: Mapping[str, Any], name: str) -> Figure | None:
+def row_estimate(row: Mapping[str, Any], name: str) -> Estimate | None:
     """A figure of a row; None where the study had nothing to say."""
     stored = row.get(name)
     if not isinstance(stored, dict) or stored["value"] is None:
         return None
-    return as_figure(stored)
+    return as_estimate(stored)
 
 
 def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows side by side, shares in percent."""
-    nothing = Figure(math.nan, math.nan, math.nan, 0)
+    nothing = Estimate(math.nan, math.nan, math.nan, 0)
     counts = [Column(key=name, title=name, meaning="", unit="n") for name in ("episodes", "throws")]
     columns = [
         Column(key=name, title=spoken(name), meaning="")
         if name == "auc"
         else Column(key=name, title=spoken(name), meaning="", unit="%", digits=1)
-        for name in _FIGURES
+        for name in _ESTIMATES
     ]
     return Table(
         key="comparison",
@@ -179,9 +179,9 @@ def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             Row(
                 key=row["scenario"],
                 label=f"{row['scenario']} ({row['robot']})",
-                figures=[
-                    *(Figure(row[one.key], math.nan, math.nan, row[one.key]) for one in counts),
-                    *(row_figure(row, one.key) or nothing for one in columns),
+                estimates=[
+                    *(Estimate(row[one.key], math.nan, math.nan, row[one.key]) for one in counts),
+                    *(row_estimate(row, one.key) or nothing for one in columns),
                 ],
             )
             for row in rows

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_safety.evaluation.comparison import row_figure
+from drake_safety.evaluation.comparison import row_estimate
 from drake_safety.evaluation.figure_style import drawing_style, new_figure
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Picture
+    from matplotlib.figure import Figure
 
 _COLUMNS = 4
 _SIZE = (480, 400)  # Of a still [pixels].
@@ -39,7 +39,7 @@ def standing_still(loop: ClosedLoop) -> np.ndarray | None:
 
 def comparison_figure(
     rows: Sequence[Mapping[str, Any]], stills: Mapping[str, np.ndarray]
-) -> Picture:
+) -> Figure:
     """Stills in a grid, and under each how well Γ tells and what recovery saves.
 
     Args:
@@ -70,10 +70,10 @@ def comparison_figure(
 def _words(row: Mapping[str, Any]) -> list[str]:
     """What is said of a row."""
     words = []
-    auc = row_figure(row, "auc")
+    auc = row_estimate(row, "auc")
     if auc is not None:
         words.append(f"AUC at planning time {auc.value:.3f}")
-    ends = [row_figure(row, f"falls_{how}_recovery") for how in ("without", "with")]
+    ends = [row_estimate(row, f"falls_{how}_recovery") for how in ("without", "with")]
     if None not in ends:
         before, after = (100 * end.value for end in ends if end is not None)
         words.append(f"falls {before:.0f} % → {after:.1f} %")

@@ -8,10 +8,10 @@ import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS
 from drake_safety.evaluation.metrics import (
-    Figure,
+    Estimate,
     auc_difference,
     proportion,
-    segment_figures,
+    segment_estimates,
     threshold_at,
 )
 from drake_safety.evaluation.scorers import Scorer
@@ -21,7 +21,7 @@ from drake_safety.learning.segments import Episodes, split
 
 def evaluate_episodes(
     scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
-) -> tuple[dict[str, Figure], dict[str, np.ndarray], np.ndarray]:
+) -> tuple[dict[str, Estimate], dict[str, np.ndarray], np.ndarray]:
     """Every scorer on fresh episodes, per segment and at k = 0.
 
     The threshold of the recalls is the one of best balanced accuracy on the calibration set, of
@@ -48,7 +48,7 @@ def evaluate_episodes(
         "segments": (np.ones(len(segments), dtype=bool), np.ones(len(seen), dtype=bool)),
         "episodes": (segments.is_first, seen.is_first),
     }
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     scores = {}
     for scorer in scorers:
         name = scorer.name
@@ -56,18 +56,20 @@ def evaluate_episodes(
         scores[name] = score
         for kind, (rows, seen_rows) in rows_of.items():
             threshold = threshold_at(seen_score[seen_rows], seen.is_unsafe[seen_rows])
-            found = segment_figures(segments.take(rows), score[rows], threshold=threshold)
-            figures |= {f"{kind}.{name}.{key}": figure for key, figure in found.items()}
+            found = segment_estimates(segments.take(rows), score[rows], threshold=threshold)
+            estimates |= {f"{kind}.{name}.{key}": estimate for key, estimate in found.items()}
     classifiers = [name for name in scores if name in KINDS]
     if "sharpened" in scores and classifiers:
         for kind, (rows, _) in rows_of.items():
-            best = max(classifiers, key=lambda name: figures[f"{kind}.{name}.auc"].value)
-            figures[f"{kind}.sharpened_minus_best_classifier.auc"] = auc_difference(
+            best = max(classifiers, key=lambda name: estimates[f"{kind}.{name}.auc"].value)
+            estimates[f"{kind}.sharpened_minus_best_classifier.auc"] = auc_difference(
                 scores["sharpened"][rows],
                 scores[best][rows],
                 segments.is_unsafe[rows],
                 segments.episode[rows],
             )
-    figures["episodes.share_unsafe"] = proportion(test.num_unsafe, test.num_unsafe + test.num_safe)
-    figures["episodes.share_diverged"] = proportion(test.num_diverged, len(test))
-    return figures, scores, segments.is_unsafe
+    estimates["episodes.share_unsafe"] = proportion(
+        test.num_unsafe, test.num_unsafe + test.num_safe
+    )
+    estimates["episodes.share_diverged"] = proportion(test.num_diverged, len(test))
+    return estimates, scores, segments.is_unsafe

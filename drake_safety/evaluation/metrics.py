@@ -19,7 +19,7 @@ CRITERIA = ("balanced_accuracy", "equal_error")
 
 
 @dataclass(frozen=True)
-class Figure:
+class Estimate:
     """A figure of merit and its interval.
 
     Attributes:
@@ -62,7 +62,7 @@ class Bootstrap:
 
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
-    ) -> Figure:
+    ) -> Estimate:
         """A statistic of weighted samples, and its percentiles when whole episodes are drawn again.
 
         Args:
@@ -73,7 +73,7 @@ class Bootstrap:
         value = statistic(np.ones(len(members)))
         num_episodes = int(members.max()) + 1 if members.size else 0
         if math.isnan(value):
-            return Figure(math.nan, math.nan, math.nan, num_episodes)
+            return Estimate(math.nan, math.nan, math.nan, num_episodes)
         rng = np.random.default_rng(self.seed)
         shares = np.full(num_episodes, 1.0 / num_episodes)
         drawn = np.array(
@@ -84,14 +84,14 @@ class Bootstrap:
         )
         # A draw without one of the classes says nothing.
         low, high = np.quantile(drawn[~np.isnan(drawn)], self.quantiles)
-        return Figure(value, float(low), float(high), num_episodes)
+        return Estimate(value, float(low), float(high), num_episodes)
 
 
 _BOOTSTRAP = Bootstrap()
 _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
-def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
+def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
     """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
 
     Raises:
@@ -102,12 +102,12 @@ def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
     from scipy.stats import binomtest
 
     if n == 0:
-        return Figure(value=math.nan, low=0.0, high=1.0, n=0)
+        return Estimate(value=math.nan, low=0.0, high=1.0, n=0)
     interval = binomtest(count, n).proportion_ci(confidence, method="exact")
-    return Figure(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
+    return Estimate(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
 
 
-def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Figure:
+def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Estimate:
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values take part: a fall that never comes is later than any other.
@@ -119,13 +119,13 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> F
     if np.isnan(values).any():
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate(math.nan, math.nan, math.nan, 0)
     rng = np.random.default_rng(bootstrap.seed)
     size = (bootstrap.num_resamples, values.size)
     drawn = np.sort(rng.integers(values.size, size=size), axis=1)
     # Order statistics, not interpolation, which would subtract infinities.
     low, high = np.quantile(_middle(values[drawn]), bootstrap.quantiles, method="nearest")
-    return Figure(float(_middle(values)), float(low), float(high), values.size)
+    return Estimate(float(_middle(values)), float(low), float(high), values.size)
 
 
 def _middle(ordered: np.ndarray) -> np.ndarray:
@@ -159,7 +159,7 @@ def auc(
     episode: np.ndarray,
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> Figure:
+) -> Estimate:
     """The area under the ROC curve, with an interval from a bootstrap over episodes.
 
     Where the scores of unsafe and safe samples do not overlap the bootstrap sees no spread, and low
@@ -187,7 +187,7 @@ def auc_difference(
     episode: np.ndarray,
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> Figure:
+) -> Estimate:
     """By how much one scorer's area exceeds another's on the same samples, resampled in pairs.
 
     Args:
@@ -207,14 +207,14 @@ def auc_difference(
     return bootstrap.over_episodes(difference, episode)
 
 
-def segment_figures(
+def segment_estimates(
     segments: Segments,
     unsafe_score: np.ndarray,
     *,
     threshold: float,
     is_probability: bool = True,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """How well a scorer tells segments that lead to an unsafe end from those that do not.
 
     The segments of one episode are not independent: every interval is a bootstrap over episodes.
@@ -235,10 +235,10 @@ def segment_figures(
     Raises:
         ValueError: Not one score a segment, or a probability outside [0, 1].
     """
-    score, label = _checked("segment_figures", unsafe_score, segments.is_unsafe)
+    score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode
 
-    def mean(values: np.ndarray, rows: np.ndarray) -> Figure:
+    def mean(values: np.ndarray, rows: np.ndarray) -> Estimate:
         values, members = values[rows].astype(float), episode[rows]
 
         def average(weight: np.ndarray) -> float:
@@ -247,7 +247,7 @@ def segment_figures(
 
         return bootstrap.over_episodes(average, members)
 
-    def recall(is_right: np.ndarray, rows: np.ndarray) -> Figure:
+    def recall(is_right: np.ndarray, rows: np.ndarray) -> Estimate:
         num_right, num_samples = int(is_right[rows].sum()), int(rows.sum())
         num_episodes = len(np.unique(episode[rows]))
         confidence = bootstrap.confidence
@@ -258,15 +258,15 @@ def segment_figures(
             return proportion(count, num_episodes, confidence=confidence)
         return mean(is_right, rows)
 
-    figures = {
+    estimates = {
         "auc": auc(score, label, episode, bootstrap=bootstrap),
         "safe_recall": recall(score <= threshold, ~label),
         "unsafe_recall": recall(score > threshold, label),
     }
     if is_probability:
-        squared = _squared_error("segment_figures", score, label)
-        figures["brier"] = mean(squared, np.ones(len(label), dtype=bool))
-    return figures
+        squared = _squared_error("segment_estimates", score, label)
+        estimates["brier"] = mean(squared, np.ones(len(label), dtype=bool))
+    return estimates
 
 
 def threshold_at(

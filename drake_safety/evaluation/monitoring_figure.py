@@ -39,7 +39,7 @@ def monitoring_figure(study: MonitoringStudy, names: Sequence[str] | None = None
         for i, name in enumerate(names):
             score = study.unsafe_score[name]
             style = series_style(i) | {"linewidth": 2.4 if i == 0 else 1.5, "zorder": 4 - (i > 0)}
-            words = f"{spoken(name)}   {study.figures[f'monitoring.{name}.auc'].value:.3f}"
+            words = f"{spoken(name)}   {study.estimates[f'monitoring.{name}.auc'].value:.3f}"
             draw_roc(roc, score, label, words, -study.thresholds[name], **style)
             lead_s = np.sort(study.lead_s[name])
             if lead_s.size:

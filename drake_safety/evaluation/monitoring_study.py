@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.alarms import Alarm
-from drake_safety.evaluation.metrics import Figure, auc, median, proportion
+from drake_safety.evaluation.metrics import Estimate, auc, median, proportion
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 
@@ -28,7 +28,7 @@ class MonitoringStudy:
     """What :func:`evaluate_alarms` found.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         thresholds: By alarm: below it there is one.
         unsafe_score: By alarm, minus the smallest value that it could have cried at, (N,).
         is_unsafe: Which of the N motions leave the safe set.
@@ -36,7 +36,7 @@ class MonitoringStudy:
             when it is late, minus infinity when it never comes.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     thresholds: dict[str, float]
     unsafe_score: dict[str, np.ndarray]
     is_unsafe: np.ndarray
@@ -108,7 +108,7 @@ def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
     return float(np.sort(lowest)[math.floor(share * len(lowest))])
 
 
-def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Figure:
+def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
     """Events per hour, with the exact interval of a Poisson process.
 
     Args:
@@ -120,12 +120,12 @@ def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 
     from scipy.stats import chi2
 
     if not duration_s > 0:
-        return Figure(math.nan, math.nan, math.nan, n)
+        return Estimate(math.nan, math.nan, math.nan, n)
     tail = 0.5 * (1.0 - confidence)
     hours = duration_s / 3600.0
     low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
     high = 0.5 * chi2.ppf(1.0 - tail, 2 * count + 2)
-    return Figure(count / hours, float(low / hours), float(high / hours), n)
+    return Estimate(count / hours, float(low / hours), float(high / hours), n)
 
 
 def evaluate_alarms(
@@ -153,20 +153,20 @@ def evaluate_alarms(
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
-    figures = _motion_figures(judged, len(test))
+    estimates = _motion_estimates(judged, len(test))
     thresholds, scores, leads = {}, {}, {}
     for alarm in alarms:
         lowest = np.array([lowest_value(motion, alarm.value(motion)) for motion in calm])
         threshold = equal_share_threshold(lowest, false_alarm_share)
         values = [alarm.value(motion) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
-        found, lead_s = _alarm_figures(judged, values, threshold)
+        found, lead_s = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
-        found["threshold"] = Figure(threshold, threshold, threshold, len(calm))
-        figures |= {f"monitoring.{alarm.name}.{key}": figure for key, figure in found.items()}
+        found["threshold"] = Estimate(threshold, threshold, threshold, len(calm))
+        estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
         thresholds[alarm.name], scores[alarm.name], leads[alarm.name] = threshold, score, lead_s
     return MonitoringStudy(
-        figures=figures,
+        estimates=estimates,
         thresholds=thresholds,
         unsafe_score=scores,
         is_unsafe=is_unsafe,
@@ -174,7 +174,7 @@ def evaluate_alarms(
     )
 
 
-def _motion_figures(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Figure]:
+def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Estimate]:
     """What came of the motions, whoever watches."""
     left = [motion for motion in judged if motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
@@ -182,16 +182,16 @@ def _motion_figures(judged: Sequence[WatchedMotion], num_test: int) -> dict[str,
         "monitoring.motions.left_out": proportion(num_test - len(judged), num_test),
         "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
         "monitoring.motions.fall": proportion(sum(m.has_fallen for m in left), len(judged)),
-        "monitoring.motions.safe_hours": Figure(hours, hours, hours, len(judged) - len(left)),
+        "monitoring.motions.safe_hours": Estimate(hours, hours, hours, len(judged) - len(left)),
         "monitoring.motions.push_to_leaving_s": median(
             np.array([motion.leave_time_s - motion.push_time_s for motion in left])
         ),
     }
 
 
-def _alarm_figures(
+def _alarm_estimates(
     judged: Sequence[WatchedMotion], values: Sequence[np.ndarray], threshold: float
-) -> tuple[dict[str, Figure], np.ndarray]:
+) -> tuple[dict[str, Estimate], np.ndarray]:
     """What one alarm is worth, and its lead times.
 
     Args:

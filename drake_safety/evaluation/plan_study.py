@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion, segment_figures
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, segment_estimates
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
@@ -163,12 +163,12 @@ class PlanStudy:
     """What :func:`evaluate_plans` found.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         thresholds: Per rule, the unsafe score above which it refuses.
         unsafe_score: Per set ("plans", "plans.other_hand") and rule, the score of each plan, (N,).
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     thresholds: dict[str, float]
     unsafe_score: dict[str, dict[str, np.ndarray]]
 
@@ -210,7 +210,7 @@ def evaluate_plans(
 
     promise = 1.0 - miss_rate
     num_unsafe = int(calibration.is_unsafe.sum())
-    figures = {"plans.promised_unsafe_recall": Figure(promise, promise, promise, num_unsafe)}
+    estimates = {"plans.promised_unsafe_recall": Estimate(promise, promise, promise, num_unsafe)}
     scores: dict[str, dict[str, np.ndarray]] = {}
     for prefix, plans in sets.items():
         scores[prefix] = {rule.name: rule.unsafe_score(plans) for rule in rules}
@@ -220,18 +220,20 @@ def evaluate_plans(
             (f"{prefix}.fair", plans.fair(), plans.is_fair),
         ):
             for name, score in scores[prefix].items():
-                found = verdict_figures(chosen, score[rows], thresholds[name])
-                figures |= {f"{key}.{name}.{what}": figure for what, figure in found.items()}
+                found = verdict_estimates(chosen, score[rows], thresholds[name])
+                estimates |= {f"{key}.{name}.{what}": estimate for what, estimate in found.items()}
                 limit = 1.0 - thresholds[name]
-                figures[f"{key}.{name}.threshold"] = Figure(limit, limit, limit, len(calibration))
-            found = _cause_figures(
+                estimates[f"{key}.{name}.threshold"] = Estimate(
+                    limit, limit, limit, len(calibration)
+                )
+            found = _cause_estimates(
                 chosen,
                 {name: of_all[rows] for name, of_all in causes.items()},
                 _is_refused(scores[prefix][own.name][rows], thresholds[own.name]),
             )
-            found |= outcome_figures(chosen)
-            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
-        figures[f"{prefix}.share_fair"] = proportion(
+            found |= outcome_estimates(chosen)
+            estimates |= {f"{key}.{what}": estimate for what, estimate in found.items()}
+        estimates[f"{prefix}.share_fair"] = proportion(
             int(plans.is_outcome_fair.sum()), len(plans.outcomes)
         )
     for prefix in twins:
@@ -242,8 +244,8 @@ def evaluate_plans(
                 sets[prefix],
                 _is_refused(scores[prefix][name], threshold),
             )
-            figures |= {f"{prefix}.{name}.{what}": figure for what, figure in found.items()}
-    return PlanStudy(figures=figures, thresholds=thresholds, unsafe_score=scores)
+            estimates |= {f"{prefix}.{name}.{what}": estimate for what, estimate in found.items()}
+    return PlanStudy(estimates=estimates, thresholds=thresholds, unsafe_score=scores)
 
 
 def promised_miss_rate(calibration: Plans) -> float:
@@ -273,19 +275,21 @@ def promised_miss_rate(calibration: Plans) -> float:
     return max(least, wanted)
 
 
-def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) -> dict[str, Figure]:
+def verdict_estimates(
+    plans: Plans, unsafe_score: np.ndarray, threshold: float
+) -> dict[str, Estimate]:
     """How well scores (N,) tell unsafe plans from safe ones.
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall` and `brier`. Each plan is an episode of its own, so
         the recalls have Clopper-Pearson's interval.
     """
-    return segment_figures(plans.first, unsafe_score, threshold=threshold)
+    return segment_estimates(plans.first, unsafe_score, threshold=threshold)
 
 
 def recall_losses(
     plans: Plans, is_refused: np.ndarray, twins: Plans, is_twin_refused: np.ndarray
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """What recalls lose from plans to their twins: the same targets, in the same order.
 
     Args:
@@ -307,7 +311,7 @@ def recall_losses(
 
     def loss(
         relevant: np.ndarray, right: np.ndarray, twin_relevant: np.ndarray, twin_right: np.ndarray
-    ) -> Figure:
+    ) -> Estimate:
         def statistic(weight: np.ndarray) -> float:
             total, twin_total = weight @ relevant, weight @ twin_relevant
             if not (total and twin_total):
@@ -323,7 +327,7 @@ def recall_losses(
     }
 
 
-def outcome_figures(plans: Plans) -> dict[str, Figure]:
+def outcome_estimates(plans: Plans) -> dict[str, Estimate]:
     """What came of the plans: `outcomes.safe`, `outcomes.CAUSE` and the controllers' failures.
 
     Returns:
@@ -331,16 +335,16 @@ def outcome_figures(plans: Plans) -> dict[str, Figure]:
         `controller_failures` their number.
     """
     n = len(plans.outcomes)
-    figures = {
+    estimates = {
         f"outcomes.{name}": proportion(int(np.sum(plans.outcomes == name)), n)
         for name in (SAFE, *plans.constraint_names, DIVERGED)
     }
-    figures["episodes_with_controller_failures"] = proportion(
+    estimates["episodes_with_controller_failures"] = proportion(
         int(np.sum(plans.num_failures > 0)), n
     )
     total = float(plans.num_failures.sum())
-    figures["controller_failures"] = Figure(total, total, total, n)
-    return figures
+    estimates["controller_failures"] = Estimate(total, total, total, n)
+    return estimates
 
 
 def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.ndarray]:
@@ -365,21 +369,21 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
     }
 
 
-def _cause_figures(
+def _cause_estimates(
     plans: Plans, named: Mapping[str, np.ndarray], is_refused: np.ndarray
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """Shares of the right causes among correctly refused plans, by either rule and by cause."""
-    figures = {}
+    estimates = {}
     for name, causes in named.items():
-        figures[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
+        estimates[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
         if name == "right_cause":
-            figures |= {f"causes.{cause}": figure for cause, figure in by_cause.items()}
-    return figures
+            estimates |= {f"causes.{cause}": estimate for cause, estimate in by_cause.items()}
+    return estimates
 
 
 def _right_causes(
     plans: Plans, named: np.ndarray, is_refused: np.ndarray
-) -> tuple[Figure, dict[str, Figure]]:
+) -> tuple[Estimate, dict[str, Estimate]]:
     """The share whose named cause (N,) is the simulated one: of all correctly refused, by cause."""
     rows = is_refused & plans.is_unsafe
     is_right = (named == plans.first.cause)[rows]

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
@@ -57,7 +57,7 @@ class ReachableRegion:
     simulated_z_m: np.ndarray
     outcomes: np.ndarray
 
-    def figures(self) -> dict[str, Figure]:
+    def estimates(self) -> dict[str, Estimate]:
         """How often verdicts on the simulated grid are right.
 
         Returns:
@@ -68,11 +68,11 @@ class ReachableRegion:
         verdicts = {"sharpened": self.safety_probability >= self.threshold}
         if self.is_reachable is not None:
             verdicts["reachability"] = self.is_reachable
-        figures = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
+        estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
-            figures[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
-        return figures
+            estimates[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
+        return estimates
 
 
 def reachable_region(

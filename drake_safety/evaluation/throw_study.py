@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, median, proportion
+from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.scenario import Scenario
@@ -78,7 +78,7 @@ class ThrowStudy:
     """What :func:`evaluate_throws` found.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         logs: The throws without recovery.
         trigger_times_s: Per rule, when it triggered in each throw [s], (N,); NaN for never.
         recovered: Per rule, the logs with recovery by index of the throw, triggered ones only.
@@ -86,7 +86,7 @@ class ThrowStudy:
         calibration_logs: The other throws, on which thresholds were chosen, if any were left open.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     logs: list[ThrowLog]
     trigger_times_s: dict[str, np.ndarray]
     recovered: dict[str, dict[int, ThrowLog]]
@@ -224,14 +224,14 @@ def evaluate_throws(
         name: {index: simulated[index, time] for index, time in times.items()}
         for name, times in triggered.items()
     }
-    figures = _balancing_figures(logs)
+    estimates = _balancing_estimates(logs)
     for rule in rules:
-        found = _rule_figures(logs, triggers[rule.name], recovered[rule.name])
+        found = _rule_estimates(logs, triggers[rule.name], recovered[rule.name])
         threshold = thresholds[rule.name]
-        found["threshold"] = Figure(threshold, threshold, threshold, len(logs))
-        figures |= {f"throws.{rule.name}.{key}": figure for key, figure in found.items()}
+        found["threshold"] = Estimate(threshold, threshold, threshold, len(logs))
+        estimates |= {f"throws.{rule.name}.{key}": estimate for key, estimate in found.items()}
     return ThrowStudy(
-        figures=figures,
+        estimates=estimates,
         logs=logs,
         trigger_times_s=triggers,
         recovered=recovered,
@@ -285,7 +285,7 @@ def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
     return rounds
 
 
-def _balancing_figures(logs: Sequence[ThrowLog]) -> dict[str, Figure]:
+def _balancing_estimates(logs: Sequence[ThrowLog]) -> dict[str, Estimate]:
     """What becomes of the throws when the robot never steps."""
     n = len(logs)
     left = [log for log in logs if log.has_left]
@@ -302,9 +302,9 @@ def _balancing_figures(logs: Sequence[ThrowLog]) -> dict[str, Figure]:
     }
 
 
-def _rule_figures(
+def _rule_estimates(
     logs: Sequence[ThrowLog], times: np.ndarray, recovered: Mapping[int, ThrowLog]
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """What becomes of the throws when a rule has the robot step.
 
     Args:
@@ -326,7 +326,7 @@ def _rule_figures(
     in_time = [i for i in fell if is_triggered[i] and times[i] < fall[i]]
     after_touch = [i for i in in_time if times[i] >= touch[i] - 1e-9]
     successes = [log for log in recovered.values() if not log.has_fallen]
-    figures = {
+    estimates = {
         "falls_with_recovery": proportion(falls, n),
         "false_triggers": proportion(int(is_triggered[calm].sum()), len(calm)),
         "triggers_before_impact": proportion(
@@ -345,7 +345,7 @@ def _rule_figures(
     }
     kinds = sorted({kind for log in recovered.values() for kind in log.violations})
     for kind in kinds:
-        figures[f"recoveries_with_{kind}"] = proportion(
+        estimates[f"recoveries_with_{kind}"] = proportion(
             sum(log.violations[kind] > 0 for log in successes), len(successes)
         )
-    return figures
+    return estimates

@@ -25,7 +25,7 @@ from drake_safety.evaluation.report.cell_map import (
 )
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
 from drake_safety.evaluation.report.tables import Column, Table
-from drake_safety.evaluation.report.verdicts import other_figures, verdict_tables
+from drake_safety.evaluation.report.verdicts import other_tables, verdict_tables
 from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_SVG_BYTES = 1_500_000  # A larger picture is embedded as PNG, which is then the smaller one.
@@ -52,9 +52,9 @@ def write_report(
         shutil.rmtree(folder / name, ignore_errors=True)
         (folder / name).mkdir(parents=True)
     tables = verdict_tables(run.results)
-    prefixes = dict.fromkeys(key.partition(".")[0] for key in run.results.figures)
+    prefixes = dict.fromkeys(key.partition(".")[0] for key in run.results.estimates)
     others = {
-        prefix: other_figures(run.results, prefix)
+        prefix: other_tables(run.results, prefix)
         for prefix in prefixes
         if prefix not in _KNOWN_PREFIXES
     }
@@ -86,9 +86,9 @@ def write_report(
             pictures=pictures,
             motions=_motions(run, pictures),
             maps=maps,
-            all_figures=[
-                (key, Column(key="", title="", meaning="", digits=4), figure)
-                for key, figure in run.results.figures.items()
+            all_estimates=[
+                (key, Column(key="", title="", meaning="", digits=4), estimate)
+                for key, estimate in run.results.estimates.items()
             ],
             entries=run.results.entries,
             versions=versions,
@@ -155,18 +155,18 @@ def _counts(run: Run) -> list[dict[str, Any]]:
 
 def _tiles(run: Run) -> list[dict[str, str]]:
     """The few figures that say most."""
-    figures = run.results.figures
+    estimates = run.results.estimates
     tiles = []
 
     def add(key: str, title: str, remark: str, column: Column) -> None:
-        figure = figures.get(key)
-        if figure is not None:
+        estimate = estimates.get(key)
+        if estimate is not None:
             tiles.append(
                 {
                     "title": title,
-                    "value": column.value_text(figure),
-                    "interval": column.interval_text(figure),
-                    "remark": f"{remark} ({figure.n})",
+                    "value": column.value_text(estimate),
+                    "interval": column.interval_text(estimate),
+                    "remark": f"{remark} ({estimate.n})",
                 }
             )
 
@@ -201,11 +201,11 @@ def _beside_the_paper(run: Run, pictures: dict[str, dict[str, Any]]) -> dict[str
             {
                 "name": name,
                 "paper": printed,
-                "ours": column.value_text(run.results.figures[key]),
-                "interval": column.interval_text(run.results.figures[key]),
+                "ours": column.value_text(run.results.estimates[key]),
+                "interval": column.interval_text(run.results.estimates[key]),
             }
             for name, printed, key, unit in one.get("values", [])
-            if key in run.results.figures
+            if key in run.results.estimates
             for column in [Column(key="", title="", meaning="", unit=unit, digits=_digits(unit))]
         ]
         found = [p for name, p in pictures.items() if Path(name).name == one["picture"]]

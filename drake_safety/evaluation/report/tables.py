@@ -1,4 +1,4 @@
-"""Tables of figures: what page, README, CSV and JSON all show, each in its own way."""
+"""Tables of estimates: what page, README, CSV and JSON all show, each in its own way."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 
 OURS = "sharpened"
 """Key of the row that the others are compared with."""
@@ -22,7 +22,7 @@ class Column:
     """What one column of a table shows.
 
     Attributes:
-        key: The last part of a figure's key.
+        key: The last part of an estimate's key.
         title: Its heading.
         meaning: A sentence for somebody who has not read the paper.
         unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
@@ -43,33 +43,39 @@ class Column:
         """Whether it is a number between 0 and 1, which can be drawn as a bar."""
         return self.unit in ("", "%")
 
-    def value_text(self, figure: Figure | None) -> str:
-        """The figure itself; a dash where there was nothing to see."""
-        if figure is None or (math.isnan(figure.value) and self.unit != "of"):
+    def value_text(self, estimate: Estimate | None) -> str:
+        """The estimate itself; a dash where there was nothing to see."""
+        if estimate is None or (math.isnan(estimate.value) and self.unit != "of"):
             return "–"
         if self.unit == "of":
-            count = round(figure.value * figure.n) if figure.n else 0
-            return f"{count} of {figure.n}"
-        if math.isinf(figure.value):
+            count = round(estimate.value * estimate.n) if estimate.n else 0
+            return f"{count} of {estimate.n}"
+        if math.isinf(estimate.value):
             return "never"
         if self.unit == "n":
-            return f"{figure.value:.0f}"
+            return f"{estimate.value:.0f}"
         unit = self.unit.removeprefix("=")
         space = "" if unit in ("", "/h") else f" {unit}"
-        return f"{self._scale * figure.value:.{self.digits}f}{space}"
+        return f"{self._scale * estimate.value:.{self.digits}f}{space}"
 
-    def interval_text(self, figure: Figure | None) -> str:
+    def interval_text(self, estimate: Estimate | None) -> str:
         """Its interval in brackets, or nothing."""
-        if figure is None or self.unit not in ("", "%", "/h") or not math.isfinite(figure.value):
+        if (
+            estimate is None
+            or self.unit not in ("", "%", "/h")
+            or not math.isfinite(estimate.value)
+        ):
             return ""
-        if not (math.isfinite(figure.low) and math.isfinite(figure.high)):
+        if not (math.isfinite(estimate.low) and math.isfinite(estimate.high)):
             return ""
-        low, high = (f"{self._scale * end:.{self.digits}f}" for end in (figure.low, figure.high))
+        low, high = (
+            f"{self._scale * end:.{self.digits}f}" for end in (estimate.low, estimate.high)
+        )
         return f"({low}–{high})"
 
-    def text(self, figure: Figure | None) -> str:
-        """The figure and its interval."""
-        return f"{self.value_text(figure)} {self.interval_text(figure)}".strip()
+    def text(self, estimate: Estimate | None) -> str:
+        """The estimate and its interval."""
+        return f"{self.value_text(estimate)} {self.interval_text(estimate)}".strip()
 
     @property
     def _scale(self) -> float:
@@ -81,15 +87,15 @@ class Row:
     """Who or what is judged.
 
     Attributes:
-        key: Its part of the figures' keys.
+        key: Its part of the estimates' keys.
         label: How it is called.
-        figures: One a column; None where there is none.
+        estimates: One a column; None where there is none.
         is_quoted: Whether somebody else printed them: they take no part in comparisons.
     """
 
     key: str
     label: str
-    figures: Sequence[Figure | None]
+    estimates: Sequence[Estimate | None]
     is_quoted: bool = False
 
 
@@ -114,30 +120,30 @@ class Table:
     rows: Sequence[Row] = field(default_factory=list)
 
     def best(self, column: int) -> set[int]:
-        """Rows whose figure is the best of a column; none where there is nothing to compare."""
+        """Rows whose estimate is the best of a column; none where there is nothing to compare."""
         sign = self.columns[column].better
         values = {
-            i: sign * row.figures[column].value  # type: ignore[union-attr]
+            i: sign * row.estimates[column].value  # type: ignore[union-attr]
             for i, row in enumerate(self.rows)
-            if not row.is_quoted and _is_known(row.figures[column])
+            if not row.is_quoted and _is_known(row.estimates[column])
         }
         if not sign or len(values) < 2 or len(set(values.values())) == 1:
             return set()
         return {i for i, value in values.items() if value == max(values.values())}
 
     def rivals_ahead(self) -> list[str]:
-        """In words, each figure in which another row is ahead of ours."""
+        """In words, each estimate in which another row is ahead of ours."""
         ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
         found: list[str] = []
         if ours is None:
             return found
         for number, column in enumerate(self.columns):
             best = self.best(number)
-            mine = self.rows[ours].figures[number]
+            mine = self.rows[ours].estimates[number]
             if not best or ours in best or mine is None:
                 continue
             first = self.rows[min(best)]
-            other = first.figures[number]
+            other = first.estimates[number]
             if other is None:
                 continue
             is_clear = (other.low > mine.high) if column.better > 0 else (other.high < mine.low)
@@ -149,15 +155,15 @@ class Table:
         return found
 
     def to_csv(self) -> str:
-        """The table as CSV: value, ends of the interval and n of every figure."""
+        """The table as CSV: value, ends of the interval and n of every estimate."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         names = ("", ".low", ".high", ".n")
         writer.writerow([self.corner, *(f"{c.key}{end}" for c in self.columns for end in names)])
         for row in self.rows:
             cells: list[Any] = [row.key]
-            for figure in row.figures:
-                fields = {} if figure is None else figure.to_json()
+            for estimate in row.estimates:
+                fields = {} if estimate is None else estimate.to_json()
                 cells += [fields.get(name) for name in ("value", "low", "high", "n")]
             writer.writerow(["" if cell is None else cell for cell in cells])
         return out.getvalue()
@@ -175,8 +181,8 @@ class Table:
                     "key": row.key,
                     "label": row.label,
                     "figures": {
-                        column.key: None if figure is None else figure.to_json()
-                        for column, figure in zip(self.columns, row.figures, strict=True)
+                        column.key: None if estimate is None else estimate.to_json()
+                        for column, estimate in zip(self.columns, row.estimates, strict=True)
                     },
                 }
                 for row in self.rows
@@ -184,20 +190,20 @@ class Table:
         }
 
     def to_markdown(self) -> str:
-        """The table as Markdown, figures with their intervals."""
+        """The table as Markdown, estimates with their intervals."""
         lines = [
             "| " + " | ".join([self.corner, *(c.title for c in self.columns)]) + " |",
             "|" + "---|" * (1 + len(self.columns)),
         ]
         for row in self.rows:
             cells = [row.label if row.is_quoted else _MODES.sub(r"`\1`", row.label)]
-            for column, figure in zip(self.columns, row.figures, strict=True):
-                cells.append("" if figure is None else column.text(figure))
+            for column, estimate in zip(self.columns, row.estimates, strict=True):
+                cells.append("" if estimate is None else column.text(estimate))
             if row.is_quoted:
                 cells = [f"*{cell}*" if cell else "" for cell in cells]
             lines.append("| " + " | ".join(cells).replace("|  |", "| |") + " |")
         return "\n".join(lines).replace("|  |", "| |")
 
 
-def _is_known(figure: Figure | None) -> bool:
-    return figure is not None and math.isfinite(figure.value)
+def _is_known(estimate: Estimate | None) -> bool:
+    return estimate is not None and math.isfinite(estimate.value)

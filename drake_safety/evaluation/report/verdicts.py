@@ -61,7 +61,7 @@ def label_of(key: str) -> str:
 
 
 def verdict_tables(results: Results) -> list[Table]:
-    """Every table that the results have figures for, in the order in which one reads them."""
+    """Every table that the results have estimates for, in the order in which one reads them."""
     judged = columns_of("judged")
     tables = [
         _by_judge(
@@ -118,8 +118,8 @@ def plan_sets(results: Results) -> list[str]:
     """Prefixes of the sets of targets that were judged, all of them first."""
     found = [
         key.removesuffix(".outcomes.safe")
-        for key, figure in results.figures.items()
-        if key.endswith(".outcomes.safe") and figure.n
+        for key, estimate in results.estimates.items()
+        if key.endswith(".outcomes.safe") and estimate.n
     ]
     return sorted(found, key=lambda prefix: (prefix.count("."), prefix))
 
@@ -129,7 +129,7 @@ def set_title(prefix: str) -> str:
     return _SET_TITLES.get(prefix, spoken(prefix.partition(".")[2] or prefix).replace(".", ", "))
 
 
-def other_figures(results: Results, prefix: str) -> list[Table]:
+def other_tables(results: Results, prefix: str) -> list[Table]:
     """Figures of a kind that no other table knows, each in a row of its own.
 
     Args:
@@ -138,14 +138,14 @@ def other_figures(results: Results, prefix: str) -> list[Table]:
     """
     column = Column(key="value", title="value", meaning="As the evaluation wrote it.")
     groups: dict[str, list[Row]] = {}
-    for key, figure in results.figures.items():
+    for key, estimate in results.estimates.items():
         first, *rest = key.split(".")
         if first != prefix or not rest:
             continue
         group = rest[0] if len(rest) > 1 else ""
         name = ".".join(rest[1:] if len(rest) > 1 else rest)
         groups.setdefault(group, []).append(
-            Row(key=key, label=spoken(name).replace(".", " · "), figures=[figure])
+            Row(key=key, label=spoken(name).replace(".", " · "), estimates=[estimate])
         )
     return [
         Table(
@@ -160,25 +160,25 @@ def other_figures(results: Results, prefix: str) -> list[Table]:
     ]
 
 
-def figure_rows(
+def estimate_rows(
     results: Results, prefixes: Mapping[str, str], columns: Sequence[Column]
 ) -> list[Row]:
-    """A row a prefix of figures' keys; those without any figure are left out.
+    """A row a prefix of estimates' keys; those without any estimate are left out.
 
     Args:
         results: The results.
         prefixes: By prefix, what the row is called.
-        columns: Which figures.
+        columns: Which estimates.
     """
     rows = [
         Row(
             key=prefix,
             label=label,
-            figures=[results.figures.get(f"{prefix}.{column.key}") for column in columns],
+            estimates=[results.estimates.get(f"{prefix}.{column.key}") for column in columns],
         )
         for prefix, label in prefixes.items()
     ]
-    return [row for row in rows if any(row.figures)]
+    return [row for row in rows if any(row.estimates)]
 
 
 def _by_judge(
@@ -191,16 +191,16 @@ def _by_judge(
     key: str | None = None,
     corner: str = "who judges",
 ) -> Table:
-    """A row for each who has a figure of the second column."""
+    """A row for each who has an estimate of the second column."""
     pattern = re.compile(rf"{re.escape(prefix)}\.(.+)\.{columns[1].key}")
-    names = [match[1] for name in results.figures if (match := pattern.fullmatch(name))]
+    names = [match[1] for name in results.estimates if (match := pattern.fullmatch(name))]
     if prefix in plan_sets(results):
         # The names of sets go on from one another's; those of judges have no dots.
         names = [name for name in names if "." not in name]
-        meaning += f" Judged on {results.figures[f'{prefix}.outcomes.safe'].n} fresh motions."
-    elif first := results.figures.get(f"{prefix}.{names[0]}.auc" if names else ""):
+        meaning += f" Judged on {results.estimates[f'{prefix}.outcomes.safe'].n} fresh motions."
+    elif first := results.estimates.get(f"{prefix}.{names[0]}.auc" if names else ""):
         meaning += f" Judged on {first.n} fresh motions."
-    rows = figure_rows(results, {f"{prefix}.{name}": label_of(name) for name in names}, columns)
+    rows = estimate_rows(results, {f"{prefix}.{name}": label_of(name) for name in names}, columns)
     return Table(
         key=key or prefix.replace(".", "_"),
         title=title,
@@ -212,7 +212,7 @@ def _by_judge(
 
 
 def _triggers(results: Results) -> Table:
-    alone = results.figures.get("throws.falls_without_recovery")
+    alone = results.estimates.get("throws.falls_without_recovery")
     meaning = "Balls are thrown at the robot; whoever judges may trigger a recovery step."
     if alone is not None:
         meaning += (
@@ -230,15 +230,15 @@ def alarm_table(results: Results) -> Table:
     meaning = (
         "Everyone may give as many false alarms on other motions: thresholds are chosen for that."
     )
-    refused = results.figures.get("monitoring.motions.refused")
+    refused = results.estimates.get("monitoring.motions.refused")
     if refused is not None and refused.n:
         meaning += (
             f" Of {refused.n} motions that would be safe if nobody pushed, "
             f"{_SHARE.value_text(refused)} lead to goals that sharpened refuses beforehand: they "
             "are not begun, whoever watches."
         )
-    left = results.figures.get("monitoring.motions.leave_safe_set")
-    hours = results.figures.get("monitoring.motions.safe_hours")
+    left = results.estimates.get("monitoring.motions.leave_safe_set")
+    hours = results.estimates.get("monitoring.motions.safe_hours")
     if left is not None and hours is not None:
         meaning += (
             f" Of {left.n} fresh motions {_SHARE.value_text(left)} leave the safe set; the others "
@@ -274,14 +274,14 @@ def _causes(results: Results) -> Table:
 
 
 def _by_set(results: Results, infix: str, title: str, meaning: str, of_columns: str) -> Table:
-    """A row a set of targets, a column a figure below `infix`."""
+    """A row a set of targets, a column an estimate below `infix`."""
     names = dict.fromkeys(
-        match[1] for key in results.figures if (match := re.search(rf"\.{infix}\.([^.]+)$", key))
+        match[1] for key in results.estimates if (match := re.search(rf"\.{infix}\.([^.]+)$", key))
     )
     columns = [
         Column(key=f"{infix}.{name}", title=label_of(name), meaning=of_columns, unit="%", digits=1)
         for name in names
-        if any(results.figures.get(f"{key}.{infix}.{name}") for key in plan_sets(results))
+        if any(results.estimates.get(f"{key}.{infix}.{name}") for key in plan_sets(results))
     ]
     return Table(
         key=infix,
@@ -294,4 +294,4 @@ def _by_set(results: Results, infix: str, title: str, meaning: str, of_columns: 
 
 
 def _set_rows(results: Results, columns: Sequence[Column]) -> list[Row]:
-    return figure_rows(results, {key: set_title(key) for key in plan_sets(results)}, columns)
+    return estimate_rows(results, {key: set_title(key) for key in plan_sets(results)}, columns)
