@@ -79,7 +79,7 @@ def losses(
     found = {}
     for name in STEPS:
         value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
-        found[f"losses.{name}.brier"] = Estimate(value, value, value, len(test.episodes))
+        found[f"losses.{name}.brier"] = Estimate.exact(value, len(test.episodes))
     return found
 
 

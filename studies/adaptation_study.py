@@ -183,8 +183,8 @@ def study(
                     [one[published]["brier"] for one in found[f"adapted.{size}"]]
                 )
                 share = float(closed / gap) if gap > 0.0 else math.nan
-                estimates[f"adapted.{size}.{published}.gap_closed"] = Estimate(
-                    share, share, share, num_test
+                estimates[f"adapted.{size}.{published}.gap_closed"] = Estimate.exact(
+                    share, num_test
                 )
     return AdaptationStudy(estimates=estimates, sizes=list(sizes), num_orders=num_orders)
 

@@ -221,7 +221,7 @@ def learning_curve(
         ):
             found = verdict_estimates(plans, chosen, threshold)
             limit = 1.0 - threshold
-            found["threshold"] = Estimate(limit, limit, limit, len(calibration))
+            found["threshold"] = Estimate.exact(limit, len(calibration))
             estimates |= {f"{key}.{what}": estimate for what, estimate in found.items()}
     return estimates
 

@@ -296,5 +296,5 @@ def _differences(results: Results) -> str:
 
 
 def _ahead(table: Table) -> str:
-    ahead = table.rivals_ahead()
+    ahead = table.better_baselines()
     return f"Ahead of `sharpened`: {'; '.join(ahead)}." if ahead else ""

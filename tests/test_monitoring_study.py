@@ -198,8 +198,8 @@ def test_the_table_says_where_another_alarm_is_ahead():
     study = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST)
     table = alarm_table(Results(estimates=study.estimates))
     assert [row.key for row in table.rows] == ["sharpened", "tilt"]
-    (first, *_) = table.rivals_ahead()
-    assert first.startswith("noticed in time: tilt, 50.0 % against 25.0 %")
+    (first, *_) = table.better_baselines()
+    assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
     assert "4 of" not in table.meaning and "66.7 % leave the safe set" in table.meaning
 
 

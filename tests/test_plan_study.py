@@ -209,7 +209,7 @@ def test_reachability_answers_for_the_hand_that_reaches_and_for_no_other(plans):
     score = rule.unsafe_score(replace(plans, hand="left"))
     np.testing.assert_array_equal(score, (plans.goals[:, 0] >= 1.0).astype(float))
     for hand in (None, "right"):
-        with pytest.raises(ValueError, match=rf"no hand '{hand}' is known; known are \['left'\]"):
+        with pytest.raises(ValueError, match=rf"unknown hand '{hand}'; the hands are \['left'\]"):
             rule.unsafe_score(replace(plans, hand=hand))
 
 

@@ -77,7 +77,7 @@ def figures_table(found: Figures) -> Table:
             for column, estimate in zip(found.columns, row.estimates, strict=True)
         ]
         table.add_row(row.label, *cells)
-    ahead = found.rivals_ahead()
+    ahead = found.better_baselines()
     table.caption = found.meaning or None
     if ahead:
         table.caption = f"{found.meaning}\nAhead of sharpened: {'; '.join(ahead)}"

@@ -1,4 +1,4 @@
-"""Every scorer on fresh nominal episodes: per segment, and at planning time alone."""
+"""Evaluation of scorers on fresh nominal episodes: every segment, and the first row alone."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from drake_safety.learning.segments import Episodes, split
 def evaluate_episodes(
     scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
 ) -> tuple[dict[str, Estimate], dict[str, np.ndarray], np.ndarray]:
-    """Every scorer on fresh episodes, per segment and at k = 0.
+    """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
-    The threshold of the recalls is the one of best balanced accuracy on the calibration set, of
-    its segments and of its first steps; the test set decides nothing.
+    Thresholds maximise the balanced accuracy on the calibration set, separately for all segments
+    and for k = 0.
 
     Args:
-        scorers: Who is judged.
-        calibration: Other fresh episodes, for thresholds.
-        test: Fresh episodes.
+        scorers: The scorers.
+        calibration: Fresh episodes for thresholds.
+        test: Other fresh episodes.
 
     Returns:
-        The figures by dotted key, the unsafe score of every test segment by scorer, (N,) each, and
-        whether each segment's episode ends unsafely, (N,).
+        The estimates by dotted key, the unsafe score of every test segment by scorer, (N,) each,
+        and whether each segment's episode ends unsafely, (N,).
 
     Raises:
-        ValueError: Some of the episodes are none that a scorer has not seen.
+        ValueError: A scorer has used the seed of a set.
     """
     for scorer in scorers:
         check_unused(scorer.used, (calibration.info.seed, test.info.seed), f"'{scorer.name}'")
     segments = split(test, stride=1, discount=1.0)
     seen = split(calibration, stride=1, discount=1.0)
-    # Per kind of figure, the segments it is about in either set.
+    # Rows of the test set and of the calibration set, by prefix of the keys.
     rows_of = {
         "segments": (np.ones(len(segments), dtype=bool), np.ones(len(seen), dtype=bool)),
         "episodes": (segments.is_first, seen.is_first),

@@ -1,4 +1,4 @@
-"""Balls at the actual plant: when each scorer would have the robot step, and what becomes of it."""
+"""Balls thrown at the actual plant: when each rule triggers recovery, and the outcome."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ PAPER_THRESHOLD = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class TriggerRule:
-    """A scorer with a threshold: when would it have the robot step.
+    """A scorer with a threshold that triggers recovery.
 
     Attributes:
         name: Its key in tables.
-        scorer: Who scores.
+        scorer: The scorer.
         threshold: Γ_thre; None to choose it on the calibration throws.
     """
 
@@ -42,17 +42,17 @@ def trigger_rules(
     threshold: float,
     is_normalized: bool,
 ) -> list[TriggerRule]:
-    """Those compared: Γ as the scenario triggers on it, Γ as the paper does, and the classifiers.
+    """The rules that are compared: the scenario's, the paper's and the baseline classifiers.
 
     Args:
         sharpened: An assessment in the sharpened mode.
-        paper: One in the paper's mode.
-        classifiers: Direct classifiers; their thresholds are left open.
+        paper: An assessment in the paper's mode.
+        classifiers: Baseline classifiers, whose thresholds are chosen on calibration throws.
         threshold: The scenario's Γ_thre.
-        is_normalized: Whether that is on b_safe / (1 - μ) or, literally, on b_safe.
+        is_normalized: Whether it applies to b_safe / (1 - μ) rather than to literal b_safe.
 
     Returns:
-        The rules, the scenario's own first, named "sharpened".
+        The rules; the scenario's own is the first, named "sharpened".
     """
     own = assessment_scorer(
         "sharpened", sharpened, "normalized" if is_normalized else "safety_probability"
@@ -75,15 +75,15 @@ def trigger_rules(
 
 @dataclass(frozen=True, kw_only=True)
 class ThrowStudy:
-    """What :func:`evaluate_throws` found.
+    """The result of :func:`evaluate_throws`.
 
     Attributes:
         estimates: By dotted key.
         logs: The throws without recovery.
-        trigger_times_s: Per rule, when it triggered in each throw [s], (N,); NaN for never.
-        recovered: Per rule, the logs with recovery by index of the throw, triggered ones only.
+        trigger_times_s: Per rule, the trigger time of each throw [s], (N,); NaN for never.
+        recovered: Per rule, the logs with recovery of the triggered throws, by index.
         thresholds: Per rule.
-        calibration_logs: The other throws, on which thresholds were chosen, if any were left open.
+        calibration_logs: The throws on which thresholds were chosen; empty if all were given.
     """
 
     estimates: dict[str, Estimate]
@@ -94,10 +94,10 @@ class ThrowStudy:
     calibration_logs: list[ThrowLog] = field(default_factory=list)
 
     def outcomes(self, rule: str | None = None) -> list[str]:
-        """What became of each throw, in the words of the throws figure.
+        """The outcome of each throw, a key of `throws_figure.OUTCOMES`.
 
         Args:
-            rule: Who triggers recovery; nobody by default.
+            rule: The rule that triggers recovery; none by default.
         """
         recovered = {} if rule is None else self.recovered[rule]
         outcomes = []
@@ -113,7 +113,7 @@ class ThrowStudy:
 
 
 def log_probability(log: ThrowLog, scorer: Scorer) -> np.ndarray:
-    """The scorer's safety probability at every row of a log, (N,)."""
+    """Safety probability of a scorer at every row of a log, (N,)."""
     return scorer.probability(log.state, log.desired_preview, log.features)
 
 
@@ -125,18 +125,18 @@ def choose_threshold(
 ) -> float:
     """The highest threshold whose share of false triggers stays within a bound.
 
-    A high threshold triggers early and misses nothing; false triggers are what limits it.
+    A higher threshold triggers earlier and misses fewer falls, but has more false triggers.
 
     Args:
         logs: Calibration throws without recovery.
-        probabilities: Of each log's rows.
-        max_false_share: Bound on the share of false triggers among the throws that balancing
-            survives inside the safe set.
+        probabilities: Safety probability of each log's rows.
+        max_false_share: Bound on the share of false triggers among the throws that stay in the
+            safe set without recovery.
 
     Returns:
         Γ_thre.
     """
-    # A calm throw triggers falsely below its lowest probability.
+    # A throw that stays safe has a false trigger if its lowest probability is below Γ_thre.
     lowest = np.array(
         [
             np.nan_to_num(p, nan=0.0).min()
@@ -164,26 +164,26 @@ def evaluate_throws(
     num_workers: int | None = None,
     progress: StageProgress | None = None,
 ) -> ThrowStudy:
-    """Throws balls at the actual plant and compares when rules trigger, and what becomes of it.
+    """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     Args:
         scenario: The scenario.
-        rules: Who triggers.
-        num_throws: Fresh throws that are reported.
-        num_calibration: Other throws, on which thresholds left open are chosen.
-        seed: Of the reported throws.
-        calibration_seed: Of the others.
-        variation: Which plant.
-        num_workers: Processes.
+        rules: The rules.
+        num_throws: Number of test throws.
+        num_calibration: Number of calibration throws, for thresholds that are None.
+        seed: Seed of the test throws.
+        calibration_seed: Seed of the calibration throws.
+        variation: Variation of the plant.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Raises:
-        ValueError: Both seeds are the same, or there is no threshold to choose: every calibration
+        ValueError: The seeds are equal, or no threshold can be chosen because every calibration
             throw leaves the safe set.
     """
     if seed == calibration_seed:
         raise ValueError(f"throws: seed and calibration seed are both {seed}; they must differ")
-    report = progress or _report_to_nobody
+    report = progress or (lambda stage, done, total: None)
     throw = partial(run_throws, scenario, variation=variation, num_workers=num_workers)
     thresholds = {rule.name: rule.threshold for rule in rules if rule.threshold is not None}
     calibration: list[ThrowLog] = []
@@ -217,7 +217,7 @@ def evaluate_throws(
         }
         for name, times in triggers.items()
     }
-    # Rules often agree on the instant: each distinct recovery is simulated once.
+    # Rules often trigger at the same instant: each distinct recovery is simulated once.
     wanted = {pair for times in triggered.values() for pair in times.items()}
     simulated = _simulate_recoveries(partial(throw, seed=seed), wanted, report)
     recovered = {
@@ -228,7 +228,7 @@ def evaluate_throws(
     for rule in rules:
         found = _rule_estimates(logs, triggers[rule.name], recovered[rule.name])
         threshold = thresholds[rule.name]
-        found["threshold"] = Estimate(threshold, threshold, threshold, len(logs))
+        found["threshold"] = Estimate.exact(threshold, len(logs))
         estimates |= {f"throws.{rule.name}.{key}": estimate for key, estimate in found.items()}
     return ThrowStudy(
         estimates=estimates,
@@ -240,10 +240,6 @@ def evaluate_throws(
     )
 
 
-def _report_to_nobody(stage: str, done: int, total: int) -> None:
-    """Stands in for a progress that was not asked for."""
-
-
 def _simulate_recoveries(
     throw: Callable[..., list[ThrowLog]],
     wanted: Collection[tuple[int, float]],
@@ -252,9 +248,9 @@ def _simulate_recoveries(
     """Simulates throws with recovery.
 
     Args:
-        throw: `run_throws` but for indices, trigger times and progress.
+        throw: `run_throws` without indices, trigger times and progress.
         wanted: Pairs of index and trigger time [s].
-        report: Progress.
+        report: Called with a stage, the number done and the number wanted.
 
     Returns:
         The log of each pair.
@@ -275,7 +271,7 @@ def _simulate_recoveries(
 
 
 def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
-    """Shares pairs of index and trigger time out among rounds in which no index stands twice."""
+    """Splits pairs of index and trigger time into rounds in which each index occurs once."""
     rounds: list[dict[int, float]] = []
     for index, time_s in sorted(wanted):
         free = next((one for one in rounds if index not in one), None)
@@ -286,7 +282,7 @@ def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
 
 
 def _balancing_estimates(logs: Sequence[ThrowLog]) -> dict[str, Estimate]:
-    """What becomes of the throws when the robot never steps."""
+    """Estimates of the throws without recovery."""
     n = len(logs)
     left = [log for log in logs if log.has_left]
     fell = [log for log in logs if log.has_fallen]
@@ -305,12 +301,12 @@ def _balancing_estimates(logs: Sequence[ThrowLog]) -> dict[str, Estimate]:
 def _rule_estimates(
     logs: Sequence[ThrowLog], times: np.ndarray, recovered: Mapping[int, ThrowLog]
 ) -> dict[str, Estimate]:
-    """What becomes of the throws when a rule has the robot step.
+    """Estimates of the throws with the recovery that a rule triggers.
 
     Args:
         logs: The N throws without recovery.
-        times: When the rule triggered in each [s], (N,); NaN for never.
-        recovered: By index of the throw, the logs with recovery of those it triggered in.
+        times: Trigger times of the rule [s], (N,); NaN for never.
+        recovered: By index of the throw, the logs with recovery of triggered throws.
     """
     n = len(logs)
     calm = [i for i, log in enumerate(logs) if not log.has_left]
@@ -318,7 +314,6 @@ def _rule_estimates(
     touch = np.array([log.throw.time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
     is_triggered = ~np.isnan(times)
-    # Without a trigger the log itself says how the throw ends; with one, the recovery does.
     falls = sum(
         recovered[log.index].has_fallen if log.index in recovered else log.has_fallen
         for log in logs

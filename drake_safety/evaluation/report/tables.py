@@ -1,4 +1,4 @@
-"""Tables of estimates: what page, README, CSV and JSON all show, each in its own way."""
+"""Tables of estimates, written as HTML, Markdown, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from typing import Any
 from drake_safety.evaluation.metrics import Estimate
 
 OURS = "sharpened"
-"""Key of the row that the others are compared with."""
+"""Key of the row that baselines are compared with."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """What one column of a table shows.
+    """A column of a table.
 
     Attributes:
-        key: The last part of an estimate's key.
+        key: Last part of the keys of its estimates.
         title: Its heading.
-        meaning: A sentence for somebody who has not read the paper.
+        meaning: Its definition, in a sentence.
         unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
-            rate, or "=" and "=%" for what has no interval.
-        better: 1 where more is better, -1 where less is, 0 where neither.
-        digits: After the decimal point.
+            rate, or "=" and "=%" for values without interval.
+        better: 1 if larger is better, -1 if smaller is, 0 otherwise.
+        digits: Digits after the decimal point.
     """
 
     key: str
@@ -40,11 +40,11 @@ class Column:
 
     @property
     def is_share(self) -> bool:
-        """Whether it is a number between 0 and 1, which can be drawn as a bar."""
+        """Whether values lie between 0 and 1 and can be drawn as a bar."""
         return self.unit in ("", "%")
 
     def value_text(self, estimate: Estimate | None) -> str:
-        """The estimate itself; a dash where there was nothing to see."""
+        """The value of an estimate; a dash if it has none."""
         if estimate is None or (math.isnan(estimate.value) and self.unit != "of"):
             return "–"
         if self.unit == "of":
@@ -59,7 +59,7 @@ class Column:
         return f"{self._scale * estimate.value:.{self.digits}f}{space}"
 
     def interval_text(self, estimate: Estimate | None) -> str:
-        """Its interval in brackets, or nothing."""
+        """The interval of an estimate in brackets, if any."""
         if (
             estimate is None
             or self.unit not in ("", "%", "/h")
@@ -74,7 +74,7 @@ class Column:
         return f"({low}–{high})"
 
     def text(self, estimate: Estimate | None) -> str:
-        """The estimate and its interval."""
+        """The value and interval of an estimate."""
         return f"{self.value_text(estimate)} {self.interval_text(estimate)}".strip()
 
     @property
@@ -84,13 +84,13 @@ class Column:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Who or what is judged.
+    """A row of a table, such as a method.
 
     Attributes:
-        key: Its part of the estimates' keys.
-        label: How it is called.
-        estimates: One a column; None where there is none.
-        is_quoted: Whether somebody else printed them: they take no part in comparisons.
+        key: Its part of the keys of its estimates.
+        label: Its label.
+        estimates: One a column; None if missing.
+        is_quoted: Whether they are quoted from a publication and excluded from comparisons.
     """
 
     key: str
@@ -101,13 +101,13 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Figures of a few judges, side by side.
+    """A table of estimates.
 
     Attributes:
-        key: Its name among files.
+        key: Name of its files.
         title: Its heading.
-        meaning: What it is about, for somebody who has not read the paper.
-        corner: What the rows are.
+        meaning: Its explanation.
+        corner: Heading of the row labels.
         columns: The columns.
         rows: The rows.
     """
@@ -120,7 +120,7 @@ class Table:
     rows: Sequence[Row] = field(default_factory=list)
 
     def best(self, column: int) -> set[int]:
-        """Rows whose estimate is the best of a column; none where there is nothing to compare."""
+        """Indices of the best rows of a column; empty if there is nothing to compare."""
         sign = self.columns[column].better
         values = {
             i: sign * row.estimates[column].value  # type: ignore[union-attr]
@@ -131,8 +131,8 @@ class Table:
             return set()
         return {i for i, value in values.items() if value == max(values.values())}
 
-    def rivals_ahead(self) -> list[str]:
-        """In words, each estimate in which another row is ahead of ours."""
+    def better_baselines(self) -> list[str]:
+        """Describes each column in which another row is better than `OURS`."""
         ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
         found: list[str] = []
         if ours is None:
