@@ -1,4 +1,4 @@
-"""``python -m studies ablate``: what each choice in learning Γ is worth."""
+"""``python -m studies ablate``: ablation of the choices in learning Γ."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _COLUMNS = {
     "safe_recall": "safe recall",
     "unsafe_recall": "unsafe recall",
     "brier": "Brier",
-    "calibrated_auc": "AUC by the heads",
+    "calibrated_auc": "AUC, calibrated Γ",
     "k0.auc": "AUC, k = 0",
     "k0.auc_gain": "over the baseline, k = 0",
 }
@@ -59,7 +59,7 @@ def ablate(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="One variant a choice, one short-trained map each, fewer episodes."
+            "--quick", help="One variant per choice, one map with short training, fewer episodes."
         ),
     ] = False,
     episodes: Annotated[
@@ -67,18 +67,18 @@ def ablate(
     ] = None,
     calibration_episodes: Annotated[
         int | None,
-        typer.Option(help="Other ones, for the recalls' thresholds; 300, or 100.", min=2),
+        typer.Option(help="Other ones, for thresholds of the recalls; 300, or 100.", min=2),
     ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of the fresh ones: those of `evaluate` by default.")
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Learn Γ anew with one choice made otherwise at a time, and judge it on the same episodes.
+    """Train Γ with one choice changed at a time, and evaluate it on the same episodes.
 
-    Every variant learns from the training episodes in ASSESSMENT. A row is written as soon as it is
-    finished: an ablation that was stopped goes on when it is called again. Feedback
-    that `adaptation` has left in ASSESSMENT serves to compare what n_f may count.
+    Every variant learns from the training episodes in ASSESSMENT. Rows are written as they finish:
+    a stopped ablation continues when called again. Feedback of `adaptation` in ASSESSMENT is used
+    to compare the definitions of n_f.
     """
     from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.capabilities import rate_names
@@ -179,7 +179,7 @@ def _sets(
     workers: int | None,
     stages: Stages,
 ) -> AblationSets:
-    """The training episodes, and fresh ones: what is not there yet is simulated and kept."""
+    """The training episodes and fresh ones, which are simulated and kept as needed."""
     from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
     from studies.ablation import AblationSets, EpisodeSet
@@ -209,7 +209,7 @@ def _sets(
 def _counting(
     scenario: Scenario, folder: Path
 ) -> dict[tuple[str, str], dict[str, dict[str, Estimate]]]:
-    """What n_f counts, for each plant that `adapt` has left pairs and fresh episodes of."""
+    """Definitions of n_f, for each plant with pairs and fresh episodes of `adapt`."""
     from drake_safety.learning.feedback import feedback_sets
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.dataset import load_episodes
@@ -221,13 +221,13 @@ def _counting(
         hash_ = scenario.simulation_hash(variation)[:12]
         for pairs in sorted((folder / "feedback").glob(f"{hash_}-*")):
             own_seed = int(pairs.name.rpartition("-")[2])
-            # Beside the pairs, `adapt` keeps what it has judged by.
+            # `adapt` keeps its fresh episodes beside the pairs.
             judging = ADAPTATION.seeds(own_seed)["evaluation of the adaptation"]
             fresh = pairs.with_name(f"{hash_}-{judging}") / variation
             if not ((pairs / "nominal").is_dir() and fresh.is_dir()):
                 continue
             nominal, actual = (load_episodes(pairs / name) for name in ("nominal", variation))
-            # Where `adapt` was stopped some twins are missing.
+            # If `adapt` was stopped, some twins are missing.
             twins = {episode.index for episode in nominal}
             paired = Episodes(actual.info, [one for one in actual if one.index in twins])
             feedback = feedback_sets(paired, nominal)
@@ -241,9 +241,9 @@ def _counting(
 def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
     n = rows[0].estimates["k0.auc"].n
     table = new_table(
-        "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
+        "variant", *_COLUMNS.values(), title=f"Evaluated on the same {n} fresh episodes"
     )
-    # The name is what one looks for: it is not folded, however narrow the figures become.
+    # Names are not folded, however narrow the other columns become.
     table.columns[0].no_wrap = True
     for i, row in enumerate(rows):
         is_last = i + 1 == len(rows) or rows[i + 1].group != row.group

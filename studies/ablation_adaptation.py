@@ -1,4 +1,4 @@
-"""What n_f counts in the paper's adaptation: samples of the cell, or literally all feedback."""
+"""Definitions of n_f in the paper's adaptation: samples of the cell, or all feedback."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def counting_estimates(
     *,
     bootstrap: Bootstrap | None = None,
 ) -> dict[str, dict[str, Estimate]]:
-    """Judges an assessment before feedback, and after it with either count.
+    """Evaluates an assessment before feedback, and after it with either definition.
 
     Args:
-        prior: The assessment, as it was learned.
+        prior: The assessment before feedback.
         feedback: The feedback sets.
         test: Fresh episodes of the actual robot.
-        bootstrap: How intervals are found.
+        bootstrap: Settings of the intervals.
 
     Returns:
-        By who is judged, the figures of every segment by key; `auc_gain` is over the prior.
+        By assessment, the estimates on every segment by key; `auc_gain` is over the prior.
     """
     bootstrap = bootstrap or Bootstrap()
     judged = {BEFORE: prior}

@@ -1,4 +1,4 @@
-"""Ablations as a picture: a dot with its interval for every variant, beside the baseline."""
+"""Plot of an ablation: estimates and intervals of all variants."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PANELS = {"auc": "AUC, every segment", "k0.auc": "AUC, first step (k = 0)", "bri
 
 
 def ablation_figure(rows: Sequence[AblationRow], panels: Mapping[str, str] | None = None) -> Figure:
-    """Every row of an ablation, by choice; a line marks the baseline.
+    """Plots the rows of an ablation by choice; a line marks the baseline.
 
     Args:
-        rows: The rows; the baseline among them.
-        panels: Titles by key of a figure.
+        rows: The rows, with the baseline.
+        panels: Titles by key of the estimate.
     """
     panels = PANELS if panels is None else panels
     heights: list[float] = []
     top = 0.0
     for i, row in enumerate(rows):
-        # A little room before each choice.
+        # Space before each choice.
         top += 1.0 if i == 0 or row.group == rows[i - 1].group else 1.6
         heights.append(-top)
     with drawing_style():

@@ -1,4 +1,4 @@
-"""Conducts ablations: a row a variant, kept as soon as it is there; a stopped one goes on."""
+"""Runs ablations; rows are stored as they finish, so that stopped ablations continue."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _SCHEMA = "drake_safety.ablation"
 
 @dataclass(frozen=True, kw_only=True)
 class AblationRow:
-    """What became of one variant.
+    """Results of a variant.
 
     Attributes:
-        name: Of the variant.
-        group: Which choice it is about.
-        fingerprint: Of all that decides the figures.
+        name: Name of the variant.
+        group: The choice.
+        fingerprint: Hash of everything that determines the estimates.
         estimates: By key.
     """
 
@@ -50,12 +50,12 @@ class AblationRow:
 
 @dataclass(kw_only=True)
 class AblationFile:
-    """The rows that are done, in a JSON file that is whole at any time.
+    """Finished rows, in a JSON file that is replaced atomically.
 
     Attributes:
         path: The file.
-        entries: What else it says, such as command and versions.
-        rows: By name of the variant.
+        entries: Other entries, such as command and versions.
+        rows: Rows by name of the variant.
     """
 
     path: Path
@@ -64,25 +64,25 @@ class AblationFile:
 
     @classmethod
     def open(cls, path: Path, entries: Mapping[str, Any]) -> AblationFile:
-        """Goes on with what an earlier run has left, if anything.
+        """Opens a new file, or that of an earlier run.
 
         Args:
             path: The file.
-            entries: What it shall say besides, in place of what it said.
+            entries: Other entries, which replace existing ones.
 
         Raises:
-            ValueError: The file is another's.
+            ValueError: The file holds no ablation.
         """
         rows = cls.read(path).rows if path.is_file() else {}
         return cls(path=path, entries=dict(entries), rows=rows)
 
     @classmethod
     def read(cls, path: Path) -> AblationFile:
-        """Reads a file as it is.
+        """Reads a file.
 
         Raises:
-            ValueError: It is another's.
-            OSError: It is not there.
+            ValueError: The file holds no ablation.
+            OSError: The file does not exist.
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -98,16 +98,16 @@ class AblationFile:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the ablation came to its end; one that was stopped has some of the rows."""
+        """Whether the ablation is complete."""
         return "left_out" in self.entries
 
     def keep(self, row: AblationRow) -> None:
-        """Adds a row and writes the file, first under a temporary name."""
+        """Adds a row and writes the file."""
         self.rows[row.name] = row
         self.write()
 
     def write(self) -> None:
-        """Writes the file, first under a temporary name."""
+        """Writes the file through a temporary one."""
         rows = [
             {key: value for key, value in vars(row).items() if key != "estimates"}
             | {"figures": {key: one.to_json() for key, one in row.estimates.items()}}
@@ -120,7 +120,7 @@ class AblationFile:
 
 
 def rows_to_csv(rows: Sequence[AblationRow]) -> str:
-    """The rows as CSV: value, ends of the interval and n of every figure."""
+    """The rows as CSV: value, ends of the interval and n of every estimate."""
     keys = list(dict.fromkeys(key for row in rows for key in row.estimates))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -140,7 +140,7 @@ def rows_to_csv(rows: Sequence[AblationRow]) -> str:
 def fingerprint(
     variant: Variant, base: AssessmentParameters, sets: AblationSets, version: str
 ) -> str:
-    """Of all that decides a row: what is varied, from what, on which episodes, by which version."""
+    """Hash of everything that determines a row: variant, baseline, episodes and version."""
     described = {
         name: [one.load().info.scenario_hash, one.load().info.seed, one.count]
         for name, one in vars(sets).items()
@@ -170,25 +170,25 @@ def run_ablation(
     num_workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[AblationRow], dict[str, str]]:
-    """Trains and judges every variant that the file does not know yet.
+    """Trains and evaluates the variants that the file does not have.
 
-    The baseline's scores are kept beside the file: differences to it are paired.
+    Scores of the baseline are stored beside the file for paired differences.
 
     Args:
-        variants: What is varied; the baseline among them.
-        base: The baseline's parameters.
+        variants: The variants, with the baseline.
+        base: Parameters of the baseline.
         sets: The episodes.
-        file: Where rows are kept as they finish.
-        version: Of the package.
-        bootstrap: How intervals are found.
-        num_workers: Processes; as many as there are cores by default.
+        file: File of the rows.
+        version: Version of the package.
+        bootstrap: Settings of the intervals.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and the number wanted.
 
     Returns:
-        The rows in the order of the variants, and by variant why it could not be learned.
+        The rows in the order of the variants, and the errors of failed variants.
 
     Raises:
-        ValueError: The baseline is not among the variants, or cannot be learned.
+        ValueError: The baseline is not among the variants, or cannot be trained.
     """
     baseline = next((one for one in variants if one.name == BASELINE), None)
     if baseline is None:
@@ -221,7 +221,7 @@ def run_ablation(
             progress(done, len(variants))
 
     report(0)
-    # In its name what it is of: it is whole and fits, or it is not there.
+    # The name has the fingerprint, and the file is replaced atomically: if it exists, it fits.
     kept_scores = file.path.with_name(f".{file.path.stem}-{marks[BASELINE]}.npy")
     if is_known(baseline) and kept_scores.is_file():
         reference = np.load(kept_scores, allow_pickle=False)
@@ -259,10 +259,10 @@ def _scores_or_why_not(
 
 
 def ablation_verdict(rows: Sequence[AblationRow]) -> str:
-    """Which variants the baseline beats, and which beat it, in a sentence.
+    """Names the variants that are better and worse than the baseline, in a sentence.
 
     Args:
-        rows: Of an ablation; the baseline's own is left out.
+        rows: Rows of an ablation.
     """
     ahead, behind, num_open = [], [], 0
     for row in rows:

@@ -1,4 +1,4 @@
-"""``python -m studies adaptation``: what feedback is worth, beside learning from scratch."""
+"""``python -m studies adaptation``: adaptation by feedback, beside training from scratch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import AdaptationStudy, TestSet, study, trained_rivals
+from studies.adaptation_study import AdaptationStudy, TestSet, study, train_baselines
 
 _SCRATCH_SIZES = (40, 160, 400)
 
@@ -47,23 +47,25 @@ def adaptation(
     feedback: Annotated[
         int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
     ] = 160,
-    variation: Annotated[str, typer.Option(help="Which plant is the actual one.")] = "actual",
-    evaluate: Annotated[int, typer.Option(help="Fresh actual episodes to judge by.", min=1)] = 600,
+    variation: Annotated[str, typer.Option(help="Variation of the actual plant.")] = "actual",
+    evaluate: Annotated[
+        int, typer.Option(help="Fresh actual episodes for evaluation.", min=1)
+    ] = 600,
     orders: Annotated[int, typer.Option(help="Orders of the feedback.", min=1)] = 5,
     oracle: Annotated[
-        int, typer.Option(help="Other actual episodes to train a rival on.", min=0)
+        int, typer.Option(help="Other actual episodes to train an oracle on.", min=0)
     ] = 0,
     scratch: Annotated[
         bool, typer.Option("--scratch", help="Also train from scratch on the feedback itself.")
     ] = False,
     seed: Annotated[
-        int, typer.Option(help="First of the seeds of all that is fresh.")
+        int, typer.Option(help="First of the seeds of fresh simulations.")
     ] = ADAPTATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Judge Γ before and after feedback of a simulated plant, in several orders of it.
+    """Evaluate Γ before and after feedback of a simulated plant, in several orders of it.
 
-    The episodes are those that `drake-safety adapt` keeps in ASSESSMENT; figures and pictures go to
+    Episodes are shared with `drake-safety adapt`; results and figures are written to
     ASSESSMENT/adapted-VARIATION.
     """
     loaded = load_scenario(scenario)
@@ -98,12 +100,20 @@ def adaptation(
             }
         studies: dict[str, AdaptationStudy] = {}
         for mode, prior in priors.items():
-            rivals: dict[str, SafetyAssessment] = {}
+            baselines: dict[str, SafetyAssessment] = {}
             if learned_from:
-                rivals = trained_rivals(prior, learned_from, num_workers=workers, progress=stages)
+                baselines = train_baselines(
+                    prior, learned_from, num_workers=workers, progress=stages
+                )
             test = TestSet.of(fresh, prior.parameters.shortest)
             studies[mode] = study(
-                prior, sets, test, num_orders=orders, seed=seed, rivals=rivals, progress=stages
+                prior,
+                sets,
+                test,
+                num_orders=orders,
+                seed=seed,
+                baselines=baselines,
+                progress=stages,
             )
             if mode == "paper" and oracle:
                 studies[mode].estimates |= losses(prior, sets, learned_from["oracle"], test)

@@ -9,7 +9,7 @@ from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import TestSet, scores, study, trained_rivals
+from studies.adaptation_study import TestSet, scores, study, train_baselines
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap
         judged,
         sizes=(10, 40),
         num_orders=3,
-        rivals={"oracle": assessment.adapt(feedback)},
+        baselines={"oracle": assessment.adapt(feedback)},
     )
     few, many = (found.estimates[f"adapted.{n}.calibrated.brier"] for n in (10, 40))
     assert few.low < few.high
@@ -79,10 +79,10 @@ def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap
 def test_too_few_episodes_give_no_rival(assessment):
     episodes = make_episodes(40, seed=5, noise=0.002)
     few = {"scratch.1": episodes[:1], "scratch.40": episodes}
-    rivals = trained_rivals(assessment, few, num_workers=1)
-    assert list(rivals) == ["scratch.40"]
-    assert rivals["scratch.40"].parameters == assessment.parameters
-    np.testing.assert_array_equal(rivals["scratch.40"].correction_.change, 0.0)
+    baselines = train_baselines(assessment, few, num_workers=1)
+    assert list(baselines) == ["scratch.40"]
+    assert baselines["scratch.40"].parameters == assessment.parameters
+    np.testing.assert_array_equal(baselines["scratch.40"].correction_.change, 0.0)
 
 
 def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, judged):

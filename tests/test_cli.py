@@ -234,7 +234,7 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
     printed = capsys.readouterr().out
     assert "at most 10 % of unsafe episodes called safe, on average" in printed
-    assert "takes 99 unsafe episodes" in printed
+    assert "needs 99 unsafe episodes" in printed
     stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
     for mode in MODES:
         assert stored[mode].keys() == {"plan", "motion"}

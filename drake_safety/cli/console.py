@@ -1,4 +1,4 @@
-"""What all commands share: the arguments that several take, and what they write with."""
+"""Common arguments and output of the commands."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ WorkersOption = Annotated[
     int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
 ]
 
-# Square brackets are units here, not markup. A log has no width of its own.
+# Square brackets are units here, not markup. Output to a file has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 
 
 def new_table(*columns: str, title: str | None = None) -> Table:
-    """A table whose cells fold where they do not fit: no figure is cut short."""
+    """A table whose cells fold if they do not fit, so that no number is truncated."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
 
 
 def figures_table(found: Figures) -> Table:
-    """A table of the report on the console: figures with their intervals, and what they mean.
+    """A table of the report for the console, with its explanation.
 
     Args:
         found: The table.
@@ -80,12 +80,12 @@ def figures_table(found: Figures) -> Table:
     ahead = found.better_baselines()
     table.caption = found.meaning or None
     if ahead:
-        table.caption = f"{found.meaning}\nAhead of sharpened: {'; '.join(ahead)}"
+        table.caption = f"{found.meaning}\nBetter than sharpened: {'; '.join(ahead)}"
     return table
 
 
 def interval(estimate: Estimate, scale: float = 1.0, digits: int = 3) -> str:
-    """A figure with its interval, as tables show it; a dash where there was nothing to see."""
+    """An estimate with its interval; a dash for NaN."""
     if math.isnan(estimate.value):
         return "-"
     value, low, high = (scale * x for x in (estimate.value, estimate.low, estimate.high))
@@ -93,12 +93,12 @@ def interval(estimate: Estimate, scale: float = 1.0, digits: int = 3) -> str:
 
 
 def margin_words(name: str, margin: float, angular_constraints: Collection[str]) -> str:
-    """A constraint and its margin as one reads them: ``collision, -1.2 cm``.
+    """A constraint and its margin as text: ``collision, -1.2 cm``.
 
     Args:
         name: The constraint.
         margin: Its margin [m, rad].
-        angular_constraints: Names of those whose margins are angles.
+        angular_constraints: Names of constraints whose margins are angles.
     """
     if name in angular_constraints:
         return f"{name}, {math.degrees(margin):+.1f}°"
@@ -111,8 +111,8 @@ def cause_words(
     """The constraint that is most likely to be violated, and its margin where one is predicted.
 
     Args:
-        loop: Whose constraints they are.
-        assessment: What said so.
+        loop: The closed loop.
+        assessment: The assessment.
         masses: b_unsafe split by constraint, (n_c,).
         margins: Predicted margins, (n_c,) [m, rad].
     """
@@ -128,27 +128,27 @@ def cause_words(
 
 
 def print_path(what: str, path: Path) -> None:
-    """Prints a path whole on one line, so that it can be copied."""
+    """Prints a path without line breaks, so that it can be copied."""
     console.print(what, str(path), soft_wrap=True, highlight=False)
 
 
 def print_shipped(folder: AssessmentFolder) -> None:
-    """Says which assessment is used where none was asked for."""
+    """Prints which assessment is used by default."""
     if folder.is_shipped:
         print_path("assessment        comes with the package,", folder.path)
 
 
 def command_line(program: str = "drake-safety") -> str:
-    """The command as it was typed.
+    """The command line.
 
     Args:
-        program: What was called.
+        program: Name of the program.
     """
     return shlex.join([*program.split(), *sys.argv[1:]])
 
 
 def versions() -> dict[str, str]:
-    """Versions of the library and of what its figures depend on."""
+    """Versions of the library and of packages that its results depend on."""
     import importlib.metadata
 
     import drake_safety
@@ -159,10 +159,10 @@ def versions() -> dict[str, str]:
 
 
 class Stages:
-    """Progress bars, one a stage, that show the time left.
+    """Progress bars, one a stage, with the remaining time.
 
     Args:
-        progress: Where the bars stand.
+        progress: Display of the bars.
     """
 
     def __init__(self, progress: Progress):
@@ -170,12 +170,12 @@ class Stages:
         self._tasks: dict[str, TaskID] = {}
 
     def __call__(self, stage: str, done: float, total: float) -> None:
-        """Shows a stage's bar, made at the first call.
+        """Updates the bar of a stage, created at the first call.
 
         Args:
-            stage: What is under way.
-            done: How much of it is done.
-            total: How much there is.
+            stage: Name of the stage.
+            done: Number done.
+            total: Number wanted.
         """
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(stage, total=total)
@@ -184,7 +184,7 @@ class Stages:
 
 @contextlib.contextmanager
 def open_stages() -> Iterator[Stages]:
-    """Shows the stages of a command for as long as the block runs."""
+    """Shows progress bars while the block runs."""
     columns = (
         TextColumn("{task.description:<34}"),
         BarColumn(bar_width=30),
