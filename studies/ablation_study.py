@@ -277,7 +277,7 @@ def ablation_verdict(rows: Sequence[AblationRow]) -> str:
             num_open += 1
     total = len(ahead) + len(behind) + num_open
     if not total:
-        return "There is nothing yet to compare the baseline with."
+        return "There is no variant to compare with the baseline."
 
     def named(which: list[AblationRow]) -> str:
         best_first = sorted(which, key=lambda row: -row.estimates["auc_gain"].value)
@@ -285,7 +285,7 @@ def ablation_verdict(rows: Sequence[AblationRow]) -> str:
             f"{_spoken_name(row)} ({row.estimates['auc_gain'].value:+.3f})" for row in best_first
         )
 
-    winner = f"No variant beats the baseline's AUC beyond chance ({total} tried)"
+    winner = f"No variant beats the baseline's AUC significantly ({total} tried)"
     if ahead:
         winner = f"{len(ahead)} of {total} variants beat the baseline's AUC: {named(ahead)}"
     loser = "it beats none of them"

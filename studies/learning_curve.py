@@ -1,4 +1,4 @@
-"""``python -m studies learning-curve``: how much better Γ judges the more it has learned from."""
+"""``python -m studies learning-curve``: recalls of Γ over the number of training episodes."""
 
 from __future__ import annotations
 
@@ -61,16 +61,16 @@ def train_fewer(
     sizes: Annotated[str, typer.Option(help="Numbers of training episodes, such as '512,1024'.")],
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     calibration_episodes: Annotated[
-        int, typer.Option(help="Other ones, to choose thresholds.", min=20)
+        int, typer.Option(help="Other ones, for thresholds.", min=20)
     ] = 300,
     seed: Annotated[
         int, typer.Option(help="First seed of the fresh ones: those of `evaluate` by default.")
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Learn Γ of plans with a goal from fewer episodes, too, and judge it on the same fresh ones.
+    """Train Γ of plans with a goal on fewer episodes, and evaluate it on the same fresh ones.
 
-    Writes ASSESSMENT/learning_curve.json, which `store` takes in, and its picture.
+    Writes ASSESSMENT/learning_curve.json, which `store` includes, and its figure.
     """
     wanted = parse_sizes(sizes)
     loaded = load_scenario(scenario)
@@ -122,7 +122,7 @@ def train_fewer(
     table = Table(
         key="learning_curve",
         title="Learning curve",
-        meaning="The same test, after learning from fewer simulated episodes.",
+        meaning="The same test after training on fewer episodes.",
         corner="training episodes",
         columns=columns,
         rows=estimate_rows(Results(estimates=estimates), prefixes, columns),
@@ -137,7 +137,7 @@ def parse_sizes(text: str) -> tuple[int, ...]:
     """The numbers of episodes in '512,1024'.
 
     Raises:
-        ValueError: Something else stands there.
+        ValueError: The text is no list of integers.
     """
     try:
         return tuple(int(part) for part in text.split(",")) if text else ()
@@ -148,14 +148,14 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 
 
 def check_sizes(num_episodes: int, sizes: Sequence[int]) -> None:
-    """Refuses sizes of training sets that cannot be.
+    """Checks sizes of training sets.
 
     Args:
-        num_episodes: How many training episodes there are.
-        sizes: How many of them to learn from.
+        num_episodes: Number of training episodes.
+        sizes: Sizes of the training sets.
 
     Raises:
-        ValueError: A size is not positive, or more than there are.
+        ValueError: A size is not positive, or exceeds the number of episodes.
     """
     misfits = [size for size in sizes if not 1 <= size <= num_episodes]
     if misfits:
@@ -175,24 +175,24 @@ def learning_curve(
     num_workers: int | None = None,
     progress: StageProgress | None = None,
 ) -> dict[str, Estimate]:
-    """Trains on the first n episodes, for several n, and judges the same plans each time.
+    """Trains on the first n episodes, for several n, and evaluates on the same plans.
 
     Args:
         path: Folder of the training episodes.
         sizes: The n.
-        parameters: How Γ is learned.
-        calibration: Plans on which each Γ's threshold is chosen.
+        parameters: Parameters of Γ.
+        calibration: Plans on which thresholds are chosen.
         test: Fresh plans.
-        known: What was learned already, by n.
-        num_workers: Processes.
+        known: Assessments that are already trained, by n.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Returns:
-        By "N.auc", "N.safe_recall", "N.unsafe_recall", "N.brier" and "N.threshold" (Γ_thre), the
-        same by "N.fair.…" for the fair set.
+        "N.auc", "N.safe_recall", "N.unsafe_recall", "N.brier" and "N.threshold" (Γ_thre), and the
+        same as "N.fair.…" for the fair set.
 
     Raises:
-        ValueError: A size is not positive, or more than there are.
+        ValueError: A size is not positive, or exceeds the number of episodes.
     """
     check_sizes(len(completed(path)), sizes)
     learned, wanted = dict(known or {}), sorted(set(sizes))
@@ -200,7 +200,7 @@ def learning_curve(
     done = len(wanted) - len(missing)
     if progress is not None:
         progress("learning curve", done, len(wanted))
-    # The largest first: nobody waits for it at the end.
+    # The largest first, so that no worker is left with it at the end.
     arguments = [(os.fspath(path), size, parameters) for size in reversed(missing)]
     for size, assessment in parallel_map(_learn, arguments, num_workers):
         learned[size] = assessment

@@ -1,4 +1,4 @@
-"""Recalls over the number of training episodes."""
+"""Plot of recalls over the number of training episodes."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from drake_safety.evaluation.metrics import Estimate
 
 _CURVES = (
-    ("safe_recall", "safe targets accepted", SAFE_COLOUR, "o", SAFE_RECALL),
-    ("unsafe_recall", "unsafe targets refused", UNSAFE_COLOUR, "s", UNSAFE_RECALL),
+    ("safe_recall", "safe recall", SAFE_COLOUR, "o", SAFE_RECALL),
+    ("unsafe_recall", "unsafe recall", UNSAFE_COLOUR, "s", UNSAFE_RECALL),
 )
 
 
 def learning_curve_figure(estimates: Mapping[str, Estimate]) -> Figure:
-    """Both recalls with their intervals, whole target box and fair set, and the paper's figures.
+    """Plots both recalls with intervals for all targets and the fair set, and those of the paper.
 
     Args:
-        estimates: What :func:`~studies.learning_curve.learning_curve` found.
+        estimates: The result of :func:`~studies.learning_curve.learning_curve`.
     """
     from matplotlib.ticker import NullLocator
 
@@ -67,6 +67,6 @@ def learning_curve_figure(estimates: Mapping[str, Estimate]) -> Figure:
             axes.set_axisbelow(True)
         panels[0].set_ylim(max(0.0, lowest - 0.02), 1.005)
         panels[0].set_ylabel("recall")
-        panels[0].plot([], [], color=FAINT_INK, lw=1.0, ls=(0, (2, 2)), label="the paper's")
+        panels[0].plot([], [], color=FAINT_INK, lw=1.0, ls=(0, (2, 2)), label="paper")
         panels[0].legend(loc="lower right")
     return fig

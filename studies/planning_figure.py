@@ -1,4 +1,4 @@
-"""Planning with Γ as a picture: how many starts stay safe, by who takes the plan."""
+"""Plot of planning with Γ: shares of safe motions by choice of the plan."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 
 def planning_figure(estimates: Mapping[str, Estimate]) -> Figure:
-    """A dot with its interval for each way to take a plan; a line marks the default plan.
+    """Plots the share of safe motions for each choice; a line marks the default plan.
 
     Args:
-        estimates: Those of a :class:`~studies.planning_study.PlanningStudy`; what is
-            missing, or was never seen, is left out.
+        estimates: Those of a :class:`~studies.planning_study.PlanningStudy`; missing ones and NaN
+            are left out.
     """
     rows = [
         (key, name, estimates[key])
@@ -45,7 +45,7 @@ def planning_figure(estimates: Mapping[str, Estimate]) -> Figure:
                 axes.axvline(100.0 * estimate.value, color=FAINT_INK, linewidth=0.8, zorder=0)
         axes.set_yticks([-i for i in range(len(rows))], [f"{name} ({f.n})" for _, name, f in rows])
         axes.set_ylim(-len(rows) + 0.4, 0.6)
-        axes.set_title("What choosing plans by Γ is worth")
+        axes.set_title("Planning with Γ")
         axes.set_xlabel("motions that stay safe [%], with 95 % intervals")
         axes.grid(axis="x", color="#eceef0", linewidth=0.7)
         axes.set_axisbelow(True)

@@ -1,7 +1,7 @@
 """Tables of results in README and docs, generated from stored evaluations.
 
-What stands between ``<!-- results: NAME -->``, or ``<!-- summary: NAME -->``, and ``<!-- end -->``
-is made from ``docs/results/NAME.json``, and from nothing else.
+The text between ``<!-- results: NAME -->``, or ``<!-- summary: NAME -->``, and ``<!-- end -->`` is
+generated from ``docs/results/NAME.json`` alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OPEN = re.compile(r"<!-- (?:results|summary): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
-"""Of 1000 random targets, in the paper."""
+"""Recalls of the paper on 1000 random targets."""
 
 
 def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
@@ -43,13 +43,13 @@ def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
 
     Args:
         path: The file.
-        folder: Where the stored results are.
+        folder: Folder of the stored results.
 
     Returns:
-        The names of the results it shows.
+        The names of its results.
 
     Raises:
-        ValueError: It has no such block, one of them does not end, or its results are not there.
+        ValueError: It has no block, a block does not end, or results are missing.
     """
     text = path.read_text(encoding="utf-8")
     names = [match["name"] for match in _BLOCK.finditer(text)]
@@ -65,14 +65,14 @@ def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
 
 
 def generate(text: str, folder: Path) -> str:
-    """A text with every block of results as the stored ones make it.
+    """Replaces every block of results in a text by the stored ones.
 
     Args:
         text: The Markdown.
-        folder: Where the stored results are.
+        folder: Folder of the stored results.
 
     Raises:
-        ValueError: A block does not end, or its results are not there.
+        ValueError: A block does not end, or results are missing.
     """
     blocks = [match["name"] for match in _BLOCK.finditer(text)]
     if blocks != (opened := _OPEN.findall(text)):
@@ -107,7 +107,7 @@ def results_text(results: Results) -> str:
 
 
 def summary_text(results: Results) -> str:
-    """Counts and the one table of an evaluation that a reader needs first, as Markdown."""
+    """Counts and the main table of an evaluation, as Markdown."""
     if results.has("plans."):
         sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
         judges = ("paper", "gradient_boosting", "mlp", "reachability")
@@ -121,7 +121,7 @@ def summary_text(results: Results) -> str:
         return f"{_counts(results)}\n\n{table}\n| *the paper's own* | {printed} | |"
     columns = {
         "every segment, AUC": ("segments.{}.auc", _SHARE),
-        "first step, AUC": ("episodes.{}.auc", _SHARE),
+        "first row, AUC": ("episodes.{}.auc", _SHARE),
         "falls with recovery": ("throws.{}.falls_with_recovery", _PERCENT),
         "false triggers": ("throws.{}.false_triggers", _PERCENT),
     }
@@ -157,13 +157,13 @@ def _counts(results: Results) -> str:
     entries, estimates = results.entries, results.estimates
     judged = estimates.get("plans.outcomes.safe") or estimates.get("episodes.share_unsafe")
     words = [
-        f"Learned from {entries.get('training_episodes')} episodes of seed "
+        f"Trained on {entries.get('training_episodes')} episodes of seed "
         f"{entries.get('training_seed')}."
     ]
     if judged is not None:
         kind = "safe" if "plans.outcomes.safe" in estimates else "unsafe"
         words.append(
-            f"Judged on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
+            f"Evaluated on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
             f"{_PERCENT.text(judged)} are {kind}."
         )
     calibration = entries.get("calibration_episodes")
@@ -176,7 +176,7 @@ def _counts(results: Results) -> str:
 
 
 def _moments(results: Results) -> list[str]:
-    titles = {"segments": "every segment", "episodes": "first step, k = 0"}
+    titles = {"segments": "every segment", "episodes": "first row, k = 0"}
     parts = [
         replace(table, corner=titles[table.key]).to_markdown()
         for table in verdict_tables(results)
@@ -196,14 +196,14 @@ def _throws(results: Results) -> list[str]:
     (table,) = (table for table in verdict_tables(results) if table.key == "throws")
     alone = results.estimates["throws.falls_without_recovery"]
     remark = (
-        f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
-        f"falls in {_PERCENT.text(alone)}."
+        f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); "
+        f"{_PERCENT.text(alone)} fall without recovery."
     )
     return [remark, replace(table, corner="trigger").to_markdown(), _ahead(table), _broken(results)]
 
 
 def _broken(results: Results) -> str:
-    """In how many of the successful recoveries something happened that hardware would not bear."""
+    """Numbers of successful recoveries that violate a hardware limit."""
     prefix = "throws.sharpened.recoveries_with_"
     found = {
         key.removeprefix(prefix).replace("_", " "): estimate
@@ -214,14 +214,15 @@ def _broken(results: Results) -> str:
         return ""
     counts = [f"{kind} {round(estimate.value * estimate.n)}" for kind, estimate in found.items()]
     (n,) = {estimate.n for estimate in found.values()}
+    violations = ", ".join(counts)
     return (
-        f"Of {n} successful recoveries by `sharpened`, so many break a limit: {', '.join(counts)}."
+        f"Of {n} successful recoveries by `sharpened`, numbers that violate a limit: {violations}."
     )
 
 
 def _targets(results: Results) -> list[str]:
     parts = []
-    columns = 3  # Recalls and AUC; the page shows the others, too.
+    columns = 3  # Recalls and AUC; the report shows all.
     tables = verdict_tables(results)
     for table in tables:
         if table.key != "plans":
@@ -248,7 +249,7 @@ def _targets(results: Results) -> list[str]:
     right = results.estimates.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
-            f"The right cause is named for {_PERCENT.text(right)} of the {right.n} rightly "
+            f"The correct cause is named for {_PERCENT.text(right)} of the {right.n} correctly "
             "refused targets."
         )
     pattern = re.compile(r"(plans\.learning_curve\.(\d+))\.safe_recall")
@@ -262,7 +263,7 @@ def _targets(results: Results) -> list[str]:
 
 
 def _rows(results: Results, corner: str, prefixes: Mapping[str, str]) -> str:
-    """Recalls and AUC of figures by prefix, as Markdown."""
+    """Recalls and AUC by prefix, as Markdown."""
     columns = columns_of("targets")[:3]
     rows = estimate_rows(results, prefixes, columns)
     return Table(
@@ -275,7 +276,7 @@ def _points(loss: float) -> str:
 
 
 def _differences(results: Results) -> str:
-    """What `sharpened` gains or loses from the trained hand to the other."""
+    """Differences of the recalls of `sharpened` between the hands."""
     lost = {
         what: results.estimates.get(f"plans.other_hand.sharpened.{what}_recall_loss")
         for what in ("safe", "unsafe")
@@ -297,4 +298,4 @@ def _differences(results: Results) -> str:
 
 def _ahead(table: Table) -> str:
     ahead = table.better_baselines()
-    return f"Ahead of `sharpened`: {'; '.join(ahead)}." if ahead else ""
+    return f"Better than `sharpened`: {'; '.join(ahead)}." if ahead else ""

@@ -1,4 +1,4 @@
-"""``python -m studies truth``: Γ beside the truth, where it can be simulated on a grid."""
+"""``python -m studies truth``: Γ against the truth simulated on a grid."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def truth(
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Γ of either mode beside the truth on every state plane, and on random plans, at k = 0.
+    """Compare Γ of both modes with the truth on state planes and on random plans, at k = 0.
 
-    Writes ASSESSMENT/known_truth.json and a picture a mode.
+    Writes ASSESSMENT/known_truth.json and a figure for each mode.
     """
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
@@ -80,7 +80,7 @@ def truth(
         "IoU",
         "confident errors [%]",
         "their band [% of a side]",
-        title=f"Γ beside the truth on {resolution} x {resolution} simulated starts",
+        title=f"Γ against the truth on {resolution} x {resolution} simulated starts",
     )
     pictures = []
     entries: dict[str, Any] = {}

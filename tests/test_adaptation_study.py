@@ -76,7 +76,7 @@ def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap
         study(assessment, feedback, judged, sizes=(41,))
 
 
-def test_too_few_episodes_give_no_rival(assessment):
+def test_too_few_episodes_give_no_baseline(assessment):
     episodes = make_episodes(40, seed=5, noise=0.002)
     few = {"scratch.1": episodes[:1], "scratch.40": episodes}
     baselines = train_baselines(assessment, few, num_workers=1)

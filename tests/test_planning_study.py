@@ -123,17 +123,20 @@ def test_without_starts_or_plans_there_is_nothing_to_study():
 
 
 @pytest.mark.parametrize(
-    ("gain", "said"),
+    ("gain", "start"),
     [
-        ((0.5, 0.1, 0.8), "Γ wins: 75.0 % (58.8–87.3) of the starts stay safe with the plan that"),
-        ((-0.5, -0.9, -0.1), "The default plan wins: "),
-        ((0.1, -0.2, 0.4), "Nobody wins beyond chance: "),
-        ((np.nan, np.nan, np.nan), "Nobody wins: "),
+        (
+            (0.5, 0.1, 0.8),
+            "Γ is better: 75.0 % (58.8–87.3) of the starts stay safe with the plan that",
+        ),
+        ((-0.5, -0.9, -0.1), "The default plan is better: "),
+        ((0.1, -0.2, 0.4), "No significant difference: "),
+        ((np.nan, np.nan, np.nan), "No difference: "),
     ],
 )
-def test_who_wins_is_what_the_interval_of_the_gain_says(gain, said):
+def test_the_verdict_follows_from_the_interval_of_the_gain(gain, start):
     estimates = {"default": proportion(24, 40), "chosen": proportion(30, 40)}
     estimates["gain"] = Estimate(*gain, 40)
-    assert planning_verdict(estimates).startswith(said)
+    assert planning_verdict(estimates).startswith(start)
     del estimates["gain"]
     assert "incomplete" in planning_verdict(estimates)

@@ -164,7 +164,7 @@ def test_what_was_trained_is_told_with_its_share_of_unsafe_ones(whole):
     assert "drake-safety train lip --episodes 60" in whole.page.words
 
 
-def test_figures_that_no_table_knows_and_where_a_rival_is_ahead_are_shown(whole):
+def test_figures_that_no_table_knows_and_where_a_baseline_is_better_are_shown(whole):
     assert "miss rate 5" in whole.page.words
     assert "0.025 (0.001–0.132)" in whole.page.words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in (

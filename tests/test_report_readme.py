@@ -78,7 +78,7 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety train lip")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
     assert "stale words" not in text
-    assert "Learned from 64 episodes of seed 7. Judged on 60 fresh ones of seed 1000" in text
+    assert "Trained on 64 episodes of seed 7. Evaluated on 60 fresh ones of seed 1000" in text
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
     again = text
@@ -98,7 +98,7 @@ def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
     assert "| all targets | safe recall | unsafe recall | AUC |" in text
     assert "| *the paper's own* | *0.952* | *0.987* | |" in text
     assert "of which 40.0 % (26.4–54.8) are safe" in text
-    assert "named for 90.0 % (55.5–99.7) of the 10 rightly refused" in text
+    assert "named for 90.0 % (55.5–99.7) of the 10 correctly refused" in text
 
 
 def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path):

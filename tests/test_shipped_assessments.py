@@ -186,7 +186,7 @@ def test_a_file_too_few_and_a_scenario_that_changed_are_noticed(package, scenari
         ("gone", "there is no 'paper' assessment"),
         ("uncalibrated", "holds no calibrated threshold: `drake-safety calibrate` chooses one"),
         ("changed", "`drake-safety evaluate` them as they are now"),
-        ("untold", "does not tell what its assessments were trained with"),
+        ("untold", "the training command of"),
         ("unjudged", "holds no evaluation to store: `drake-safety evaluate` makes one"),
     ],
 )

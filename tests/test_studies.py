@@ -131,7 +131,7 @@ def test_sizes_of_a_learning_curve_are_numbers_between_commas():
 
 
 @pytest.mark.slow
-def test_adaptation_is_judged_in_several_orders_beside_its_rivals(monkeypatch, capsys, run):
+def test_adaptation_is_judged_in_several_orders_beside_its_baselines(monkeypatch, capsys, run):
     file, folder = run
     scenario = load_scenario(file)
     name = next(one for one in scenario.variations if one != "nominal")
