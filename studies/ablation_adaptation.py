@@ -6,8 +6,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc_difference, segment_estimates
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
@@ -42,7 +40,7 @@ def counting_estimates(
         one.parameters = replace(prior.parameters, adaptation=settings)
         judged[name] = one.adapt(feedback, method="paper")
     segments = test.segments
-    scores = {name: _unsafe_score(one, test) for name, one in judged.items()}
+    scores = {name: test.unsafe_score(one) for name, one in judged.items()}
     found = {}
     for name, score in scores.items():
         found[name] = segment_estimates(
@@ -52,9 +50,3 @@ def counting_estimates(
             score, scores[BEFORE], segments.is_unsafe, segments.episode, bootstrap=bootstrap
         )
     return found
-
-
-def _unsafe_score(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
-    segments = test.segments
-    features = segments.features if assessment.uses_features else None
-    return 1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized

@@ -72,17 +72,11 @@ def losses(
         "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),
         "psi": share,
         "grid": np.where(own >= 0, by_cell[own], overall),
-        "update": _grid(prior.adapt(feedback, method="paper"), test),
-        "update_without_gpr": _grid(without_gpr.adapt(feedback, method="paper"), test),
+        "update": test.unsafe_score(prior.adapt(feedback, method="paper")),
+        "update_without_gpr": test.unsafe_score(without_gpr.adapt(feedback, method="paper")),
     }
     found = {}
     for name in STEPS:
         value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
         found[f"losses.{name}.brier"] = Estimate.exact(value, len(test.episodes))
     return found
-
-
-def _grid(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
-    judged = test.segments
-    features = judged.features if assessment.uses_features else None
-    return 1.0 - assessment.predict(judged.state, judged.desired_preview, features).normalized

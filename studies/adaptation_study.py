@@ -54,6 +54,14 @@ class TestSet:
             episodes=episodes, segments=split(episodes, stride=1, discount=1.0, shortest=shortest)
         )
 
+    def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
+        """1 - Γ of each segment by the grid of an assessment, (N,)."""
+        segments = self.segments
+        features = segments.features if assessment.uses_features else None
+        return (
+            1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized
+        )
+
 
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.

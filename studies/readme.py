@@ -110,11 +110,11 @@ def summary_text(results: Results) -> str:
     """Counts and the main table of an evaluation, as Markdown."""
     if results.has("plans."):
         sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
-        judges = ("paper", "gradient_boosting", "mlp", "reachability")
+        methods = ("paper", "gradient_boosting", "mlp", "reachability")
         names = {
             "plans.sharpened": "`sharpened`",
             **{prefix: f"`sharpened`, {title}" for prefix, title in sets.items()},
-            **{f"plans.{judge}": _named(judge) for judge in judges},
+            **{f"plans.{method}": _named(method) for method in methods},
         }
         table = _rows(results, "all targets", names)
         printed = f"*{SAFE_RECALL:.3f}* | *{UNSAFE_RECALL:.3f}*"
@@ -126,16 +126,16 @@ def summary_text(results: Results) -> str:
         "false triggers": ("throws.{}.false_triggers", _PERCENT),
     }
     lines = [f"| | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
-    for judge in ("sharpened", "paper", "gradient_boosting", "mlp"):
+    for method in ("sharpened", "paper", "gradient_boosting", "mlp"):
         cells = []
         for key, column in columns.values():
-            wanted = (key.format(judge), key.format(f"{judge}_literal_0.6"))
+            wanted = (key.format(method), key.format(f"{method}_literal_0.6"))
             found = next(
                 (results.estimates[one] for one in wanted if one in results.estimates), None
             )
             cells.append("" if found is None else column.text(found))
         if any(cells):
-            lines.append(f"| {_named(judge)} | {' | '.join(cells)} |")
+            lines.append(f"| {_named(method)} | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
     if "throws.falls_without_recovery" in results.estimates:
         alone = results.estimates["throws.falls_without_recovery"]
@@ -143,8 +143,8 @@ def summary_text(results: Results) -> str:
     return "\n\n".join(parts)
 
 
-def _named(judge: str) -> str:
-    return f"`{judge}`" if judge in MODES else label_of(judge)
+def _named(method: str) -> str:
+    return f"`{method}`" if method in MODES else label_of(method)
 
 
 def _commands(results: Results) -> str:

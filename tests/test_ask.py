@@ -257,7 +257,10 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     calibrate(folder, 0.0)
     started = []
     recording = SimpleNamespace(
-        viewer=None, start=lambda: started.append(True), save=lambda timeline, events: None
+        viewer=None,
+        start=lambda: started.append(True),
+        save=lambda timeline, events: None,
+        save_animation=lambda *arguments: None,
     )
     monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
     monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)

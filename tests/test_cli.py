@@ -116,7 +116,7 @@ def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
 
 
 def test_a_run_that_is_stopped_says_that_episodes_are_kept(monkeypatch, capsys):
-    def stopped(**options):
+    def stopped(arguments, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.cli.app", stopped)
@@ -197,7 +197,7 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     arguments = ("--other-hand", 10, "--plane-step", 0.6)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
     printed = capsys.readouterr().out
-    for title in ("all targets", "the other hand", "paper sees the next H steps"):
+    for title in ("all targets", "the other hand", "paper uses its next H steps"):
         assert title in printed
     report = json.loads((folder / "evaluation.json").read_text())
     assert (
@@ -299,7 +299,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     ("arguments", "message"),
     [
         (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
-        (["--throws", "3"], "has no recovery to judge: pass --throws 0"),
+        (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
         (["--seed", "-3"], "seed 0 would give episodes that begin as the 60 'nominal'"),
     ],
 )
@@ -348,7 +348,7 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
     pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
     assert refused["n"] == 30 and pushed["n"] == 30 - round(30 * refused["value"])
     assert 0 < pushed["value"] < 1
-    assert "Watching while it moves: pushes" in printed
+    assert "Alarms on pushed motions" in printed
     assert (folder / "monitoring.png").is_file()
     # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
     monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
@@ -362,4 +362,6 @@ def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, s
     _, folder = shuttle_run
     arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
     assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
-    assert "have no goal to be pushed on the way to" in " ".join(capsys.readouterr().out.split())
+    assert "leave out --pushes; alarms are evaluated on throws" in " ".join(
+        capsys.readouterr().out.split()
+    )

@@ -120,7 +120,7 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
     one = next(iter(found.values()))[0]
     table = new_table(
         "mode",
-        "judged by",
+        "score",
         "safe from Γ",
         "unsafe below",
         "misses",
