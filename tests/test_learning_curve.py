@@ -67,7 +67,7 @@ def test_the_picture_has_both_recalls_beside_the_papers(curve):
     assert [axes.get_title(loc="left") for axes in panels] == ["All targets", "Fair set"]
     for axes, infix in zip(panels, ("", "fair."), strict=True):
         lines = {line.get_label(): line for line in axes.lines}
-        drawn = lines["unsafe targets refused"].get_ydata()
+        drawn = lines["unsafe recall"].get_ydata()
         expected = [curve[f"{size}.{infix}unsafe_recall"].value for size in (30, 60)]
         assert list(drawn) == expected
         levels = {line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1}
