@@ -13,7 +13,7 @@ from studies.publish import readme, ship, store
 from studies.truth import truth
 
 app = typer.Typer(
-    help="Make what the tables of README and docs are made of, from a checkout.",
+    help="Run the studies behind the tables of README and docs, from a checkout.",
     no_args_is_help=True,
     rich_markup_mode=None,
     add_completion=False,

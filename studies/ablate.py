@@ -1,4 +1,4 @@
-"""``python -m studies ablate``: what each choice in learning Γ is worth."""
+"""``python -m studies ablate``: ablation of the choices in learning Γ."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from studies import command_line
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.learning.assessment import AssessmentParameters
     from drake_safety.simulation.scenario import Scenario
     from studies.ablation import AblationSets, EpisodeSet
@@ -46,7 +46,7 @@ _COLUMNS = {
     "safe_recall": "safe recall",
     "unsafe_recall": "unsafe recall",
     "brier": "Brier",
-    "calibrated_auc": "AUC by the heads",
+    "calibrated_auc": "AUC, calibrated Γ",
     "k0.auc": "AUC, k = 0",
     "k0.auc_gain": "over the baseline, k = 0",
 }
@@ -59,7 +59,7 @@ def ablate(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="One variant a choice, one short-trained map each, fewer episodes."
+            "--quick", help="One variant per choice, one map with short training, fewer episodes."
         ),
     ] = False,
     episodes: Annotated[
@@ -67,18 +67,18 @@ def ablate(
     ] = None,
     calibration_episodes: Annotated[
         int | None,
-        typer.Option(help="Other ones, for the recalls' thresholds; 300, or 100.", min=2),
+        typer.Option(help="Other ones, for thresholds of the recalls; 300, or 100.", min=2),
     ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of the fresh ones: those of `evaluate` by default.")
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Learn Γ anew with one choice made otherwise at a time, and judge it on the same episodes.
+    """Train Γ with one choice changed at a time, and evaluate it on the same episodes.
 
-    Every variant learns from the training episodes in ASSESSMENT. A row is written as soon as it is
-    finished: an ablation that was stopped goes on when it is called again. Feedback
-    that `adaptation` has left in ASSESSMENT serves to compare what n_f may count.
+    Every variant learns from the training episodes in ASSESSMENT. Rows are written as they finish:
+    a stopped ablation continues when called again. Feedback of `adaptation` in ASSESSMENT is used
+    to compare the definitions of n_f.
     """
     from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.capabilities import rate_names
@@ -145,9 +145,11 @@ def ablate(
         counting = _counting(loaded, assessment)
     if counting:
         file.entries["n_f"] = {
-            f"{variation}.{mode}.{who}": {key: figure.to_json() for key, figure in figures.items()}
+            f"{variation}.{mode}.{who}": {
+                key: estimate.to_json() for key, estimate in estimates.items()
+            }
             for (variation, mode), found in counting.items()
-            for who, figures in found.items()
+            for who, estimates in found.items()
         }
     else:
         left_out["n_f"] = "there are no pairs with fresh episodes: `python -m studies adaptation`"
@@ -177,7 +179,7 @@ def _sets(
     workers: int | None,
     stages: Stages,
 ) -> AblationSets:
-    """The training episodes, and fresh ones: what is not there yet is simulated and kept."""
+    """The training episodes and fresh ones, which are simulated and kept as needed."""
     from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
     from studies.ablation import AblationSets, EpisodeSet
@@ -206,12 +208,12 @@ def _sets(
 
 def _counting(
     scenario: Scenario, folder: Path
-) -> dict[tuple[str, str], dict[str, dict[str, Figure]]]:
-    """What n_f counts, for each plant that `adapt` has left pairs and fresh episodes of."""
+) -> dict[tuple[str, str], dict[str, dict[str, Estimate]]]:
+    """Definitions of n_f, for each plant with pairs and fresh episodes of `adapt`."""
     from drake_safety.learning.feedback import feedback_sets
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.dataset import load_episodes
-    from studies.ablation_adaptation import counting_figures
+    from studies.ablation_adaptation import counting_estimates
     from studies.adaptation_study import TestSet
 
     found = {}
@@ -219,34 +221,34 @@ def _counting(
         hash_ = scenario.simulation_hash(variation)[:12]
         for pairs in sorted((folder / "feedback").glob(f"{hash_}-*")):
             own_seed = int(pairs.name.rpartition("-")[2])
-            # Beside the pairs, `adapt` keeps what it has judged by.
+            # `adapt` keeps its fresh episodes beside the pairs.
             judging = ADAPTATION.seeds(own_seed)["evaluation of the adaptation"]
             fresh = pairs.with_name(f"{hash_}-{judging}") / variation
             if not ((pairs / "nominal").is_dir() and fresh.is_dir()):
                 continue
             nominal, actual = (load_episodes(pairs / name) for name in ("nominal", variation))
-            # Where `adapt` was stopped some twins are missing.
+            # If `adapt` was stopped, some twins are missing.
             twins = {episode.index for episode in nominal}
             paired = Episodes(actual.info, [one for one in actual if one.index in twins])
             feedback = feedback_sets(paired, nominal)
             for mode in MODES:
                 prior = load_assessment(folder, mode)
                 test = TestSet.of(load_episodes(fresh), prior.parameters.shortest)
-                found[variation, mode] = counting_figures(prior, feedback, test)
+                found[variation, mode] = counting_estimates(prior, feedback, test)
     return found
 
 
 def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
-    n = rows[0].figures["k0.auc"].n
+    n = rows[0].estimates["k0.auc"].n
     table = new_table(
-        "variant", *_COLUMNS.values(), title=f"Each judged on the same {n} fresh episodes"
+        "variant", *_COLUMNS.values(), title=f"Evaluated on the same {n} fresh episodes"
     )
-    # The name is what one looks for: it is not folded, however narrow the figures become.
+    # Names are not folded, however narrow the other columns become.
     table.columns[0].no_wrap = True
     for i, row in enumerate(rows):
         is_last = i + 1 == len(rows) or rows[i + 1].group != row.group
-        figures = (interval(row.figures[key]) for key in _COLUMNS)
-        table.add_row(row.name, *figures, end_section=is_last)
+        estimates = (interval(row.estimates[key]) for key in _COLUMNS)
+        table.add_row(row.name, *estimates, end_section=is_last)
     table.caption = (
         f"baseline: δ {base.score_weight:g}, H {base.horizon}, perplexity {base.perplexity:g}, "
         f"{base.resolution} × {base.resolution} cells, k_min {base.min_count}, mode '{base.mode}'"
@@ -254,13 +256,13 @@ def _table(rows: Sequence[AblationRow], base: AssessmentParameters) -> Table:
     return table
 
 
-def _counting_table(found: dict[str, dict[str, Figure]], variation: str, mode: str) -> Table:
+def _counting_table(found: dict[str, dict[str, Estimate]], variation: str, mode: str) -> Table:
     columns = [key for key in _COLUMNS if not key.startswith(("k0.", "calibrated"))]
     table = new_table(
         "n_f",
         *(_COLUMNS[key] for key in columns),
         title=f"{mode}, the paper's adaptation to '{variation}'",
     )
-    for who, figures in found.items():
-        table.add_row(who, *(interval(figures[key]) for key in columns))
+    for who, estimates in found.items():
+        table.add_row(who, *(interval(estimates[key]) for key in columns))
     return table

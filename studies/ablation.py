@@ -1,7 +1,7 @@
-"""Ablations: what each choice is worth, one changed at a time and learned anew.
+"""Ablations: variants of the assessment, each trained with one choice changed.
 
-Every variant learns from the same stored episodes and is judged at the same rows of the same fresh
-ones, whatever it sees of them.
+All variants learn from the same stored episodes and are evaluated at the same rows of the same
+fresh ones, whatever inputs they use.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import (
     Bootstrap,
-    Figure,
+    Estimate,
     auc,
     auc_difference,
-    segment_figures,
+    segment_estimates,
     threshold_at,
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
@@ -34,7 +34,7 @@ _RESOLUTIONS = (7, 14, 20, 28, 40)
 _MIN_COUNTS = (1, 5, 20, 50)
 _HORIZON_SHARES = (0.2, 0.5)
 _EPISODE_SHARES = (0.125, 0.25, 0.5)
-# What stands for its group in a hurry.
+# The variants of a quick ablation.
 _QUICK = {
     "score_weight=0.1",
     "perplexity=10",
@@ -47,14 +47,14 @@ _QUICK = {
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One choice that is made otherwise.
+    """A variant with one choice changed.
 
     Attributes:
         name: Its key.
-        group: Which choice it is about.
-        changes: Parameters that differ from the baseline's.
-        num_episodes: How many of the training episodes it learns from; None for all.
-        without: States and features that it does not see.
+        group: The choice.
+        changes: Parameters that differ from those of the baseline.
+        num_episodes: Number of training episodes; None for all.
+        without: Omitted states and features.
     """
 
     name: str
@@ -64,17 +64,17 @@ class Variant:
     without: Sequence[str] = ()
 
     def parameters(self, base: AssessmentParameters) -> AssessmentParameters:
-        """The baseline's parameters with the changes."""
+        """The parameters of the baseline with the changes."""
         return replace(copy.deepcopy(base), **self.changes)
 
     def recut(self, episodes: Episodes, horizon: int) -> Episodes:
-        """The episodes as the variant sees them.
+        """The episodes with the inputs of the variant.
 
-        A shorter horizon is the beginning of the preview that was recorded.
+        A shorter horizon uses the beginning of the recorded preview.
 
         Args:
-            episodes: As they were recorded.
-            horizon: The variant's own, at most the recorded one.
+            episodes: The recorded episodes.
+            horizon: Horizon of the variant, at most the recorded one.
         """
         info = episodes.info
         states = _kept(info.state_names, self.without)
@@ -112,17 +112,17 @@ def list_variants(
     rate_names: Sequence[str],
     quick: bool = False,
 ) -> tuple[list[Variant], dict[str, str]]:
-    """What is varied, the baseline first, and what cannot be varied and why.
+    """The variants, the baseline first, and the choices that cannot be varied.
 
     Args:
-        base: The baseline's parameters.
-        num_episodes: How many episodes there are to learn from.
+        base: Parameters of the baseline.
+        num_episodes: Number of training episodes.
         state_names: Columns of the state.
-        rate_names: States and features that are made of velocities.
-        quick: Whether one variant a choice is enough.
+        rate_names: States and features that depend on velocities.
+        quick: Whether to list one variant per choice.
 
     Returns:
-        The variants, and by choice the reason why it is left out.
+        The variants, and the reasons of omitted choices.
     """
     found = [Variant(name=BASELINE, group=BASELINE)]
 
@@ -156,9 +156,7 @@ def list_variants(
         name = "episodes=half" if share == 0.5 else f"episodes={count}"
         if count:
             found.append(Variant(name=name, group="episodes", num_episodes=count))
-    left_out = {
-        "horizon H": "longer horizons need outputs that were desired beyond what is recorded"
-    }
+    left_out = {"horizon H": "longer horizons need a longer recorded preview"}
     rates = [name for name in rate_names if name in state_names]
     if rates:
         found.append(Variant(name="state_without_velocities", group="velocities", without=rates))
@@ -170,7 +168,7 @@ def list_variants(
         left_out["velocities"] = "none of the states is known to be a velocity"
     if base.is_sharpened:
         found.append(Variant(name="paper", group="mode", changes={"mode": "paper"}))
-        # Literally read, the paper's mode stands and falls with its score weight.
+        # The paper's mode depends strongly on its score weight.
         found.append(
             Variant(
                 name="paper_score_weight=0.1",
@@ -190,14 +188,14 @@ class EpisodeSet:
 
     Attributes:
         path: The folder.
-        count: How many of them.
+        count: Number of episodes.
     """
 
     path: str | os.PathLike[str]
     count: int
 
     def load(self) -> Episodes:
-        """Reads them; a worker process does so once."""
+        """Loads the episodes, once per process."""
         return _loaded(os.fspath(self.path))[: self.count]
 
 
@@ -208,13 +206,13 @@ def _loaded(path: str) -> Episodes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VariantScores:
-    """What a variant takes the fresh segments to be: 1 - Γ.
+    """Unsafe scores 1 - Γ of a variant on fresh segments.
 
     Attributes:
-        calibration: Of the calibration's segments, by b_safe / (1 - μ), (M,).
-        test: Of the test's, likewise, (N,).
-        calibrated: Of the test's, by the maps' heads, (N,); the paper's mode has none, and gives
-            what `test` has.
+        calibration: Scores of the calibration set, by b_safe / (1 - μ), (M,).
+        test: Scores of the test set, likewise, (N,).
+        calibrated: Scores of the test set by calibrated Γ, (N,); equal to `test` in the paper's
+            mode, which has no heads.
     """
 
     calibration: np.ndarray
@@ -224,12 +222,12 @@ class VariantScores:
 
 @dataclass(frozen=True, kw_only=True)
 class AblationSets:
-    """What all variants learn from and are judged by.
+    """The episodes of all variants.
 
     Attributes:
-        training: Stored training episodes.
-        calibration: Fresh ones, for the thresholds of the recalls.
-        test: Other fresh ones.
+        training: Training episodes.
+        calibration: Fresh episodes for thresholds.
+        test: Other fresh episodes.
     """
 
     training: EpisodeSet
@@ -240,15 +238,15 @@ class AblationSets:
 def unsafe_scores(
     variant: Variant, base: AssessmentParameters, sets: AblationSets
 ) -> VariantScores:
-    """Trains a variant and has it score the fresh segments.
+    """Trains a variant and scores the fresh segments.
 
     Args:
-        variant: What is made otherwise.
-        base: The baseline's parameters.
+        variant: The variant.
+        base: Parameters of the baseline.
         sets: The episodes.
 
     Raises:
-        ValueError: The variant cannot be learned from so few episodes.
+        ValueError: There are too few episodes to train the variant.
     """
     parameters = variant.parameters(base)
     training = sets.training.load()
@@ -257,7 +255,7 @@ def unsafe_scores(
     assessment = SafetyAssessment(parameters).fit(variant.recut(training, parameters.horizon))
     found = []
     for episodes in (sets.calibration.load(), sets.test.load()):
-        # The baseline's rows: others must not be judged at easier ones.
+        # All variants are evaluated at the rows of the baseline.
         segments = judged_segments(episodes, base)
         info = episodes.info
         states = _kept(info.state_names, variant.without)
@@ -278,42 +276,42 @@ def unsafe_scores(
 
 
 def judged_segments(episodes: Episodes, base: AssessmentParameters) -> Segments:
-    """The segments of fresh episodes that everyone is judged by."""
+    """The segments of fresh episodes at which all variants are evaluated."""
     return split(episodes, stride=1, discount=1.0, shortest=base.shortest)
 
 
-def variant_figures(
+def variant_estimates(
     scores: VariantScores,
     baseline_score: np.ndarray,
     calibration: Segments,
     test: Segments,
     *,
     bootstrap: Bootstrap | None = None,
-) -> dict[str, Figure]:
-    """How well a variant judges, and by how much better than the baseline.
+) -> dict[str, Estimate]:
+    """Estimates of a variant, and of its gain over the baseline.
 
     Args:
-        scores: Its unsafe scores of M and N segments.
-        baseline_score: The baseline's of the test's, (N,).
+        scores: Unsafe scores of M and N segments.
+        baseline_score: Unsafe scores of the baseline on the test set, (N,).
         calibration: The M segments.
         test: The N segments.
-        bootstrap: How intervals are found.
+        bootstrap: Settings of the intervals.
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall`, `brier` and `auc_gain` of all segments, and "k0.…" of
-        the first of each episode; `calibrated_auc` is by the maps' heads. Recalls are at the
-        threshold of best balanced accuracy.
+        the first of each episode; `calibrated_auc` is that of calibrated Γ. Recalls are at
+        the threshold of best balanced accuracy.
     """
     bootstrap = bootstrap or Bootstrap()
     calibration_score, score = scores.calibration, scores.test
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     rows_of = {
         "": (np.ones(len(test), dtype=bool), np.ones(len(calibration), dtype=bool)),
         "k0.": (test.is_first, calibration.is_first),
     }
     for prefix, (rows, seen) in rows_of.items():
         threshold = threshold_at(calibration_score[seen], calibration.is_unsafe[seen])
-        found = segment_figures(
+        found = segment_estimates(
             test.take(rows), score[rows], threshold=threshold, bootstrap=bootstrap
         )
         found["auc_gain"] = auc_difference(
@@ -326,5 +324,5 @@ def variant_figures(
         found["calibrated_auc"] = auc(
             scores.calibrated[rows], test.is_unsafe[rows], test.episode[rows], bootstrap=bootstrap
         )
-        figures |= {f"{prefix}{key}": figure for key, figure in found.items()}
-    return figures
+        estimates |= {f"{prefix}{key}": estimate for key, estimate in found.items()}
+    return estimates

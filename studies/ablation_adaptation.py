@@ -1,4 +1,4 @@
-"""What n_f counts in the paper's adaptation: samples of the cell, or literally all feedback."""
+"""Definitions of n_f in the paper's adaptation: samples of the cell, or all feedback."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from drake_safety.evaluation.metrics import Bootstrap, Figure, auc_difference, segment_figures
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc_difference, segment_estimates
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from studies.adaptation_study import THRESHOLD, TestSet
@@ -16,23 +14,23 @@ from studies.adaptation_study import THRESHOLD, TestSet
 BEFORE, PER_CELL, TOTAL = "before_feedback", "n_f_per_cell", "n_f_total"
 
 
-def counting_figures(
+def counting_estimates(
     prior: SafetyAssessment,
     feedback: Sequence[FeedbackSet],
     test: TestSet,
     *,
     bootstrap: Bootstrap | None = None,
-) -> dict[str, dict[str, Figure]]:
-    """Judges an assessment before feedback, and after it with either count.
+) -> dict[str, dict[str, Estimate]]:
+    """Evaluates an assessment before feedback, and after it with either definition.
 
     Args:
-        prior: The assessment, as it was learned.
+        prior: The assessment before feedback.
         feedback: The feedback sets.
         test: Fresh episodes of the actual robot.
-        bootstrap: How intervals are found.
+        bootstrap: Settings of the intervals.
 
     Returns:
-        By who is judged, the figures of every segment by key; `auc_gain` is over the prior.
+        By assessment, the estimates on every segment by key; `auc_gain` is over the prior.
     """
     bootstrap = bootstrap or Bootstrap()
     judged = {BEFORE: prior}
@@ -42,19 +40,13 @@ def counting_figures(
         one.parameters = replace(prior.parameters, adaptation=settings)
         judged[name] = one.adapt(feedback, method="paper")
     segments = test.segments
-    scores = {name: _unsafe_score(one, test) for name, one in judged.items()}
+    scores = {name: test.unsafe_score(one) for name, one in judged.items()}
     found = {}
     for name, score in scores.items():
-        found[name] = segment_figures(
+        found[name] = segment_estimates(
             segments, score, threshold=1.0 - THRESHOLD, bootstrap=bootstrap
         )
         found[name]["auc_gain"] = auc_difference(
             score, scores[BEFORE], segments.is_unsafe, segments.episode, bootstrap=bootstrap
         )
     return found
-
-
-def _unsafe_score(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
-    segments = test.segments
-    features = segments.features if assessment.uses_features else None
-    return 1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized

@@ -1,4 +1,4 @@
-"""Ablations as a picture: a dot with its interval for every variant, beside the baseline."""
+"""Plot of an ablation: estimates and intervals of all variants."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PANELS = {"auc": "AUC, every segment", "k0.auc": "AUC, first step (k = 0)", "bri
 
 
 def ablation_figure(rows: Sequence[AblationRow], panels: Mapping[str, str] | None = None) -> Figure:
-    """Every row of an ablation, by choice; a line marks the baseline.
+    """Plots the rows of an ablation by choice; a line marks the baseline.
 
     Args:
-        rows: The rows; the baseline among them.
-        panels: Titles by key of a figure.
+        rows: The rows, with the baseline.
+        panels: Titles by key of the estimate.
     """
     panels = PANELS if panels is None else panels
     heights: list[float] = []
     top = 0.0
     for i, row in enumerate(rows):
-        # A little room before each choice.
+        # Space before each choice.
         top += 1.0 if i == 0 or row.group == rows[i - 1].group else 1.6
         heights.append(-top)
     with drawing_style():
@@ -41,12 +41,14 @@ def ablation_figure(rows: Sequence[AblationRow], panels: Mapping[str, str] | Non
         all_axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (key, title) in zip(all_axes, panels.items(), strict=True):
             for row, height in zip(rows, heights, strict=True):
-                figure = row.figures[key]
+                estimate = row.estimates[key]
                 colour = INK if row.name == BASELINE else SAFE_COLOUR
-                axes.plot([figure.low, figure.high], [height, height], color=colour, linewidth=1.6)
-                axes.plot(figure.value, height, "o", color=colour, markersize=5)
+                axes.plot(
+                    [estimate.low, estimate.high], [height, height], color=colour, linewidth=1.6
+                )
+                axes.plot(estimate.value, height, "o", color=colour, markersize=5)
                 if row.name == BASELINE:
-                    axes.axvline(figure.value, color=FAINT_INK, linewidth=0.8, zorder=0)
+                    axes.axvline(estimate.value, color=FAINT_INK, linewidth=0.8, zorder=0)
             axes.set_title(title)
             axes.grid(axis="x", color="#eceef0", linewidth=0.7)
         all_axes[0].set_yticks(heights, [spoken(row.name).replace("=", " = ") for row in rows])

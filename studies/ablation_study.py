@@ -1,4 +1,4 @@
-"""Conducts ablations: a row a variant, kept as soon as it is there; a stopped one goes on."""
+"""Runs ablations; rows are stored as they finish, so that stopped ablations continue."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.metrics import Bootstrap, Figure
-from drake_safety.evaluation.report.results import as_figure
+from drake_safety.evaluation.metrics import Bootstrap, Estimate
+from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation.rollouts import parallel_map
 from studies.ablation import (
@@ -25,7 +25,7 @@ from studies.ablation import (
     VariantScores,
     judged_segments,
     unsafe_scores,
-    variant_figures,
+    variant_estimates,
 )
 
 _SCHEMA = "drake_safety.ablation"
@@ -33,29 +33,29 @@ _SCHEMA = "drake_safety.ablation"
 
 @dataclass(frozen=True, kw_only=True)
 class AblationRow:
-    """What became of one variant.
+    """Results of a variant.
 
     Attributes:
-        name: Of the variant.
-        group: Which choice it is about.
-        fingerprint: Of all that decides the figures.
-        figures: By key.
+        name: Name of the variant.
+        group: The choice.
+        fingerprint: Hash of everything that determines the estimates.
+        estimates: By key.
     """
 
     name: str
     group: str
     fingerprint: str
-    figures: Mapping[str, Figure]
+    estimates: Mapping[str, Estimate]
 
 
 @dataclass(kw_only=True)
 class AblationFile:
-    """The rows that are done, in a JSON file that is whole at any time.
+    """Finished rows, in a JSON file that is replaced atomically.
 
     Attributes:
         path: The file.
-        entries: What else it says, such as command and versions.
-        rows: By name of the variant.
+        entries: Other entries, such as command and versions.
+        rows: Rows by name of the variant.
     """
 
     path: Path
@@ -64,25 +64,25 @@ class AblationFile:
 
     @classmethod
     def open(cls, path: Path, entries: Mapping[str, Any]) -> AblationFile:
-        """Goes on with what an earlier run has left, if anything.
+        """Opens a new file, or that of an earlier run.
 
         Args:
             path: The file.
-            entries: What it shall say besides, in place of what it said.
+            entries: Other entries, which replace existing ones.
 
         Raises:
-            ValueError: The file is another's.
+            ValueError: The file holds no ablation.
         """
         rows = cls.read(path).rows if path.is_file() else {}
         return cls(path=path, entries=dict(entries), rows=rows)
 
     @classmethod
     def read(cls, path: Path) -> AblationFile:
-        """Reads a file as it is.
+        """Reads a file.
 
         Raises:
-            ValueError: It is another's.
-            OSError: It is not there.
+            ValueError: The file holds no ablation.
+            OSError: The file does not exist.
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -90,26 +90,27 @@ class AblationFile:
                 raise ValueError(f"its schema is not '{_SCHEMA}'")
             rows = {}
             for row in content.pop("rows"):
-                figures = {key: as_figure(value) for key, value in row.pop("figures").items()}
-                rows[row["name"]] = AblationRow(**row, figures=figures)
+                estimates = {key: as_estimate(value) for key, value in row.pop("figures").items()}
+                rows[row["name"]] = AblationRow(**row, estimates=estimates)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} holds no ablation: {error!r}") from error
         return cls(path=path, entries=content, rows=rows)
 
     @property
     def is_whole(self) -> bool:
-        """Whether the ablation came to its end; one that was stopped has some of the rows."""
+        """Whether the ablation is complete."""
         return "left_out" in self.entries
 
     def keep(self, row: AblationRow) -> None:
-        """Adds a row and writes the file, first under a temporary name."""
+        """Adds a row and writes the file."""
         self.rows[row.name] = row
         self.write()
 
     def write(self) -> None:
-        """Writes the file, first under a temporary name."""
+        """Writes the file through a temporary one."""
         rows = [
-            {**vars(row), "figures": {key: f.to_json() for key, f in row.figures.items()}}
+            {key: value for key, value in vars(row).items() if key != "estimates"}
+            | {"figures": {key: one.to_json() for key, one in row.estimates.items()}}
             for row in self.rows.values()
         ]
         text = json.dumps({"schema": _SCHEMA, **self.entries, "rows": rows}, indent=2)
@@ -119,8 +120,8 @@ class AblationFile:
 
 
 def rows_to_csv(rows: Sequence[AblationRow]) -> str:
-    """The rows as CSV: value, ends of the interval and n of every figure."""
-    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    """The rows as CSV: value, ends of the interval and n of every estimate."""
+    keys = list(dict.fromkeys(key for row in rows for key in row.estimates))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     ends = ("value", "low", "high", "n")
@@ -129,8 +130,8 @@ def rows_to_csv(rows: Sequence[AblationRow]) -> str:
     for row in rows:
         cells: list[Any] = [row.group, row.name]
         for key in keys:
-            figure = row.figures.get(key)
-            fields = {} if figure is None else figure.to_json()
+            estimate = row.estimates.get(key)
+            fields = {} if estimate is None else estimate.to_json()
             cells += ["" if fields.get(end) is None else fields[end] for end in ends]
         writer.writerow(cells)
     return out.getvalue()
@@ -139,7 +140,7 @@ def rows_to_csv(rows: Sequence[AblationRow]) -> str:
 def fingerprint(
     variant: Variant, base: AssessmentParameters, sets: AblationSets, version: str
 ) -> str:
-    """Of all that decides a row: what is varied, from what, on which episodes, by which version."""
+    """Hash of everything that determines a row: variant, baseline, episodes and version."""
     described = {
         name: [one.load().info.scenario_hash, one.load().info.seed, one.count]
         for name, one in vars(sets).items()
@@ -169,25 +170,25 @@ def run_ablation(
     num_workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[AblationRow], dict[str, str]]:
-    """Trains and judges every variant that the file does not know yet.
+    """Trains and evaluates the variants that the file does not have.
 
-    The baseline's scores are kept beside the file: differences to it are paired.
+    Scores of the baseline are stored beside the file for paired differences.
 
     Args:
-        variants: What is varied; the baseline among them.
-        base: The baseline's parameters.
+        variants: The variants, with the baseline.
+        base: Parameters of the baseline.
         sets: The episodes.
-        file: Where rows are kept as they finish.
-        version: Of the package.
-        bootstrap: How intervals are found.
-        num_workers: Processes; as many as there are cores by default.
+        file: File of the rows.
+        version: Version of the package.
+        bootstrap: Settings of the intervals.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and the number wanted.
 
     Returns:
-        The rows in the order of the variants, and by variant why it could not be learned.
+        The rows in the order of the variants, and the errors of failed variants.
 
     Raises:
-        ValueError: The baseline is not among the variants, or cannot be learned.
+        ValueError: The baseline is not among the variants, or cannot be trained.
     """
     baseline = next((one for one in variants if one.name == BASELINE), None)
     if baseline is None:
@@ -201,13 +202,13 @@ def run_ablation(
         return variant.name in file.rows
 
     def keep(variant: Variant, scores: VariantScores, reference: np.ndarray) -> None:
-        figures = variant_figures(scores, reference, calibration, test, bootstrap=bootstrap)
+        estimates = variant_estimates(scores, reference, calibration, test, bootstrap=bootstrap)
         file.keep(
             AblationRow(
                 name=variant.name,
                 group=variant.group,
                 fingerprint=marks[variant.name],
-                figures=figures,
+                estimates=estimates,
             )
         )
 
@@ -220,7 +221,7 @@ def run_ablation(
             progress(done, len(variants))
 
     report(0)
-    # In its name what it is of: it is whole and fits, or it is not there.
+    # The name has the fingerprint, and the file is replaced atomically: if it exists, it fits.
     kept_scores = file.path.with_name(f".{file.path.stem}-{marks[BASELINE]}.npy")
     if is_known(baseline) and kept_scores.is_file():
         reference = np.load(kept_scores, allow_pickle=False)
@@ -258,14 +259,14 @@ def _scores_or_why_not(
 
 
 def ablation_verdict(rows: Sequence[AblationRow]) -> str:
-    """Which variants the baseline beats, and which beat it, in a sentence.
+    """Names the variants that are better and worse than the baseline, in a sentence.
 
     Args:
-        rows: Of an ablation; the baseline's own is left out.
+        rows: Rows of an ablation.
     """
     ahead, behind, num_open = [], [], 0
     for row in rows:
-        gain = row.figures.get("auc_gain")
+        gain = row.estimates.get("auc_gain")
         if row.name == BASELINE or gain is None:
             continue
         if gain.low > 0.0:
@@ -276,15 +277,15 @@ def ablation_verdict(rows: Sequence[AblationRow]) -> str:
             num_open += 1
     total = len(ahead) + len(behind) + num_open
     if not total:
-        return "There is nothing yet to compare the baseline with."
+        return "There is no variant to compare with the baseline."
 
     def named(which: list[AblationRow]) -> str:
-        best_first = sorted(which, key=lambda row: -row.figures["auc_gain"].value)
+        best_first = sorted(which, key=lambda row: -row.estimates["auc_gain"].value)
         return ", ".join(
-            f"{_spoken_name(row)} ({row.figures['auc_gain'].value:+.3f})" for row in best_first
+            f"{_spoken_name(row)} ({row.estimates['auc_gain'].value:+.3f})" for row in best_first
         )
 
-    winner = f"No variant beats the baseline's AUC beyond chance ({total} tried)"
+    winner = f"No variant beats the baseline's AUC significantly ({total} tried)"
     if ahead:
         winner = f"{len(ahead)} of {total} variants beat the baseline's AUC: {named(ahead)}"
     loser = "it beats none of them"

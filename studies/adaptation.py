@@ -1,4 +1,4 @@
-"""``python -m studies adaptation``: what feedback is worth, beside learning from scratch."""
+"""``python -m studies adaptation``: adaptation by feedback, beside training from scratch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import AdaptationStudy, TestSet, study, trained_rivals
+from studies.adaptation_study import AdaptationStudy, TestSet, study, train_baselines
 
 _SCRATCH_SIZES = (40, 160, 400)
 
@@ -47,23 +47,25 @@ def adaptation(
     feedback: Annotated[
         int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
     ] = 160,
-    variation: Annotated[str, typer.Option(help="Which plant is the actual one.")] = "actual",
-    evaluate: Annotated[int, typer.Option(help="Fresh actual episodes to judge by.", min=1)] = 600,
+    variation: Annotated[str, typer.Option(help="Variation of the actual plant.")] = "actual",
+    evaluate: Annotated[
+        int, typer.Option(help="Fresh actual episodes for evaluation.", min=1)
+    ] = 600,
     orders: Annotated[int, typer.Option(help="Orders of the feedback.", min=1)] = 5,
     oracle: Annotated[
-        int, typer.Option(help="Other actual episodes to train a rival on.", min=0)
+        int, typer.Option(help="Other actual episodes to train an oracle on.", min=0)
     ] = 0,
     scratch: Annotated[
         bool, typer.Option("--scratch", help="Also train from scratch on the feedback itself.")
     ] = False,
     seed: Annotated[
-        int, typer.Option(help="First of the seeds of all that is fresh.")
+        int, typer.Option(help="First of the seeds of fresh simulations.")
     ] = ADAPTATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Judge Γ before and after feedback of a simulated plant, in several orders of it.
+    """Evaluate Γ before and after feedback of a simulated plant, in several orders of it.
 
-    The episodes are those that `drake-safety adapt` keeps in ASSESSMENT; figures and pictures go to
+    Episodes are shared with `drake-safety adapt`; results and figures are written to
     ASSESSMENT/adapted-VARIATION.
     """
     loaded = load_scenario(scenario)
@@ -98,15 +100,23 @@ def adaptation(
             }
         studies: dict[str, AdaptationStudy] = {}
         for mode, prior in priors.items():
-            rivals: dict[str, SafetyAssessment] = {}
+            baselines: dict[str, SafetyAssessment] = {}
             if learned_from:
-                rivals = trained_rivals(prior, learned_from, num_workers=workers, progress=stages)
+                baselines = train_baselines(
+                    prior, learned_from, num_workers=workers, progress=stages
+                )
             test = TestSet.of(fresh, prior.parameters.shortest)
             studies[mode] = study(
-                prior, sets, test, num_orders=orders, seed=seed, rivals=rivals, progress=stages
+                prior,
+                sets,
+                test,
+                num_orders=orders,
+                seed=seed,
+                baselines=baselines,
+                progress=stages,
             )
             if mode == "paper" and oracle:
-                studies[mode].figures |= losses(prior, sets, learned_from["oracle"], test)
+                studies[mode].estimates |= losses(prior, sets, learned_from["oracle"], test)
             if len(sets) >= prior.parameters.adaptation.update_interval:
                 pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
     for published in ("calibrated", "grid"):
@@ -124,9 +134,9 @@ def adaptation(
         "differing_pairs": differing,
         "versions": versions(),
         **{
-            f"{mode}.{key}": figure.to_json()
+            f"{mode}.{key}": estimate.to_json()
             for mode, found in studies.items()
-            for key, figure in found.figures.items()
+            for key, estimate in found.estimates.items()
         },
     }
     file = folder / "study.json"
@@ -134,7 +144,7 @@ def adaptation(
     for mode, found in studies.items():
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             console.print(_study_table(found, mode, published, variation))
-        if "losses.x.brier" in found.figures:
+        if "losses.x.brier" in found.estimates:
             console.print(_losses_table(found, mode))
     print_path("figures", file)
     for path in pictures:
@@ -142,7 +152,7 @@ def adaptation(
 
 
 def _losses_table(found: AdaptationStudy, mode: str) -> Table:
-    brier = {name: found.figures[f"losses.{name}.brier"].value for name in STEPS}
+    brier = {name: found.estimates[f"losses.{name}.brier"].value for name in STEPS}
     table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
     table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
     for name, before, label in (
@@ -157,7 +167,7 @@ def _losses_table(found: AdaptationStudy, mode: str) -> Table:
 
 def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
     columns = ("brier", "auc", "unsafe_recall", "safe_recall")
-    figures = found.figures
+    estimates = found.estimates
     table = new_table(
         "",
         *columns,
@@ -172,12 +182,12 @@ def _study_table(found: AdaptationStudy, mode: str, published: str, variation: s
     names["oracle"] = "oracle"
     for who, label in names.items():
         key = f"{who}.{published}"
-        if f"{key}.brier" not in figures:
+        if f"{key}.brier" not in estimates:
             continue
-        won, closed = figures.get(f"{key}.orders_won"), figures.get(f"{key}.gap_closed")
+        won, closed = estimates.get(f"{key}.orders_won"), estimates.get(f"{key}.gap_closed")
         table.add_row(
             label,
-            *(interval(figures[f"{key}.{column}"]) for column in columns),
+            *(interval(estimates[f"{key}.{column}"]) for column in columns),
             f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
             f"{100 * closed.value:.0f} %"
             if closed is not None and math.isfinite(closed.value)

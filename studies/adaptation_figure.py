@@ -1,4 +1,4 @@
-"""Pictures of adaptation: the map before and after, the discrepancy, and what feedback is worth."""
+"""Plots of adaptation: the map before and after, the discrepancy, and the gain of feedback."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ def adaptation_figure(
     updates: Sequence[int] = (1, 4),
     method: str | None = None,
 ) -> Figure:
-    """The map before feedback and after some updates: feedback, discrepancy, beliefs.
+    """Plots the map before feedback and after some updates: feedback, discrepancy, beliefs.
 
-    The upper row shows the feedback in the embedding and the beliefs of the cells, the lower one
-    the discrepancy function after each update. The cells that changed most are marked, and what
-    changed them is said. Of an ensemble it is the first map.
+    The upper row shows the beliefs of the cells, the lower one the feedback in the embedding and
+    the discrepancy function after each update. The cells that changed most are marked, with their
+    feedback. It shows the first map of an ensemble.
 
     Args:
         prior: The assessment before any feedback.
-        feedback: Feedback sets, in the order they came.
-        updates: After which updates, of `update_interval` sets each; those that there is too
-            little feedback for are left out.
-        method: How it adapts; see `SafetyAssessment.adapt`.
+        feedback: Feedback sets, in order.
+        updates: Numbers of the updates, of `update_interval` sets each; those without enough
+            feedback are left out.
+        method: Method of adaptation, see `SafetyAssessment.adapt`.
 
     Raises:
         ValueError: There is too little feedback for the first update.
@@ -146,7 +146,7 @@ def _draw_discrepancy(
     shade = ScalarMappable(Normalize(0.0, 1.0), ramp)
     draw_cells(axes, prior.grid_, shade.to_rgba(mean), deviation > gate)
     axes.set_title("Discrepancy m(y)")
-    axes.set_xlabel(f"hatched: σ > {gate:g}, not believed")
+    axes.set_xlabel(f"hatched: σ > {gate:g}, not used")
     add_colour_bar(fig, axes, shade, "|λ actual - λ nominal|")
 
 
@@ -157,7 +157,7 @@ def _mark_changes(
     after: np.ndarray,
     segments: FeedbackSegments,
 ) -> None:
-    """Outlines the cells that changed most, and says how and on what evidence."""
+    """Outlines the cells that changed most, with their change and feedback."""
     from matplotlib.patches import Rectangle
 
     grid = prior.grid_
@@ -198,11 +198,11 @@ def _mark_changes(
 
 
 def study_figure(studies: Mapping[str, AdaptationStudy], *, published: str) -> Figure:
-    """What feedback is worth: Brier score, area under the curve, recall over feedback sets.
+    """Plots Brier score, AUC and unsafe recall over the number of feedback sets.
 
     Args:
-        studies: By name, such as that of a mode.
-        published: Key of what is judged, see `adaptation_study.PUBLISHED`.
+        studies: Studies by name, such as that of a mode.
+        published: Key of the form of Γ, see `adaptation_study.PUBLISHED`.
     """
     panels = (
         ("brier", "Brier score"),
@@ -220,19 +220,19 @@ def study_figure(studies: Mapping[str, AdaptationStudy], *, published: str) -> F
 
 
 def _draw_study(axes: Axes, found: AdaptationStudy, name: str, colour: str, key: str) -> None:
-    figures = found.figures
+    estimates = found.estimates
     sizes = [0, *found.sizes]
-    adapted = [figures[f"prior.{key}"], *(figures[f"adapted.{n}.{key}"] for n in found.sizes)]
+    adapted = [estimates[f"prior.{key}"], *(estimates[f"adapted.{n}.{key}"] for n in found.sizes)]
     axes.plot(sizes, [f.value for f in adapted], "o-", color=colour, label=f"{name}, adapted")
     axes.fill_between(
         sizes, [f.low for f in adapted], [f.high for f in adapted], color=colour, alpha=0.18
     )
-    scratch = [n for n in found.sizes if f"scratch.{n}.{key}" in figures]
+    scratch = [n for n in found.sizes if f"scratch.{n}.{key}" in estimates]
     if scratch:
-        values = [figures[f"scratch.{n}.{key}"].value for n in scratch]
+        values = [estimates[f"scratch.{n}.{key}"].value for n in scratch]
         axes.plot(scratch, values, "s:", color=colour, label=f"{name}, from scratch")
-    if f"oracle.{key}" in figures:
+    if f"oracle.{key}" in estimates:
         axes.axhline(
-            figures[f"oracle.{key}"].value, color=colour, linestyle="--", label=f"{name}, oracle"
+            estimates[f"oracle.{key}"].value, color=colour, linestyle="--", label=f"{name}, oracle"
         )
     axes.grid(color=FAINT_INK, alpha=0.2)

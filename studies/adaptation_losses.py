@@ -1,4 +1,4 @@
-"""Where an adapted assessment loses: at its maps, at its grid, or at the update from feedback."""
+"""Losses of an adapted assessment by step: map, grid, and update from feedback."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_safety.evaluation.baselines import DirectClassifier
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.segments import Episodes, split
@@ -16,32 +16,31 @@ from studies.adaptation_study import TestSet
 
 NUM_NEIGHBOURS = 50
 STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
-"""From what could be known to what is, the Brier score of each; see `losses`."""
+"""The steps, see `losses`."""
 
 
 def losses(
     prior: SafetyAssessment, feedback: Sequence[FeedbackSet], learned: Episodes, test: TestSet
-) -> dict[str, Figure]:
+) -> dict[str, Estimate]:
     """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
 
-    - "x": gradient boosting on x, learned from many actual episodes: what can be known of x.
-    - "psi": the share of unsafe ends among the nearest of those episodes' segments in the
-      embedding: what Psi has kept of it.
-    - "grid": the share of unsafe ends among their segments in the same cell: what the grid has.
-    - "update": the grid as the paper's update makes it of the feedback.
-    - "update_without_gpr": the same, with no discrepancy function.
+    - "x": gradient boosting on x, trained on many actual episodes.
+    - "psi": share of unsafe ends among the nearest segments of these episodes in the embedding.
+    - "grid": share of unsafe ends among their segments in the same cell.
+    - "update": the grid after the paper's update from the feedback.
+    - "update_without_gpr": the same without discrepancy function.
 
-    From each step to the next is the loss of Psi, of the grid and of the update. It is of one map:
-    of an ensemble, "psi" and "grid" are the first one's.
+    The differences between steps are the losses of Ψ, of the grid and of the update. For an
+    ensemble, "psi" and "grid" are those of the first map.
 
     Args:
-        prior: The assessment before any feedback.
+        prior: The assessment before feedback.
         feedback: All feedback.
         learned: Many actual episodes, other than the fresh ones.
         test: The fresh episodes.
 
     Raises:
-        ValueError: The actual episodes all end alike.
+        ValueError: All actual episodes have the same end.
     """
     from sklearn.neighbors import KNeighborsClassifier
 
@@ -73,17 +72,11 @@ def losses(
         "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),
         "psi": share,
         "grid": np.where(own >= 0, by_cell[own], overall),
-        "update": _grid(prior.adapt(feedback, method="paper"), test),
-        "update_without_gpr": _grid(without_gpr.adapt(feedback, method="paper"), test),
+        "update": test.unsafe_score(prior.adapt(feedback, method="paper")),
+        "update_without_gpr": test.unsafe_score(without_gpr.adapt(feedback, method="paper")),
     }
     found = {}
     for name in STEPS:
         value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
-        found[f"losses.{name}.brier"] = Figure(value, value, value, len(test.episodes))
+        found[f"losses.{name}.brier"] = Estimate.exact(value, len(test.episodes))
     return found
-
-
-def _grid(assessment: SafetyAssessment, test: TestSet) -> np.ndarray:
-    judged = test.segments
-    features = judged.features if assessment.uses_features else None
-    return 1.0 - assessment.predict(judged.state, judged.desired_preview, features).normalized

@@ -1,4 +1,4 @@
-"""What feedback is worth: an assessment before and after it, beside those it competes with."""
+"""Evaluation of an assessment before and after feedback, beside baselines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, area_under_curve, proportion
+from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.evaluation.scorers import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
@@ -17,25 +17,24 @@ from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.rollouts import parallel_map
 
 SIZES = (40, 80, 120, 160, 400)
-"""Feedback sets after which an assessment is judged."""
-METRICS = ("brier", "auc", "unsafe_recall", "safe_recall")
+"""Numbers of feedback sets after which an assessment is evaluated."""
 THRESHOLD = 0.5
-"""Safety probability below which a segment counts as judged unsafe."""
+"""Safety probability below which a segment is classified unsafe."""
 
 PUBLISHED: dict[str, Callable[[Assessments], np.ndarray]] = {
     "calibrated": lambda result: result.calibrated,
     "grid": lambda result: result.normalized,
 }
-"""What an assessment publishes, by name: by its heads, and by its grid."""
+"""Forms of Γ by name: calibrated, and of the grid."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TestSet:
-    """Fresh actual episodes that all are judged by.
+    """Fresh actual episodes for evaluation.
 
     Attributes:
         episodes: The episodes.
-        segments: Every start row of theirs.
+        segments: Their segments from every row.
     """
 
     __test__ = False  # Not one of pytest's.
@@ -49,21 +48,29 @@ class TestSet:
 
         Args:
             episodes: The episodes.
-            shortest: Steps that a safe episode's segment has at least.
+            shortest: Minimum length of a segment of a safe episode [steps].
         """
         return cls(
             episodes=episodes, segments=split(episodes, stride=1, discount=1.0, shortest=shortest)
         )
 
+    def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
+        """1 - Γ of each segment by the grid of an assessment, (N,)."""
+        segments = self.segments
+        features = segments.features if assessment.uses_features else None
+        return (
+            1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized
+        )
+
 
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
-    """How well an assessment judges the test set, by what it publishes and by metric.
+    """Metrics of an assessment on the test set, by form of Γ and metric.
 
-    "k0.…" is of the episodes' first rows alone.
+    "k0.…" are those of first rows alone.
 
     Args:
-        assessment: Who is judged.
-        test: By what.
+        assessment: The assessment.
+        test: The test set.
     """
     segments = test.segments
     is_plain = not assessment.parameters.is_sharpened and test.episodes.info.variation == "nominal"
@@ -98,17 +105,17 @@ def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
 
 @dataclass(kw_only=True)
 class AdaptationStudy:
-    """What was found of one gap.
+    """Results of the study of one plant.
 
     Attributes:
-        figures: By dotted key "WHO.PUBLISHED.METRIC", where WHO is "prior", "adapted.N" or a
-            rival's name; of several orders it is the mean, and the interval their least and
-            largest.
+        estimates: By dotted key "ASSESSMENT.FORM.METRIC", where ASSESSMENT is "prior", "adapted.N"
+            or the name of a baseline; over orders it is the mean, with minimum and maximum as
+            interval.
         sizes: The N.
-        num_orders: In how many orders the feedback came.
+        num_orders: Number of orders of the feedback.
     """
 
-    figures: dict[str, Figure] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
     num_orders: int = 1
 
@@ -122,20 +129,20 @@ def study(
     num_orders: int = 5,
     seed: int = 0,
     method: str | None = None,
-    rivals: Mapping[str, SafetyAssessment] | None = None,
+    baselines: Mapping[str, SafetyAssessment] | None = None,
     progress: StageProgress | None = None,
 ) -> AdaptationStudy:
-    """Judges an assessment before and after feedback, in several orders of it.
+    """Evaluates an assessment before and after feedback, in several orders of it.
 
     Args:
-        assessment: The prior.
-        feedback: All feedback sets; of each order the first N are given.
+        assessment: The assessment before feedback.
+        feedback: All feedback sets, of which each order uses the first N.
         test: Fresh actual episodes.
-        sizes: The N; those beyond what there is are left out.
-        num_orders: How many orders.
-        seed: Of the orders.
-        method: How it adapts; see `SafetyAssessment.adapt`.
-        rivals: Other assessments by the name they have in the figures.
+        sizes: The N; those above the number of sets are left out.
+        num_orders: Number of orders.
+        seed: Seed of the orders.
+        method: Method of adaptation, see `SafetyAssessment.adapt`.
+        baselines: Other assessments by name.
         progress: Called with a stage, the number done and the number wanted.
 
     Raises:
@@ -145,8 +152,8 @@ def study(
     if not sizes:
         raise ValueError(f"adaptation study: there are only {len(feedback)} feedback sets")
     found: dict[str, list[dict[str, dict[str, float]]]] = {"prior": [scores(assessment, test)]}
-    for name, rival in (rivals or {}).items():
-        found[name] = [scores(rival, test)]
+    for name, baseline in (baselines or {}).items():
+        found[name] = [scores(baseline, test)]
     total = num_orders * len(sizes)
     for order in range(num_orders):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(order,)))
@@ -157,65 +164,65 @@ def study(
             if progress is not None:
                 stage = f"{assessment.parameters.mode}: orders of feedback"
                 progress(stage, order * len(sizes) + i + 1, total)
-    figures = {}
+    estimates = {}
     num_test = len(test.episodes)
     for who, orders in found.items():
         for published in PUBLISHED:
             for metric in orders[0][published]:
                 values = [one[published][metric] for one in orders]
-                figures[f"{who}.{published}.{metric}"] = Figure(
+                estimates[f"{who}.{published}.{metric}"] = Estimate(
                     float(np.mean(values)), min(values), max(values), num_test
                 )
     differing = sum(one.differs for one in feedback)
-    figures["gap"] = proportion(differing, len(feedback))
+    estimates["gap"] = proportion(differing, len(feedback))
     for size in sizes:
-        # In how many orders the adapted one is better than the prior.
+        # Number of orders in which the adapted assessment is better than the prior.
         prior = found["prior"][0]
         for published in PUBLISHED:
             won = sum(
                 one[published]["brier"] < prior[published]["brier"]
                 for one in found[f"adapted.{size}"]
             )
-            figures[f"adapted.{size}.{published}.orders_won"] = proportion(won, num_orders)
+            estimates[f"adapted.{size}.{published}.orders_won"] = proportion(won, num_orders)
             if "oracle" in found:
                 gap = prior[published]["brier"] - found["oracle"][0][published]["brier"]
                 closed = prior[published]["brier"] - np.mean(
                     [one[published]["brier"] for one in found[f"adapted.{size}"]]
                 )
                 share = float(closed / gap) if gap > 0.0 else math.nan
-                figures[f"adapted.{size}.{published}.gap_closed"] = Figure(
-                    share, share, share, num_test
+                estimates[f"adapted.{size}.{published}.gap_closed"] = Estimate.exact(
+                    share, num_test
                 )
-    return AdaptationStudy(figures=figures, sizes=list(sizes), num_orders=num_orders)
+    return AdaptationStudy(estimates=estimates, sizes=list(sizes), num_orders=num_orders)
 
 
-def trained_rivals(
+def train_baselines(
     assessment: SafetyAssessment,
     episodes: Mapping[str, Episodes],
     *,
     num_workers: int | None = None,
     progress: StageProgress | None = None,
 ) -> dict[str, SafetyAssessment]:
-    """Assessments trained from scratch on actual episodes, with the prior's own parameters.
+    """Trains assessments from scratch on actual episodes, with the parameters of the prior.
 
-    Too few episodes for t-SNE give none.
+    Those with too few episodes for t-SNE are left out.
 
     Args:
-        assessment: The prior.
-        episodes: What each learns from, by its name.
-        num_workers: Processes.
+        assessment: The assessment before feedback.
+        episodes: Training episodes by name.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
     """
-    rivals: dict[str, SafetyAssessment] = {}
-    # The largest first: nobody waits for it at the end.
+    baselines: dict[str, SafetyAssessment] = {}
+    # The largest first, so that no worker is left with it at the end.
     wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
     arguments = [(name, assessment, one) for name, one in wanted]
-    for done, (name, rival) in enumerate(parallel_map(_learned, arguments, num_workers)):
-        if rival is not None:
-            rivals[name] = rival
+    for done, (name, baseline) in enumerate(parallel_map(_learned, arguments, num_workers)):
+        if baseline is not None:
+            baselines[name] = baseline
         if progress is not None:
             progress("learning from scratch", done + 1, len(arguments))
-    return {name: rivals[name] for name in episodes if name in rivals}
+    return {name: baselines[name] for name in episodes if name in baselines}
 
 
 def _learned(

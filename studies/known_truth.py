@@ -1,4 +1,4 @@
-"""Γ against the truth: where two state variables say all, every start is simulated on a grid."""
+"""Γ against the true safe set, simulated on a grid of two state variables."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasStatePlanes, require
@@ -20,21 +20,21 @@ from drake_safety.simulation.rollouts import (
 from drake_safety.simulation.scenario import Scenario
 
 THRESHOLD = 0.5
-"""From this on Γ says safe."""
+"""Lowest Γ that is classified safe."""
 CONFIDENT = 0.9
 """Γ is confident above this, and below one minus this."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownTruth:
-    """What becomes of every start on a plane, and the first row that an assessor would see.
+    """Outcomes of all starts on a plane, and their inputs at k = 0.
 
     Attributes:
         plane: Name of the plane, which is that of its plan.
-        axes: What the plane's two variables are.
-        points: (n, n, 2), along the first variable first.
+        axes: Labels of the two variables.
+        points: Values of the variables, (n, n, 2); the first index is that of the first variable.
         is_safe: Whether the episode stays in the safe set, (n, n).
-        state, desired_preview, features: At k = 0, (n, n, size) each.
+        state, desired_preview, features: Inputs at k = 0, (n, n, size) each.
     """
 
     plane: str
@@ -60,14 +60,15 @@ class KnownTruth:
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """How far Γ and the truth agree on a plane.
+    """Agreement of Γ with the truth on a plane.
 
     Attributes:
-        threshold: Above it Γ says safe.
-        intersection_over_union: Of what Γ calls safe and what is safe; 1 when both are empty.
-        confident_errors: Share of the starts at which Γ is confident, and wrong.
-        band: How far such an error lies from the true boundary at most, as a share of the plane's
-            sides; 0 without any.
+        threshold: Lowest Γ that is classified safe.
+        intersection_over_union: Of the starts classified safe and the safe ones; 1 if both are
+            empty.
+        confident_errors: Share of the starts at which Γ is confident and wrong.
+        band: Largest distance of such an error to the true boundary, as a share of the sides of
+            the plane; 0 without errors.
     """
 
     threshold: float
@@ -88,9 +89,9 @@ def simulate_truth(
 
     Args:
         scenario: A scenario whose task has state planes.
-        plane: Which.
-        resolution: Points along either variable.
-        num_workers: Processes; as many as there are cores by default.
+        plane: Name of the plane.
+        resolution: Number of points along each variable.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and the number wanted.
 
     Raises:
@@ -151,7 +152,7 @@ def agreement(
     Args:
         is_safe: The truth, (n, m).
         probability: Γ, (n, m).
-        threshold: Above it Γ says safe.
+        threshold: Lowest Γ that is classified safe.
 
     Raises:
         ValueError: The shapes differ.
@@ -163,7 +164,7 @@ def agreement(
     says_safe = probability >= threshold
     union = np.count_nonzero(is_safe | says_safe)
     shared = np.count_nonzero(is_safe & says_safe)
-    wrong = _is_confidently_wrong(is_safe, probability)
+    wrong = is_confidently_wrong(is_safe, probability)
     depth = boundary_distance(is_safe)
     return Agreement(
         threshold=threshold,
@@ -173,12 +174,12 @@ def agreement(
     )
 
 
-def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Figure]:
-    """How far Γ and the truth agree at k = 0 on random starts and plans, not on chosen ones.
+def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Estimate]:
+    """Agreement of Γ with the truth at k = 0 on random starts and plans.
 
     Args:
         assessment: Γ.
-        episodes: Fresh episodes, drawn as those that were learned from.
+        episodes: Fresh episodes with the distribution of the training episodes.
 
     Returns:
         "safe_share", "intersection_over_union" and "confident_errors", as in `Agreement`.
@@ -188,7 +189,7 @@ def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dic
     state = first.state if assessment.uses_features else first.true_state
     probability = assessment.predict(state, first.desired_preview, first.features).normalized
     is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD
-    wrong = _is_confidently_wrong(is_safe, probability)
+    wrong = is_confidently_wrong(is_safe, probability)
     return {
         "safe_share": proportion(int(is_safe.sum()), len(first)),
         "intersection_over_union": proportion(
@@ -198,18 +199,19 @@ def random_plan_figures(assessment: SafetyAssessment, episodes: Episodes) -> dic
     }
 
 
-def _is_confidently_wrong(is_safe: np.ndarray, probability: np.ndarray) -> np.ndarray:
+def is_confidently_wrong(is_safe: np.ndarray, probability: np.ndarray) -> np.ndarray:
+    """Whether Γ is confident and wrong, element by element."""
     return np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
 
 
 def boundary_distance(is_safe: np.ndarray) -> np.ndarray:
-    """Distance of every point of a grid to the nearest one whose truth is the other.
+    """Distance of every point of a grid to the nearest one with the other outcome.
 
     Args:
-        is_safe: (n, m).
+        is_safe: Outcomes, (n, m).
 
     Returns:
-        Shares of the grid's sides, (n, m); infinite where all points are alike.
+        Distances as shares of the sides of the grid, (n, m); infinite if all outcomes are equal.
     """
     from scipy.ndimage import distance_transform_edt
 

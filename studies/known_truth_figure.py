@@ -1,4 +1,4 @@
-"""The picture of a known truth: Γ as colour, the true safe set and Γ's threshold as lines."""
+"""Plot of Γ as colour, with the boundaries of the true safe set and of Γ's threshold."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drake_safety.evaluation.figure_style import (
     drawing_style,
     new_figure,
 )
-from studies.known_truth import CONFIDENT, Agreement, KnownTruth
+from studies.known_truth import Agreement, KnownTruth, is_confidently_wrong
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 def known_truth_figure(
     panels: Sequence[tuple[KnownTruth, np.ndarray, Agreement]], title: str
 ) -> Figure:
-    """One panel a plane.
+    """Plots one panel per plane.
 
     Args:
-        panels: The truth, Γ at its points (n, n), and how far they agree.
-        title: Of the picture.
+        panels: The truth, Γ at its points (n, n), and their agreement.
+        title: Title of the figure.
     """
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.lines import Line2D
@@ -54,7 +54,7 @@ def known_truth_figure(
                     linewidths=1.6,
                     linestyles="--",
                 )
-            wrong = np.where(truth.is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
+            wrong = is_confidently_wrong(truth.is_safe, probability)
             axes.plot(*truth.points[wrong].T, "x", color=INK, markersize=5)
             axes.set_xlabel(truth.axes[0])
             axes.set_title(
@@ -69,7 +69,7 @@ def known_truth_figure(
             Line2D(
                 [], [], color=SAFE_COLOUR, lw=1.6, ls="--", label=f"Γ = {panels[0][2].threshold:g}"
             ),
-            Line2D([], [], color=INK, marker="x", ls="", label="confident, and wrong"),
+            Line2D([], [], color=INK, marker="x", ls="", label="confident and wrong"),
         ]
         fig.legend(handles=handles, loc="outside lower center", ncols=3)
     return fig

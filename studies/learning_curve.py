@@ -1,4 +1,4 @@
-"""``python -m studies learning-curve``: how much better Γ judges the more it has learned from."""
+"""``python -m studies learning-curve``: recalls of Γ over the number of training episodes."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from drake_safety.cli.training_folder import (
     run_fresh_episodes,
 )
 from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.plan_study import (
     Plans,
     plans_of,
     promised_miss_rate,
     scorer_rule,
-    verdict_figures,
+    verdict_estimates,
 )
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Table
-from drake_safety.evaluation.report.verdicts import columns_of, figure_rows
+from drake_safety.evaluation.report.verdicts import columns_of, estimate_rows
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -61,16 +61,16 @@ def train_fewer(
     sizes: Annotated[str, typer.Option(help="Numbers of training episodes, such as '512,1024'.")],
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     calibration_episodes: Annotated[
-        int, typer.Option(help="Other ones, to choose thresholds.", min=20)
+        int, typer.Option(help="Other ones, for thresholds.", min=20)
     ] = 300,
     seed: Annotated[
         int, typer.Option(help="First seed of the fresh ones: those of `evaluate` by default.")
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Learn Γ of plans with a goal from fewer episodes, too, and judge it on the same fresh ones.
+    """Train Γ of plans with a goal on fewer episodes, and evaluate it on the same fresh ones.
 
-    Writes ASSESSMENT/learning_curve.json, which `store` takes in, and its picture.
+    Writes ASSESSMENT/learning_curve.json, which `store` includes, and its figure.
     """
     wanted = parse_sizes(sizes)
     loaded = load_scenario(scenario)
@@ -104,7 +104,7 @@ def train_fewer(
             num_workers=workers,
             progress=stages,
         )
-    figures = {f"plans.learning_curve.{key}": figure for key, figure in curve.items()}
+    estimates = {f"plans.learning_curve.{key}": estimate for key, estimate in curve.items()}
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -112,7 +112,7 @@ def train_fewer(
         "seed": seed,
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
-        **{key: figure.to_json() for key, figure in figures.items()},
+        **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / CURVE_FILE
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
@@ -122,10 +122,10 @@ def train_fewer(
     table = Table(
         key="learning_curve",
         title="Learning curve",
-        meaning="The same test, after learning from fewer simulated episodes.",
+        meaning="The same test after training on fewer episodes.",
         corner="training episodes",
         columns=columns,
-        rows=figure_rows(Results(figures=figures), prefixes, columns),
+        rows=estimate_rows(Results(estimates=estimates), prefixes, columns),
     )
     console.print(figures_table(table))
     print_path("figures", file)
@@ -137,7 +137,7 @@ def parse_sizes(text: str) -> tuple[int, ...]:
     """The numbers of episodes in '512,1024'.
 
     Raises:
-        ValueError: Something else stands there.
+        ValueError: The text is no list of integers.
     """
     try:
         return tuple(int(part) for part in text.split(",")) if text else ()
@@ -148,14 +148,14 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 
 
 def check_sizes(num_episodes: int, sizes: Sequence[int]) -> None:
-    """Refuses sizes of training sets that cannot be.
+    """Checks sizes of training sets.
 
     Args:
-        num_episodes: How many training episodes there are.
-        sizes: How many of them to learn from.
+        num_episodes: Number of training episodes.
+        sizes: Sizes of the training sets.
 
     Raises:
-        ValueError: A size is not positive, or more than there are.
+        ValueError: A size is not positive, or exceeds the number of episodes.
     """
     misfits = [size for size in sizes if not 1 <= size <= num_episodes]
     if misfits:
@@ -174,25 +174,25 @@ def learning_curve(
     known: Mapping[int, SafetyAssessment] | None = None,
     num_workers: int | None = None,
     progress: StageProgress | None = None,
-) -> dict[str, Figure]:
-    """Trains on the first n episodes, for several n, and judges the same plans each time.
+) -> dict[str, Estimate]:
+    """Trains on the first n episodes, for several n, and evaluates on the same plans.
 
     Args:
         path: Folder of the training episodes.
         sizes: The n.
-        parameters: How Γ is learned.
-        calibration: Plans on which each Γ's threshold is chosen.
+        parameters: Parameters of Γ.
+        calibration: Plans on which thresholds are chosen.
         test: Fresh plans.
-        known: What was learned already, by n.
-        num_workers: Processes.
+        known: Assessments that are already trained, by n.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Returns:
-        By "N.auc", "N.safe_recall", "N.unsafe_recall", "N.brier" and "N.threshold" (Γ_thre), the
-        same by "N.fair.…" for the fair set.
+        "N.auc", "N.safe_recall", "N.unsafe_recall", "N.brier" and "N.threshold" (Γ_thre), and the
+        same as "N.fair.…" for the fair set.
 
     Raises:
-        ValueError: A size is not positive, or more than there are.
+        ValueError: A size is not positive, or exceeds the number of episodes.
     """
     check_sizes(len(completed(path)), sizes)
     learned, wanted = dict(known or {}), sorted(set(sizes))
@@ -200,14 +200,14 @@ def learning_curve(
     done = len(wanted) - len(missing)
     if progress is not None:
         progress("learning curve", done, len(wanted))
-    # The largest first: nobody waits for it at the end.
+    # The largest first, so that no worker is left with it at the end.
     arguments = [(os.fspath(path), size, parameters) for size in reversed(missing)]
     for size, assessment in parallel_map(_learn, arguments, num_workers):
         learned[size] = assessment
         done += 1
         if progress is not None:
             progress("learning curve", done, len(wanted))
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     miss_rate = promised_miss_rate(calibration)
     for size in wanted:
         rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
@@ -219,11 +219,11 @@ def learning_curve(
             (f"{size}", test, score),
             (f"{size}.fair", test.fair(), score[test.is_fair]),
         ):
-            found = verdict_figures(plans, chosen, threshold)
+            found = verdict_estimates(plans, chosen, threshold)
             limit = 1.0 - threshold
-            found["threshold"] = Figure(limit, limit, limit, len(calibration))
-            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
-    return figures
+            found["threshold"] = Estimate.exact(limit, len(calibration))
+            estimates |= {f"{key}.{what}": estimate for what, estimate in found.items()}
+    return estimates
 
 
 def _learn(path: str, size: int, parameters: AssessmentParameters) -> tuple[int, SafetyAssessment]:

@@ -1,4 +1,4 @@
-"""Recalls over the number of training episodes."""
+"""Plot of recalls over the number of training episodes."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from drake_safety.evaluation.figure_style import (
 from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Picture
+    from matplotlib.figure import Figure
 
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
 
 _CURVES = (
-    ("safe_recall", "safe targets accepted", SAFE_COLOUR, "o", SAFE_RECALL),
-    ("unsafe_recall", "unsafe targets refused", UNSAFE_COLOUR, "s", UNSAFE_RECALL),
+    ("safe_recall", "safe recall", SAFE_COLOUR, "o", SAFE_RECALL),
+    ("unsafe_recall", "unsafe recall", UNSAFE_COLOUR, "s", UNSAFE_RECALL),
 )
 
 
-def learning_curve_figure(figures: Mapping[str, Figure]) -> Picture:
-    """Both recalls with their intervals, whole target box and fair set, and the paper's figures.
+def learning_curve_figure(estimates: Mapping[str, Estimate]) -> Figure:
+    """Plots both recalls with intervals for all targets and the fair set, and those of the paper.
 
     Args:
-        figures: What :func:`~studies.learning_curve.learning_curve` found.
+        estimates: The result of :func:`~studies.learning_curve.learning_curve`.
     """
     from matplotlib.ticker import NullLocator
 
-    sizes = sorted({int(key.partition(".")[0]) for key in figures})
+    sizes = sorted({int(key.partition(".")[0]) for key in estimates})
     lowest = min(
-        figure.low
-        for key, figure in figures.items()
-        if key.endswith("recall") and np.isfinite(figure.low)
+        estimate.low
+        for key, estimate in estimates.items()
+        if key.endswith("recall") and np.isfinite(estimate.low)
     )
     with drawing_style():
         fig = new_figure(10.0, 4.6)
@@ -48,9 +48,9 @@ def learning_curve_figure(figures: Mapping[str, Figure]) -> Picture:
             panels, ("", "fair."), ("All targets", "Fair set"), strict=True
         ):
             for what, label, colour, marker, paper in _CURVES:
-                found = [figures[f"{size}.{infix}{what}"] for size in sizes]
+                found = [estimates[f"{size}.{infix}{what}"] for size in sizes]
                 value, low, high = (
-                    np.array([getattr(figure, end) for figure in found])
+                    np.array([getattr(estimate, end) for estimate in found])
                     for end in ("value", "low", "high")
                 )
                 axes.fill_between(sizes, low, high, color=colour, alpha=0.15, linewidth=0)
@@ -67,6 +67,6 @@ def learning_curve_figure(figures: Mapping[str, Figure]) -> Picture:
             axes.set_axisbelow(True)
         panels[0].set_ylim(max(0.0, lowest - 0.02), 1.005)
         panels[0].set_ylabel("recall")
-        panels[0].plot([], [], color=FAINT_INK, lw=1.0, ls=(0, (2, 2)), label="the paper's")
+        panels[0].plot([], [], color=FAINT_INK, lw=1.0, ls=(0, (2, 2)), label="paper")
         panels[0].legend(loc="lower right")
     return fig

@@ -1,4 +1,4 @@
-"""``python -m studies plan-study``: what choosing plans by Γ is worth."""
+"""``python -m studies plan-study``: the gain of choosing plans by Γ."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def plan_study(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the figures; by default ASSESSMENT, or else runs/SCENARIO-shipped."
+            help="Folder for the results; by default ASSESSMENT, or else runs/SCENARIO-shipped."
         ),
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
-    """Compare the default plan, the one with the highest Γ, and the best in hindsight.
+    """Compare the default plan, the plan with the highest Γ, and the best in hindsight.
 
     Simulates every candidate plan of every start: EPISODES times CANDIDATES motions. They are kept
-    in ASSESSMENT as they finish: a study that was stopped goes on when it is called again.
+    in ASSESSMENT as they finish: a stopped study continues when called again.
     """
     from drake_safety.evaluation.figure_style import save
     from drake_safety.simulation.scenario import load_scenario
@@ -85,11 +85,11 @@ def plan_study(
         "executed",
         "safe [%]",
         title=f"{episodes} fresh starts, {candidates} plans each; Γ accepts a plan of "
-        f"{interval(study.figures['accepted'], 100, 1)} %",
+        f"{interval(study.estimates['accepted'], 100, 1)} %",
     )
     for key, name in PLANS.items():
-        figure = study.figures[key]
-        table.add_row(name, f"{figure.n}", interval(figure, 100, 1))
+        estimate = study.estimates[key]
+        table.add_row(name, f"{estimate.n}", interval(estimate, 100, 1))
     report = {
         "command": command_line(),
         "scenario": loaded.name,
@@ -99,28 +99,28 @@ def plan_study(
         "candidates": candidates,
         "threshold": rule.threshold,
         "versions": versions(),
-        **{f"planning.{key}": figure.to_json() for key, figure in study.figures.items()},
+        **{f"planning.{key}": estimate.to_json() for key, estimate in study.estimates.items()},
     }
     folder = out or learned.out
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "planning.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(table)
-    console.print(planning_verdict(study.figures), highlight=False, soft_wrap=True)
+    console.print(planning_verdict(study.estimates), highlight=False, soft_wrap=True)
     if rule.remark:
         console.print(rule.remark, highlight=False, soft_wrap=True)
     print_path("figures", file)
-    for picture in save(planning_figure(study.figures), folder / "planning"):
+    for picture in save(planning_figure(study.estimates), folder / "planning"):
         print_path("picture", picture)
 
 
 def planning_folder(folder: Path, scenario_hash: str, seed: int, num_plans: int) -> Path:
-    """Where the study keeps the motions it executed, so that it can go on with them.
+    """Folder of the executed motions.
 
     Args:
-        folder: The folder of the training.
-        scenario_hash: Of what was simulated: another simulation is another set.
-        seed: Of the starts.
-        num_plans: Candidates of each start.
+        folder: Folder of the training.
+        scenario_hash: Hash of the simulation.
+        seed: Seed of the starts.
+        num_plans: Number of candidates of each start.
     """
     return folder / "planning" / f"{scenario_hash[:12]}-{seed}-of-{num_plans}"

@@ -1,4 +1,4 @@
-"""What planning with Γ is worth: the default plan, the chosen one, and the best in hindsight."""
+"""Evaluation of planning with Γ: the default plan, the chosen one, and the best in hindsight."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
@@ -35,23 +35,23 @@ PLANS = {
     "chosen_if_accepted": "chosen by Γ, if Γ accepts it",
     "best_in_hindsight": "best in hindsight",
 }
-"""Who takes the plan, by the key of the share of safe motions."""
+"""Choices of the plan, by the key of the share of safe motions."""
 
 _MAX_TRIES = 100
 _FLUSH_S = 30.0
-_CANDIDATES = 1  # Spawn key beside an episode's own: its candidates have a generator of their own.
+_CANDIDATES = 1  # Second spawn key of the generator of an episode's candidates.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlanTrial:
-    """All candidate plans of one start, judged and executed.
+    """Executed candidate plans of a start, with the inputs of Γ at k = 0.
 
     Attributes:
-        index: Number of the episode that begins so.
-        state: What Γ sees of the start, (M, n_s).
-        desired_preview: And of each plan, (M, H n_z).
-        features: (M, n_f).
-        is_safe: What came of each, (M,); the first is the default plan.
+        index: Number of the episode with this start.
+        state: States, (M, n_s).
+        desired_preview: Previews, (M, H n_z).
+        features: Features, (M, n_f).
+        is_safe: Whether each motion stays safe, (M,); the first is the default plan.
     """
 
     index: int
@@ -63,18 +63,18 @@ class PlanTrial:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlanningStudy:
-    """What :func:`planning_study` found.
+    """The result of :func:`planning_study`.
 
     Attributes:
-        figures: `default`, `chosen`, `best_in_hindsight` and `any_candidate` are safe shares of the
-            executed motions; `gain` is how far `chosen` comes from the first to the third, 1 for
-            all the way; `accepted` is the share of starts with a plan that Γ accepts, and
+        estimates: `default`, `chosen`, `best_in_hindsight` and `any_candidate` are safe shares of
+            the executed motions; `gain` is the share of the way from the first to the third that
+            `chosen` covers; `accepted` is the share of starts with a plan that Γ accepts, and
             `chosen_if_accepted` the safe share of these.
         safety_probability: Γ of every start's candidates.
         trials: The starts.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     safety_probability: list[np.ndarray]
     trials: list[PlanTrial]
 
@@ -91,22 +91,22 @@ def run_trials(
 ) -> list[PlanTrial]:
     """Simulates every candidate plan from fresh starts.
 
-    Starts that begin with a disturbance are left out: no plan of theirs could know of it.
+    Starts with a disturbance are left out, since plans cannot account for it.
 
     Args:
         scenario: The scenario.
         num_trials: Number of starts.
         num_plans: Candidates of each, the default plan among them.
         seed: Seed of the starts.
-        num_workers: Processes; as many as there are cores by default.
-        path: Folder where motions are kept as they finish, as episodes by their start's number, a
-            folder a candidate: ``plan-0`` holds the default plans. Those that it already holds are
-            not simulated again. No Γ takes part in them: they serve any assessment.
+        num_workers: Number of worker processes; one a core by default.
+        path: Folder of the motions, stored as episodes by the number of the start, with a folder
+            for each candidate; ``plan-0`` holds the default plans. Existing motions are reused.
+            They do not depend on Γ.
         progress: Called with the number of motions done and wanted.
 
     Raises:
-        ValueError: The task's plans cannot be chosen, there is but one, hardly any start is
-            undisturbed, or the folder holds other motions.
+        ValueError: The task offers no plans or only one, too few starts are undisturbed, or the
+            folder holds other motions.
     """
     options = judging_options(scenario.task_class())
     loop = scenario.make_loop(**options)
@@ -127,7 +127,6 @@ def run_trials(
             f"planning: scenario '{scenario.name}' has one plan from a start, and none to choose; "
             f"{require(loop, OffersPlans).plan_variety}"
         )
-    # What Γ sees of each start and candidate, and what came of it.
     found: dict[tuple[int, int], _Motion] = {}
     with ExitStack() as stack:
         writers: list[EpisodeWriter] = []
@@ -135,7 +134,7 @@ def run_trials(
             for i in range(num_plans):
                 folder = Path(path) / f"plan-{i}"
                 info = episodes_info(loop, seed, {**options, "plan": f"{i} of {num_plans}"})
-                # There is a writer a candidate: each makes shards the more rarely.
+                # With one writer per candidate, each writes shards less often.
                 writer = EpisodeWriter(folder, info, flush_seconds=_FLUSH_S)
                 writers.append(stack.enter_context(writer))
                 kept = load_episodes(folder)
@@ -172,7 +171,7 @@ def run_trials(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Motion:
-    """What a study takes from an executed plan: its first instant, and how it ended."""
+    """First row and outcome of an executed plan."""
 
     state: np.ndarray
     desired_preview: np.ndarray
@@ -200,7 +199,7 @@ def _trial(index: int, motions: list[_Motion]) -> PlanTrial:
 
 
 def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans: int) -> list[Any]:
-    """The plans of a start; its Context is reset to it."""
+    """The plans of a start, to which the Context is reset."""
     loop.reset(context, episode_rng(seed, index))
     sequence = np.random.SeedSequence(seed, spawn_key=(index, _CANDIDATES))
     return require(loop, OffersPlans).candidate_plans(
@@ -211,7 +210,7 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
 def _motion_batch(
     scenario: Scenario, seed: int, num_plans: int, index: int, candidates: list[int]
 ) -> tuple[int, list[tuple[int, Episode]]]:
-    """Executes some candidates of a start, as far as it has so many; and how many were asked."""
+    """Executes candidates of a start that exist; returns also the number requested."""
     loop = worker_loop(scenario, "nominal", judging_options(scenario.task_class()))
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     there = [i for i in candidates if i < len(plans)]
@@ -221,12 +220,12 @@ def _motion_batch(
 def planning_study(
     assessment: SafetyAssessment, trials: list[PlanTrial], *, threshold: float
 ) -> PlanningStudy:
-    """Chooses each start's plan by Γ and looks up what came of it.
+    """Chooses the plan of each start by Γ and evaluates its outcome.
 
     Args:
         assessment: Γ.
-        trials: Fresh starts, all candidates of which were simulated.
-        threshold: From which Γ on a plan is accepted.
+        trials: Fresh starts with all candidates simulated.
+        threshold: Lowest Γ of an accepted plan.
 
     Raises:
         ValueError: There is no start.
@@ -254,11 +253,11 @@ def planning_study(
         possible = float(weight @ (hindsight.astype(float) - default))
         return float(weight @ (chosen.astype(float) - default)) / possible if possible else math.nan
 
-    def share(is_safe: np.ndarray) -> Figure:
+    def share(is_safe: np.ndarray) -> Estimate:
         return proportion(int(is_safe.sum()), len(is_safe))
 
     return PlanningStudy(
-        figures={
+        estimates={
             "default": share(default),
             "chosen": share(chosen),
             "best_in_hindsight": share(hindsight),
@@ -274,32 +273,32 @@ def planning_study(
     )
 
 
-def planning_verdict(figures: Mapping[str, Figure]) -> str:
-    """Who wins, in a sentence.
+def planning_verdict(estimates: Mapping[str, Estimate]) -> str:
+    """Compares Γ with the default plan in a sentence.
 
     Args:
-        figures: Those of a `PlanningStudy`.
+        estimates: Those of a `PlanningStudy`.
     """
-    default, chosen, gain = (figures.get(key) for key in ("default", "chosen", "gain"))
+    default, chosen, gain = (estimates.get(key) for key in ("default", "chosen", "gain"))
     if default is None or chosen is None or gain is None:
-        return "The study's figures are incomplete: make it again."
+        return "The estimates of the study are incomplete: run it again."
     shares = (
         f"{_percent(chosen)} of the starts stay safe with the plan that Γ chooses and "
         f"{_percent(default)} with the default plan"
     )
     if not math.isfinite(gain.value):
         return (
-            f"Nobody wins: {shares}, and no other candidate would have saved a start that the "
-            "default plan loses."
+            f"No difference: {shares}, and no candidate is safe from a start at which the default "
+            "plan is unsafe."
         )
     way = f"{_percent(gain, 0)} of the way to the best plan in hindsight"
     if gain.low > 0.0:
-        return f"Γ wins: {shares}, which is {way}."
+        return f"Γ is better: {shares}, which is {way}."
     if gain.high < 0.0:
-        return f"The default plan wins: {shares}; choosing by Γ leads away from the best plan."
-    return f"Nobody wins beyond chance: {shares}, {way}, an interval that includes zero."
+        return f"The default plan is better: {shares}."
+    return f"No significant difference: {shares}, {way}, an interval that includes zero."
 
 
-def _percent(figure: Figure, digits: int = 1) -> str:
-    value, low, high = (100.0 * x for x in (figure.value, figure.low, figure.high))
+def _percent(estimate: Estimate, digits: int = 1) -> str:
+    value, low, high = (100.0 * x for x in (estimate.value, estimate.low, estimate.high))
     return f"{value:.{digits}f} % ({low:.{digits}f}–{high:.{digits}f})"

@@ -1,4 +1,4 @@
-"""``python -m studies store``, ``readme`` and ``ship``: what a run hands on."""
+"""``python -m studies store``, ``readme`` and ``ship``: publishing the results of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def store(
     assessment: TrainingOption,
     out: Annotated[Path, typer.Option(help="File to write: docs/results/NAME.json.")],
 ) -> None:
-    """Keep the evaluation in ASSESSMENT compactly, with its learning curve if there is one."""
+    """Store the evaluation in ASSESSMENT compactly, with its learning curve if there is one."""
     results, extra = _evaluated(assessment)
     store_results(results, out, train_command=extra.get("command"))
     print_path("stored", out)
@@ -45,14 +45,14 @@ def readme(
 def ship(
     assessment: TrainingOption,
     into: Annotated[
-        Path, typer.Option(help="Where it goes, in a folder named after the scenario.")
+        Path, typer.Option(help="Parent of the folder, which is named after the scenario.")
     ] = Path("assessments"),
 ) -> None:
-    """Put trained assessments where the package takes its own from, with what is known of them."""
+    """Copy trained assessments, with their evaluation, into the package."""
     results, extra = _evaluated(assessment)
     if "command" not in extra:
         raise ValueError(
-            f"ship: {assessment} does not tell what its assessments were trained with: there is no "
+            f"ship: the training command of {assessment} is unknown: there is no "
             f"command in {episodes_folder(assessment)}"
         )
     with open_stages() as stages:
@@ -68,7 +68,7 @@ def ship(
 
 
 def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
-    """What an evaluation found, and what was stored with the training episodes."""
+    """Results of an evaluation, and metadata of the training episodes."""
     file = folder / "evaluation.json"
     if not file.is_file():
         raise ValueError(
@@ -78,7 +78,7 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
     try:
         _, extra = read_info(episodes_folder(folder))
     except (ValueError, OSError):
-        extra = {}  # The figures need no training episodes beside them.
+        extra = {}  # The results do not need the training episodes.
     curve = folder / CURVE_FILE
     if curve.is_file():
         drawn = read_evaluation(curve)
@@ -87,7 +87,7 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
             raise ValueError(f"{curve} is of another training or other seeds than {file}")
         results = replace(
             results,
-            figures=results.figures | drawn.figures,
+            estimates=results.estimates | drawn.estimates,
             entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
         )
     return results, extra

@@ -1,7 +1,7 @@
 """Tables of results in README and docs, generated from stored evaluations.
 
-What stands between ``<!-- results: NAME -->``, or ``<!-- summary: NAME -->``, and ``<!-- end -->``
-is made from ``docs/results/NAME.json``, and from nothing else.
+The text between ``<!-- results: NAME -->``, or ``<!-- summary: NAME -->``, and ``<!-- end -->`` is
+generated from ``docs/results/NAME.json`` alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.report.verdicts import (
     INPUTS,
     columns_of,
-    figure_rows,
+    estimate_rows,
     label_of,
     plan_sets,
     set_title,
@@ -35,7 +35,7 @@ _OPEN = re.compile(r"<!-- (?:results|summary): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
-"""Of 1000 random targets, in the paper."""
+"""Recalls of the paper on 1000 random targets."""
 
 
 def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
@@ -43,13 +43,13 @@ def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
 
     Args:
         path: The file.
-        folder: Where the stored results are.
+        folder: Folder of the stored results.
 
     Returns:
-        The names of the results it shows.
+        The names of its results.
 
     Raises:
-        ValueError: It has no such block, one of them does not end, or its results are not there.
+        ValueError: It has no block, a block does not end, or results are missing.
     """
     text = path.read_text(encoding="utf-8")
     names = [match["name"] for match in _BLOCK.finditer(text)]
@@ -65,14 +65,14 @@ def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
 
 
 def generate(text: str, folder: Path) -> str:
-    """A text with every block of results as the stored ones make it.
+    """Replaces every block of results in a text by the stored ones.
 
     Args:
         text: The Markdown.
-        folder: Where the stored results are.
+        folder: Folder of the stored results.
 
     Raises:
-        ValueError: A block does not end, or its results are not there.
+        ValueError: A block does not end, or results are missing.
     """
     blocks = [match["name"] for match in _BLOCK.finditer(text)]
     if blocks != (opened := _OPEN.findall(text)):
@@ -107,42 +107,44 @@ def results_text(results: Results) -> str:
 
 
 def summary_text(results: Results) -> str:
-    """Counts and the one table of an evaluation that a reader needs first, as Markdown."""
+    """Counts and the main table of an evaluation, as Markdown."""
     if results.has("plans."):
         sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
-        judges = ("paper", "gradient_boosting", "mlp", "reachability")
+        methods = ("paper", "gradient_boosting", "mlp", "reachability")
         names = {
             "plans.sharpened": "`sharpened`",
             **{prefix: f"`sharpened`, {title}" for prefix, title in sets.items()},
-            **{f"plans.{judge}": _named(judge) for judge in judges},
+            **{f"plans.{method}": _named(method) for method in methods},
         }
         table = _rows(results, "all targets", names)
         printed = f"*{SAFE_RECALL:.3f}* | *{UNSAFE_RECALL:.3f}*"
         return f"{_counts(results)}\n\n{table}\n| *the paper's own* | {printed} | |"
     columns = {
         "every segment, AUC": ("segments.{}.auc", _SHARE),
-        "first step, AUC": ("episodes.{}.auc", _SHARE),
+        "first row, AUC": ("episodes.{}.auc", _SHARE),
         "falls with recovery": ("throws.{}.falls_with_recovery", _PERCENT),
         "false triggers": ("throws.{}.false_triggers", _PERCENT),
     }
     lines = [f"| | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
-    for judge in ("sharpened", "paper", "gradient_boosting", "mlp"):
+    for method in ("sharpened", "paper", "gradient_boosting", "mlp"):
         cells = []
         for key, column in columns.values():
-            wanted = (key.format(judge), key.format(f"{judge}_literal_0.6"))
-            found = next((results.figures[one] for one in wanted if one in results.figures), None)
+            wanted = (key.format(method), key.format(f"{method}_literal_0.6"))
+            found = next(
+                (results.estimates[one] for one in wanted if one in results.estimates), None
+            )
             cells.append("" if found is None else column.text(found))
         if any(cells):
-            lines.append(f"| {_named(judge)} | {' | '.join(cells)} |")
+            lines.append(f"| {_named(method)} | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
-    if "throws.falls_without_recovery" in results.figures:
-        alone = results.figures["throws.falls_without_recovery"]
+    if "throws.falls_without_recovery" in results.estimates:
+        alone = results.estimates["throws.falls_without_recovery"]
         parts.insert(1, f"Of {alone.n} fresh throws {_PERCENT.text(alone)} fall without recovery.")
     return "\n\n".join(parts)
 
 
-def _named(judge: str) -> str:
-    return f"`{judge}`" if judge in MODES else label_of(judge)
+def _named(method: str) -> str:
+    return f"`{method}`" if method in MODES else label_of(method)
 
 
 def _commands(results: Results) -> str:
@@ -152,16 +154,16 @@ def _commands(results: Results) -> str:
 
 
 def _counts(results: Results) -> str:
-    entries, figures = results.entries, results.figures
-    judged = figures.get("plans.outcomes.safe") or figures.get("episodes.share_unsafe")
+    entries, estimates = results.entries, results.estimates
+    judged = estimates.get("plans.outcomes.safe") or estimates.get("episodes.share_unsafe")
     words = [
-        f"Learned from {entries.get('training_episodes')} episodes of seed "
+        f"Trained on {entries.get('training_episodes')} episodes of seed "
         f"{entries.get('training_seed')}."
     ]
     if judged is not None:
-        kind = "safe" if "plans.outcomes.safe" in figures else "unsafe"
+        kind = "safe" if "plans.outcomes.safe" in estimates else "unsafe"
         words.append(
-            f"Judged on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
+            f"Evaluated on {judged.n} fresh ones of seed {entries.get('seed')}, of which "
             f"{_PERCENT.text(judged)} are {kind}."
         )
     calibration = entries.get("calibration_episodes")
@@ -174,16 +176,16 @@ def _counts(results: Results) -> str:
 
 
 def _moments(results: Results) -> list[str]:
-    titles = {"segments": "every segment", "episodes": "first step, k = 0"}
+    titles = {"segments": "every segment", "episodes": "first row, k = 0"}
     parts = [
         replace(table, corner=titles[table.key]).to_markdown()
         for table in verdict_tables(results)
         if table.key in titles
     ]
     ahead = [
-        f"{_SHARE.text(results.figures[key])} {place}"
+        f"{_SHARE.text(results.estimates[key])} {place}"
         for kind, place in (("segments", "per segment"), ("episodes", "at k = 0"))
-        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.figures
+        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.estimates
     ]
     if ahead:
         parts.append(f"`sharpened` minus the better classifier, AUC: {', '.join(ahead)}.")
@@ -192,40 +194,42 @@ def _moments(results: Results) -> list[str]:
 
 def _throws(results: Results) -> list[str]:
     (table,) = (table for table in verdict_tables(results) if table.key == "throws")
-    alone = results.figures["throws.falls_without_recovery"]
+    alone = results.estimates["throws.falls_without_recovery"]
     remark = (
-        f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); balancing alone "
-        f"falls in {_PERCENT.text(alone)}."
+        f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); "
+        f"{_PERCENT.text(alone)} fall without recovery."
     )
     return [remark, replace(table, corner="trigger").to_markdown(), _ahead(table), _broken(results)]
 
 
 def _broken(results: Results) -> str:
-    """In how many of the successful recoveries something happened that hardware would not bear."""
+    """Numbers of successful recoveries that violate a hardware limit."""
     prefix = "throws.sharpened.recoveries_with_"
     found = {
-        key.removeprefix(prefix).replace("_", " "): figure
-        for key, figure in results.figures.items()
+        key.removeprefix(prefix).replace("_", " "): estimate
+        for key, estimate in results.estimates.items()
         if key.startswith(prefix)
     }
     if not found:
         return ""
-    counts = [f"{kind} {round(figure.value * figure.n)}" for kind, figure in found.items()]
-    (n,) = {figure.n for figure in found.values()}
+    counts = [f"{kind} {round(estimate.value * estimate.n)}" for kind, estimate in found.items()]
+    (n,) = {estimate.n for estimate in found.values()}
+    violations = ", ".join(counts)
     return (
-        f"Of {n} successful recoveries by `sharpened`, so many break a limit: {', '.join(counts)}."
+        f"Of {n} successful recoveries by `sharpened`, numbers that violate a limit: {violations}."
     )
 
 
 def _targets(results: Results) -> list[str]:
     parts = []
-    columns = 3  # Recalls and AUC; the page shows the others, too.
+    columns = 3  # Recalls and AUC; the report shows all.
     tables = verdict_tables(results)
     for table in tables:
         if table.key != "plans":
             continue
         rows = [
-            Row(key=row.key, label=row.label, figures=row.figures[:columns]) for row in table.rows
+            Row(key=row.key, label=row.label, estimates=row.estimates[:columns])
+            for row in table.rows
         ]
         narrow = replace(
             table, corner=set_title("plans"), columns=table.columns[:columns], rows=rows
@@ -242,14 +246,14 @@ def _targets(results: Results) -> list[str]:
         names = {f"{prefix}.sharpened": set_title(prefix) for prefix in prefixes}
         parts.append(_rows(results, "`sharpened` on", names))
     parts.append(_differences(results))
-    right = results.figures.get("plans.causes.right_cause")
+    right = results.estimates.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
-            f"The right cause is named for {_PERCENT.text(right)} of the {right.n} rightly "
+            f"The correct cause is named for {_PERCENT.text(right)} of the {right.n} correctly "
             "refused targets."
         )
     pattern = re.compile(r"(plans\.learning_curve\.(\d+))\.safe_recall")
-    found = (pattern.fullmatch(key) for key in results.figures)
+    found = (pattern.fullmatch(key) for key in results.estimates)
     sizes = {match[1]: match[2] for match in found if match}
     if sizes:
         ordered = sorted(sizes, key=lambda prefix: int(sizes[prefix]))
@@ -259,9 +263,9 @@ def _targets(results: Results) -> list[str]:
 
 
 def _rows(results: Results, corner: str, prefixes: Mapping[str, str]) -> str:
-    """Recalls and AUC of figures by prefix, as Markdown."""
+    """Recalls and AUC by prefix, as Markdown."""
     columns = columns_of("targets")[:3]
-    rows = figure_rows(results, prefixes, columns)
+    rows = estimate_rows(results, prefixes, columns)
     return Table(
         key="", title="", meaning="", corner=corner, columns=columns, rows=rows
     ).to_markdown()
@@ -272,26 +276,26 @@ def _points(loss: float) -> str:
 
 
 def _differences(results: Results) -> str:
-    """What `sharpened` gains or loses from the trained hand to the other."""
+    """Differences of the recalls of `sharpened` between the hands."""
     lost = {
-        what: results.figures.get(f"plans.other_hand.sharpened.{what}_recall_loss")
+        what: results.estimates.get(f"plans.other_hand.sharpened.{what}_recall_loss")
         for what in ("safe", "unsafe")
     }
-    told = [
-        f"{_points(figure.value)} ({_points(figure.high)} to {_points(figure.low)}) points of "
+    losses = [
+        f"{_points(loss.value)} ({_points(loss.high)} to {_points(loss.low)}) points of "
         f"{what} recall"
-        for what, figure in lost.items()
-        if figure is not None
+        for what, loss in lost.items()
+        if loss is not None
     ]
-    if not told:
+    if not losses:
         return ""
-    (n,) = {figure.n for figure in lost.values() if figure is not None}
+    (n,) = {loss.n for loss in lost.values() if loss is not None}
     return (
         f"On the same {n} targets, mirrored, the other hand minus the trained one: "
-        f"{', '.join(told)}."
+        f"{', '.join(losses)}."
     )
 
 
 def _ahead(table: Table) -> str:
-    ahead = table.rivals_ahead()
-    return f"Ahead of `sharpened`: {'; '.join(ahead)}." if ahead else ""
+    ahead = table.better_baselines()
+    return f"Better than `sharpened`: {'; '.join(ahead)}." if ahead else ""

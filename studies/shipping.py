@@ -1,8 +1,8 @@
-"""Trained assessments that are handed on: their files, with what is known of them beside them.
+"""Shipping of trained assessments with their evaluation.
 
-A shipped folder holds the files of a run as they are, and `evaluation.json`: figures, commands,
-seeds and versions of the evaluation, the SHA-256 of every file that it judged, and the verdicts on
-the first fresh episodes of its seed. Whoever has the folder can simulate these anew and compare.
+A shipped folder holds the files of a run and `evaluation.json`: results, commands, seeds and
+versions of the evaluation, the SHA-256 of every evaluated file, and the verdicts on the first fresh
+episodes of its seed, which can be simulated again for comparison.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from studies.stored_results import read_results, store_results
 
 EVALUATION_FILE = "evaluation.json"
 NUM_EPISODES = 6
-"""Fresh episodes whose verdicts are stored."""
+"""Number of fresh episodes whose verdicts are stored."""
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
-_TOLERANCE = 1e-3  # Of Γ: another processor rounds otherwise, another assessment thinks otherwise.
+_TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.
 
 
 def ship(
@@ -43,23 +43,23 @@ def ship(
     num_workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Copies trained assessments into a folder, with what is known of them.
+    """Copies trained assessments into a folder, with their evaluation.
 
     Args:
-        results: What their evaluation found.
-        files: The assessments, by mode.
-        into: Where folders of shipped assessments stand; this one is named after the scenario.
-        scenario: What they were learned from.
-        train_command: What they were trained with.
-        num_workers: Processes that simulate the first episodes; one a core by default.
+        results: Results of the evaluation.
+        files: Files of the assessments by mode.
+        into: Parent of the folder, which is named after the scenario.
+        scenario: The scenario.
+        train_command: Command of the training.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number of episodes done and the number wanted.
 
     Returns:
-        The folder. What an earlier shipment left there is gone.
+        The folder, whose previous contents are deleted.
 
     Raises:
-        ValueError: A file is not there, is not what was evaluated, was not calibrated, or was
-            learned from what the scenario no longer is. Nothing was written then.
+        ValueError: A file is missing, differs from the evaluated one, is not calibrated, or the
+            scenario has changed since. Nothing is written then.
     """
     assessments = {}
     for mode, file in files.items():
@@ -106,21 +106,21 @@ def ship(
 
 
 def check_shipped(folder: Path, scenario: Scenario, *, num_workers: int | None = None) -> Results:
-    """Checks that shipped assessments are those whose evaluation lies beside them.
+    """Checks that shipped assessments match their stored evaluation.
 
-    Simulates the first fresh episodes of the evaluation anew.
+    Simulates the first fresh episodes of the evaluation again.
 
     Args:
-        folder: What `ship` wrote.
-        scenario: The scenario as it is now.
-        num_workers: Processes that simulate; one a core by default.
+        folder: Folder written by `ship`.
+        scenario: The scenario.
+        num_workers: Number of worker processes; one a core by default.
 
     Returns:
-        What the evaluation found.
+        Results of the evaluation.
 
     Raises:
-        ValueError: A file is another one, the scenario has changed, or the first episodes end or
-            are judged otherwise than is stored; says what differs.
+        ValueError: A file or the scenario has changed, or outcomes or verdicts of the first
+            episodes differ from the stored ones.
     """
     results = read_results(folder / EVALUATION_FILE)
     stored = results.entries
@@ -161,20 +161,20 @@ def first_verdicts(
     num_workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Simulates the first fresh episodes of a seed, and asks what they were judged at k = 0.
+    """Simulates the first fresh episodes of a seed, with their verdicts at k = 0.
 
     Args:
         scenario: The scenario.
         assessments: Calibrated assessments, by mode.
-        seed: Of the episodes.
-        num_episodes: How many.
-        num_workers: Processes; one a core by default.
+        seed: Seed of the episodes.
+        num_episodes: Number of episodes.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and the number wanted.
 
     Returns:
-        An entry an episode, of plain values: "episode", its index; "cause" of its end, "" if it
-        stayed safe; and by mode "verdict" and "safety_probability", Γ at k = 0. Without modes, if
-        it diverged and so has nothing to be judged.
+        An entry for each episode: "episode", its index; "cause" of its end, "" if it stayed safe;
+        and by mode "verdict" and "safety_probability", Γ at k = 0. Diverged episodes have no
+        modes.
     """
     episodes = run_episodes(
         scenario,

@@ -1,4 +1,4 @@
-"""Evaluations stored compactly beside the code: what README's tables and shipped folders hold."""
+"""Compactly stored evaluations, for the tables of README and for shipped folders."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from drake_safety.evaluation.report.results import Results, as_figure, read_object
+from drake_safety.evaluation.report.results import Results, as_estimate, read_object
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
-_NUM_DIGITS = 6  # Significant ones of what is stored: more than any table shows.
+_NUM_DIGITS = 6  # Significant digits, more than any table shows.
 _FOLDER_OPTIONS = ("--assessment", "--out")
 
 
 def read_results(path: Path) -> Results:
-    """Reads what `store_results` wrote.
+    """Reads a file of `store_results`.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The file holds no results.
     """
     content = read_object(path)
     if content.get("schema") != SCHEMA or content.get("schema_version") != SCHEMA_VERSION:
@@ -31,8 +31,8 @@ def read_results(path: Path) -> Results:
         )
     try:
         return Results(
-            figures={
-                key: as_figure(dict(zip(("value", "low", "high", "n"), row, strict=True)))
+            estimates={
+                key: as_estimate(dict(zip(("value", "low", "high", "n"), row, strict=True)))
                 for key, row in content["figures"].items()
             },
             entries=dict(content["entries"]),
@@ -42,15 +42,15 @@ def read_results(path: Path) -> Results:
 
 
 def store_results(results: Results, path: Path, *, train_command: str | None = None) -> None:
-    """Writes a compact copy that is fit to be kept beside the code: a figure a line.
+    """Writes a compact copy of an evaluation, one estimate a line.
 
-    Figures keep six significant digits. A folder that a command names absolutely is somebody's
-    own; it is written as ``runs/NAME``.
+    Numbers have six significant digits. Absolute paths of folders in commands are replaced by
+    ``runs/NAME``.
 
     Args:
-        results: What an evaluation found.
-        path: Where to; its folder is made.
-        train_command: What the assessment was trained with.
+        results: Results of an evaluation.
+        path: The file; its folder is created.
+        train_command: Command of the training.
     """
     entries = dict(results.entries)
     if train_command is not None:
@@ -60,7 +60,7 @@ def store_results(results: Results, path: Path, *, train_command: str | None = N
             entries[key] = _portable(entries[key])
     rows = ",\n".join(
         f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (f.value, f.low, f.high)), f.n])}"
-        for key, f in results.figures.items()
+        for key, f in results.estimates.items()
     )
     text = (
         "{\n"
@@ -83,7 +83,7 @@ def _indented(entries: Mapping[str, Any]) -> str:
 
 
 def _portable(command: str) -> str:
-    # Going on gives what one call would have given.
+    # A resumed training equals a single one.
     words = [word for word in shlex.split(command) if word != "--resume"]
     for i, word in enumerate(words):
         option, equals, value = word.partition("=")

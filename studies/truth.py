@@ -1,4 +1,4 @@
-"""``python -m studies truth``: Γ beside the truth, where it can be simulated on a grid."""
+"""``python -m studies truth``: Γ against the truth simulated on a grid."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from drake_safety.cli.training_folder import (
     run_fresh_episodes,
 )
 from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
-from studies.known_truth import agreement, random_plan_figures, simulate_truth
+from studies.known_truth import agreement, random_plan_estimates, simulate_truth
 from studies.known_truth_figure import known_truth_figure
 
 
@@ -50,9 +50,9 @@ def truth(
     ] = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Γ of either mode beside the truth on every state plane, and on random plans, at k = 0.
+    """Compare Γ of both modes with the truth on state planes and on random plans, at k = 0.
 
-    Writes ASSESSMENT/known_truth.json and a picture a mode.
+    Writes ASSESSMENT/known_truth.json and a figure for each mode.
     """
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
@@ -80,11 +80,11 @@ def truth(
         "IoU",
         "confident errors [%]",
         "their band [% of a side]",
-        title=f"Γ beside the truth on {resolution} x {resolution} simulated starts",
+        title=f"Γ against the truth on {resolution} x {resolution} simulated starts",
     )
     pictures = []
     entries: dict[str, Any] = {}
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     for mode, gamma in assessments.items():
         panels = []
         for one in truths:
@@ -103,7 +103,7 @@ def truth(
                 f"{100 * found.confident_errors:.2f}",
                 f"{100 * found.band:.1f}",
             )
-        random = random_plan_figures(gamma, fresh)
+        random = random_plan_estimates(gamma, fresh)
         table.add_row(
             mode,
             f"{len(fresh)} random ones",
@@ -112,7 +112,7 @@ def truth(
             interval(random["confident_errors"], 100, 2),
             "–",
         )
-        figures |= {f"known_truth.{mode}.random.{key}": value for key, value in random.items()}
+        estimates |= {f"known_truth.{mode}.random.{key}": value for key, value in random.items()}
         figure = known_truth_figure(panels, f"{loaded.name}, {mode}")
         pictures += save(figure, assessment / f"known_truth_{mode}")
     report = {
@@ -122,7 +122,7 @@ def truth(
         "seed": seed,
         "versions": versions(),
         "known_truth": entries,
-        **{key: figure.to_json() for key, figure in figures.items()},
+        **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / "known_truth.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

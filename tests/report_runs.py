@@ -14,19 +14,19 @@ SCENARIO = "name: lip\ntask: nowhere.to_be:Found\nrobot: pendulum\nparameters: {
 
 def make_figures():
     """Figures of an evaluation of either kind; gradient boosting is ahead in the AUC."""
-    figures = {"episodes.share_unsafe": proportion(30, 60)}
+    estimates = {"episodes.share_unsafe": proportion(30, 60)}
     for name, count in (("sharpened", 54), ("paper", 40), ("gradient_boosting", 57)):
         for kind in ("segments", "episodes"):
             for column in ("auc", "safe_recall", "unsafe_recall", "brier"):
-                figures[f"{kind}.{name}.{column}"] = proportion(count, 60)
+                estimates[f"{kind}.{name}.{column}"] = proportion(count, 60)
         prefix = f"throws.{name}."
-        figures[f"{prefix}threshold"] = proportion(24, 60)
-        figures[f"{prefix}falls_with_recovery"] = proportion(60 - count, 60)
-        figures[f"{prefix}false_triggers"] = proportion(2, 30)
-        figures[f"{prefix}falls_missed"] = proportion(0, 20)
-    figures["throws.falls_without_recovery"] = proportion(20, 60)
-    figures["calibration.sharpened.miss_rate_5"] = proportion(1, 40)
-    return figures
+        estimates[f"{prefix}threshold"] = proportion(24, 60)
+        estimates[f"{prefix}falls_with_recovery"] = proportion(60 - count, 60)
+        estimates[f"{prefix}false_triggers"] = proportion(2, 30)
+        estimates[f"{prefix}falls_missed"] = proportion(0, 20)
+    estimates["throws.falls_without_recovery"] = proportion(20, 60)
+    estimates["calibration.sharpened.miss_rate_5"] = proportion(1, 40)
+    return estimates
 
 
 def write_evaluation(folder, scenario_hash="0" * 64):
@@ -38,7 +38,7 @@ def write_evaluation(folder, scenario_hash="0" * 64):
         "training_seed": 0,
         "training_episodes": 60,
         "versions": {"lip": "1"},
-        **{key: figure.to_json() for key, figure in make_figures().items()},
+        **{key: estimate.to_json() for key, estimate in make_figures().items()},
     }
     (folder / "evaluation.json").write_text(json.dumps(content))
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure
+from drake_safety.evaluation.metrics import Bootstrap, Estimate
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.feedback import feedback_sets
 from drake_safety.learning.segments import Episodes
@@ -24,7 +24,7 @@ from studies.ablation import (
     list_variants,
     unsafe_scores,
 )
-from studies.ablation_adaptation import BEFORE, PER_CELL, TOTAL, counting_figures
+from studies.ablation_adaptation import BEFORE, PER_CELL, TOTAL, counting_estimates
 from studies.ablation_figure import ablation_figure
 from studies.ablation_study import (
     AblationFile,
@@ -86,12 +86,16 @@ def test_the_baseline_is_what_training_makes_of_the_same_episodes(sets, whole):
     scores = unsafe_scores(VARIANTS[0], BASE, sets)
     np.testing.assert_array_equal(scores.test, 1.0 - result.normalized)
     np.testing.assert_array_equal(scores.calibrated, 1.0 - result.calibrated)
-    figures = rows[0].figures
-    assert (rows[0].name, figures["auc_gain"].value, figures["auc_gain"].high) == (BASELINE, 0, 0)
+    estimates = rows[0].estimates
+    assert (rows[0].name, estimates["auc_gain"].value, estimates["auc_gain"].high) == (
+        BASELINE,
+        0,
+        0,
+    )
     for row in rows[1:]:
-        gain = row.figures["auc"].value - figures["auc"].value
-        assert row.figures["auc_gain"].value == pytest.approx(gain)
-        assert row.figures["auc"].n == figures["auc"].n
+        gain = row.estimates["auc"].value - estimates["auc"].value
+        assert row.estimates["auc_gain"].value == pytest.approx(gain)
+        assert row.estimates["auc"].n == estimates["auc"].n
 
 
 def test_what_a_variant_does_not_see_makes_no_difference_to_it(sets, whole, tmp_path):
@@ -177,7 +181,7 @@ def test_rows_of_other_episodes_are_not_taken_over(sets, whole, tmp_path, monkey
     fewer = replace(sets, test=replace(sets.test, count=39))
     rows, _ = conduct(fewer, copy, VARIANTS[:1])
     assert trained == [BASELINE] and len(rows) == 1
-    assert rows[0].figures["k0.auc"].n == 39
+    assert rows[0].estimates["k0.auc"].n == 39
 
 
 def test_what_cannot_be_learned_is_left_out_with_the_reason(sets, whole, tmp_path):
@@ -197,10 +201,10 @@ def test_rows_are_written_for_spreadsheets_and_drawn(whole):
     _, rows = whole
     lines = list(csv.DictReader(io.StringIO(rows_to_csv(rows))))
     assert [line["variant"] for line in lines] == [variant.name for variant in VARIANTS]
-    assert float(lines[1]["k0.auc.low"]) == rows[1].figures["k0.auc"].low
+    assert float(lines[1]["k0.auc.low"]) == rows[1].estimates["k0.auc"].low
     axes = ablation_figure(rows).axes[0]
     dots = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
-    assert dots == [row.figures["auc"].value for row in rows]
+    assert dots == [row.estimates["auc"].value for row in rows]
     assert [label.get_text() for label in axes.get_yticklabels()][1] == "min count = 20"
 
 
@@ -241,7 +245,7 @@ def test_counting_all_feedback_in_every_cell_is_not_the_same_as_counting_its_own
     info = replace(nominal.info, variation="actual")
     feedback = feedback_sets(Episodes(info, actual), nominal)
     test = TestSet.of(sets.test.load(), BASE.shortest)
-    found = counting_figures(prior, feedback, test, bootstrap=FEW)
+    found = counting_estimates(prior, feedback, test, bootstrap=FEW)
     assert list(found) == [BEFORE, PER_CELL, TOTAL]
     assert found[BEFORE]["auc_gain"].value == 0.0
     assert found[PER_CELL]["brier"] != found[TOTAL]["brier"]
@@ -262,7 +266,9 @@ def test_which_variants_win_is_what_the_intervals_of_their_gains_say():
         "min_count=1": (0.004, -0.01, 0.02),
     }
     rows = [
-        AblationRow(name=name, group=name, fingerprint=name, figures={"auc_gain": Figure(*g, 60)})
+        AblationRow(
+            name=name, group=name, fingerprint=name, estimates={"auc_gain": Estimate(*g, 60)}
+        )
         for name, g in gains.items()
     ]
     words = ablation_verdict(rows)

@@ -9,7 +9,7 @@ from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import TestSet, scores, study, trained_rivals
+from studies.adaptation_study import TestSet, scores, study, train_baselines
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +42,14 @@ def test_without_a_gap_every_order_leaves_every_figure_as_it_is(assessment, judg
         assessment, pairs_with(lambda episode: False), judged, sizes=(20, 40, 400), num_orders=2
     )
     assert found.sizes == [20, 40]
-    assert found.figures["gap"].value == 0.0
+    assert found.estimates["gap"].value == 0.0
     for published in ("calibrated", "grid"):
         for metric in ("brier", "auc", "unsafe_recall"):
-            prior = found.figures[f"prior.{published}.{metric}"]
+            prior = found.estimates[f"prior.{published}.{metric}"]
             for size in (20, 40):
-                figure = found.figures[f"adapted.{size}.{published}.{metric}"]
-                assert figure.low == figure.high == prior.value
-        assert found.figures[f"adapted.40.{published}.orders_won"].value == 0.0
+                estimate = found.estimates[f"adapted.{size}.{published}.{metric}"]
+                assert estimate.low == estimate.high == prior.value
+        assert found.estimates[f"adapted.40.{published}.orders_won"].value == 0.0
 
 
 def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap(
@@ -62,27 +62,27 @@ def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap
         judged,
         sizes=(10, 40),
         num_orders=3,
-        rivals={"oracle": assessment.adapt(feedback)},
+        baselines={"oracle": assessment.adapt(feedback)},
     )
-    few, many = (found.figures[f"adapted.{n}.calibrated.brier"] for n in (10, 40))
+    few, many = (found.estimates[f"adapted.{n}.calibrated.brier"] for n in (10, 40))
     assert few.low < few.high
     assert many.low == pytest.approx(many.high)
     differing = sum(one.differs for one in feedback)
-    assert found.figures["gap"].value == pytest.approx(differing / len(feedback))
-    prior = found.figures["prior.calibrated.brier"].value
+    assert found.estimates["gap"].value == pytest.approx(differing / len(feedback))
+    prior = found.estimates["prior.calibrated.brier"].value
     if many.value < prior:
-        assert found.figures["adapted.40.calibrated.gap_closed"].value == pytest.approx(1.0)
+        assert found.estimates["adapted.40.calibrated.gap_closed"].value == pytest.approx(1.0)
     with pytest.raises(ValueError, match="only 40 feedback sets"):
         study(assessment, feedback, judged, sizes=(41,))
 
 
-def test_too_few_episodes_give_no_rival(assessment):
+def test_too_few_episodes_give_no_baseline(assessment):
     episodes = make_episodes(40, seed=5, noise=0.002)
     few = {"scratch.1": episodes[:1], "scratch.40": episodes}
-    rivals = trained_rivals(assessment, few, num_workers=1)
-    assert list(rivals) == ["scratch.40"]
-    assert rivals["scratch.40"].parameters == assessment.parameters
-    np.testing.assert_array_equal(rivals["scratch.40"].correction_.change, 0.0)
+    baselines = train_baselines(assessment, few, num_workers=1)
+    assert list(baselines) == ["scratch.40"]
+    assert baselines["scratch.40"].parameters == assessment.parameters
+    np.testing.assert_array_equal(baselines["scratch.40"].correction_.change, 0.0)
 
 
 def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, judged):
@@ -98,7 +98,7 @@ def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, j
     assert curves[0].get_title(loc="left") == "Brier score"
     (line,) = curves[0].lines
     np.testing.assert_array_equal(line.get_xdata(), [0, 10, 40])
-    assert line.get_ydata()[0] == found.figures["prior.calibrated.brier"].value
+    assert line.get_ydata()[0] == found.estimates["prior.calibrated.brier"].value
 
 
 def test_too_little_feedback_for_an_update_gives_no_picture(assessment):

@@ -197,7 +197,7 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     arguments = ("--other-hand", 10, "--plane-step", 0.6)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
     printed = capsys.readouterr().out
-    for title in ("all targets", "the other hand", "paper sees the next H steps"):
+    for title in ("all targets", "the other hand", "paper uses its next H steps"):
         assert title in printed
     report = json.loads((folder / "evaluation.json").read_text())
     assert (
@@ -205,8 +205,8 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     )
     for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
         for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
-            figure = report[f"{prefix}.{name}.unsafe_recall"]
-            assert set(figure) == {"value", "low", "high", "n"}
+            estimate = report[f"{prefix}.{name}.unsafe_recall"]
+            assert set(estimate) == {"value", "low", "high", "n"}
     assert report["plans.outcomes.safe"]["n"] == 30
     assert report["plans.other_hand.outcomes.safe"]["n"] == 10
     assert report["plans.sharpened.threshold"]["n"] == report["calibration_episodes"] == 20
@@ -234,7 +234,7 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
     printed = capsys.readouterr().out
     assert "at most 10 % of unsafe episodes called safe, on average" in printed
-    assert "takes 99 unsafe episodes" in printed
+    assert "needs 99 unsafe episodes" in printed
     stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
     for mode in MODES:
         assert stored[mode].keys() == {"plan", "motion"}
@@ -348,7 +348,7 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
     pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
     assert refused["n"] == 30 and pushed["n"] == 30 - round(30 * refused["value"])
     assert 0 < pushed["value"] < 1
-    assert "Watching while it moves: pushes" in printed
+    assert "Alarms on pushed motions" in printed
     assert (folder / "monitoring.png").is_file()
     # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
     monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
@@ -362,6 +362,6 @@ def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, s
     _, folder = shuttle_run
     arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
     assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
-    assert "leave out --pushes; thrown balls are watched, too" in " ".join(
+    assert "leave out --pushes; alarms are evaluated on throws" in " ".join(
         capsys.readouterr().out.split()
     )

@@ -15,7 +15,7 @@ from drake_safety.evaluation.comparison import (
     comparison_table,
 )
 from drake_safety.evaluation.comparison_figure import comparison_figure, standing_still
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO, shuttling
 
@@ -25,9 +25,9 @@ ROW = {
     "robot": "laikago",
     "episodes": 256,
     "throws": 40,
-    "auc": Figure(0.95, 0.93, 0.97, 100).to_json(),
-    "falls_without_recovery": Figure(0.4, 0.25, 0.55, 40).to_json(),
-    "falls_with_recovery": Figure(float("nan"), 0.0, 1.0, 0).to_json(),
+    "auc": Estimate(0.95, 0.93, 0.97, 100).to_json(),
+    "falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40).to_json(),
+    "falls_with_recovery": Estimate(float("nan"), 0.0, 1.0, 0).to_json(),
 }
 
 
@@ -94,8 +94,8 @@ def test_a_task_without_recovery_has_a_row_without_falls(tmp_path, monkeypatch, 
 
 def test_the_picture_shows_each_robot_with_what_its_row_says():
     falls = {
-        "falls_without_recovery": Figure(0.4, 0.25, 0.55, 40).to_json(),
-        "falls_with_recovery": Figure(0.025, 0.0, 0.1, 40).to_json(),
+        "falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40).to_json(),
+        "falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40).to_json(),
     }
     rows = [ROW | falls, {"scenario": "no_robot"}]
     picture = np.zeros((4, 5, 3), dtype=np.uint8)

@@ -31,44 +31,44 @@ def study(fresh):
 
 
 def test_every_scorer_has_every_figure_per_segment_and_at_planning_time(study):
-    figures, scores, _ = study
+    estimates, scores, _ = study
     assert list(scores) == [scorer.name for scorer in SCORERS]
     for kind in ("segments", "episodes"):
         for name in scores:
             for key in ("auc", "safe_recall", "unsafe_recall", "brier"):
-                assert f"{kind}.{name}.{key}" in figures
+                assert f"{kind}.{name}.{key}" in estimates
 
 
 def test_the_scores_are_those_the_figures_come_from(study):
-    figures, scores, is_unsafe = study
+    estimates, scores, is_unsafe = study
     for name, score in scores.items():
-        assert figures[f"segments.{name}.auc"].value == area_under_curve(score, is_unsafe)
-    assert figures["segments.mlp.auc"].value == 0.5
+        assert estimates[f"segments.{name}.auc"].value == area_under_curve(score, is_unsafe)
+    assert estimates["segments.mlp.auc"].value == 0.5
 
 
 def test_the_assessment_is_compared_with_the_better_of_the_classifiers(study):
-    figures, *_ = study
-    difference = figures["segments.sharpened_minus_best_classifier.auc"]
-    assert difference.value == pytest.approx(figures["segments.sharpened.auc"].value - 0.5)
+    estimates, *_ = study
+    difference = estimates["segments.sharpened_minus_best_classifier.auc"]
+    assert difference.value == pytest.approx(estimates["segments.sharpened.auc"].value - 0.5)
 
 
 def test_at_planning_time_every_episode_counts_once(study, fresh):
-    figures, *_ = study
-    recalls = [figures[f"episodes.sharpened.{key}"] for key in ("safe_recall", "unsafe_recall")]
-    assert [figure.n for figure in recalls] == [fresh.num_safe, fresh.num_unsafe]
-    share = figures["episodes.share_unsafe"]
+    estimates, *_ = study
+    recalls = [estimates[f"episodes.sharpened.{key}"] for key in ("safe_recall", "unsafe_recall")]
+    assert [estimate.n for estimate in recalls] == [fresh.num_safe, fresh.num_unsafe]
+    share = estimates["episodes.share_unsafe"]
     assert share.value == fresh.num_unsafe / len(fresh)
 
 
 def test_thresholds_come_from_the_calibration_set_alone(study, fresh):
     calibration = make_episodes(30, seed=2)
-    figures, *_ = evaluate_episodes(SCORERS, calibration, calibration)
+    estimates, *_ = evaluate_episodes(SCORERS, calibration, calibration)
     again, *_ = evaluate_episodes(SCORERS, fresh, calibration)
     name = "segments.sharpened"
-    assert figures[f"{name}.auc"] == again[f"{name}.auc"]
+    assert estimates[f"{name}.auc"] == again[f"{name}.auc"]
     # No other threshold is better on the set that it was chosen on.
     best, other = (
         found[f"{name}.safe_recall"].value + found[f"{name}.unsafe_recall"].value
-        for found in (figures, again)
+        for found in (estimates, again)
     )
     assert best >= other

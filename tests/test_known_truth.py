@@ -13,7 +13,7 @@ from studies.known_truth import (
     KnownTruth,
     agreement,
     boundary_distance,
-    random_plan_figures,
+    random_plan_estimates,
     simulate_truth,
 )
 from studies.known_truth_figure import known_truth_figure
@@ -118,7 +118,7 @@ def test_random_plans_are_judged_by_their_first_rows_alone():
         episode.state[:, 0] = 1.0 - first
         episode.state[0, 0] = first
         episodes.append(episode)
-    found = random_plan_figures(SaysTheState(), Episodes(info, episodes))
+    found = random_plan_estimates(SaysTheState(), Episodes(info, episodes))
     assert found["safe_share"].value == 0.5
     # Two of the five that are safe, or said to be.
     assert found["intersection_over_union"].value == pytest.approx(2 / 5)

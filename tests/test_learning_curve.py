@@ -52,7 +52,7 @@ def test_what_is_learned_already_is_not_learned_again(folder, plans, curve, monk
         progress=lambda *report: reports.append(report[1:]),
     )
     # The first 30 episodes are what the size of 30 means.
-    assert again == {key: figure for key, figure in curve.items() if key.startswith("30.")}
+    assert again == {key: estimate for key, estimate in curve.items() if key.startswith("30.")}
     assert reports == [(1, 1)]
 
 
@@ -67,7 +67,7 @@ def test_the_picture_has_both_recalls_beside_the_papers(curve):
     assert [axes.get_title(loc="left") for axes in panels] == ["All targets", "Fair set"]
     for axes, infix in zip(panels, ("", "fair."), strict=True):
         lines = {line.get_label(): line for line in axes.lines}
-        drawn = lines["unsafe targets refused"].get_ydata()
+        drawn = lines["unsafe recall"].get_ydata()
         expected = [curve[f"{size}.{infix}unsafe_recall"].value for size in (30, 60)]
         assert list(drawn) == expected
         levels = {line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1}

@@ -6,13 +6,13 @@ import pytest
 
 from drake_safety.evaluation.metrics import (
     Bootstrap,
-    Figure,
+    Estimate,
     area_under_curve,
     auc,
     auc_difference,
     median,
     proportion,
-    segment_figures,
+    segment_estimates,
     threshold_at,
 )
 from drake_safety.learning.segments import split
@@ -31,10 +31,10 @@ def blurred_truth(segments, seed=0):
 
 def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
     # 8 of 10 in any table of exact binomial limits.
-    figure = proportion(8, 10)
-    assert (figure.value, figure.n) == (0.8, 10)
-    assert figure.low == pytest.approx(0.4439, abs=1e-4)
-    assert figure.high == pytest.approx(0.9748, abs=1e-4)
+    estimate = proportion(8, 10)
+    assert (estimate.value, estimate.n) == (0.8, 10)
+    assert estimate.low == pytest.approx(0.4439, abs=1e-4)
+    assert estimate.high == pytest.approx(0.9748, abs=1e-4)
 
 
 def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_five_percent():
@@ -45,9 +45,9 @@ def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_five_percent()
 
 
 def test_nothing_observed_bounds_nothing():
-    figure = proportion(0, 0)
-    assert math.isnan(figure.value)
-    assert (figure.low, figure.high, figure.n) == (0.0, 1.0, 0)
+    estimate = proportion(0, 0)
+    assert math.isnan(estimate.value)
+    assert (estimate.low, estimate.high, estimate.n) == (0.0, 1.0, 0)
 
 
 @pytest.mark.parametrize(("count", "n"), [(-1, 3), (4, 3)])
@@ -57,25 +57,25 @@ def test_a_count_outside_its_total_is_refused(count, n):
 
 
 def test_a_figure_is_valid_json_even_where_it_is_unknown():
-    text = json.dumps(Figure(math.nan, 0.0, math.inf, np.int64(3)).to_json(), allow_nan=False)
+    text = json.dumps(Estimate(math.nan, 0.0, math.inf, np.int64(3)).to_json(), allow_nan=False)
     assert json.loads(text) == {"value": None, "low": 0.0, "high": None, "n": 3}
 
 
 def test_the_median_lies_in_its_interval_and_more_values_narrow_it():
     rng = np.random.default_rng(0)
     few, many = median(rng.normal(size=30)), median(rng.normal(size=3000))
-    for figure in (few, many):
-        assert figure.low <= figure.value <= figure.high
+    for estimate in (few, many):
+        assert estimate.low <= estimate.value <= estimate.high
     assert many.high - many.low < 0.3 * (few.high - few.low)
 
 
 def test_the_interval_of_the_median_covers_the_truth_about_as_often_as_promised():
     rng = np.random.default_rng(1)
-    figures = [
+    estimates = [
         median(rng.exponential(size=51), bootstrap=Bootstrap(num_resamples=300, seed=trial))
         for trial in range(200)
     ]
-    share = np.mean([figure.low <= np.log(2.0) <= figure.high for figure in figures])
+    share = np.mean([estimate.low <= np.log(2.0) <= estimate.high for estimate in estimates])
     assert 0.90 <= share <= 0.99
 
 
@@ -123,9 +123,9 @@ def test_a_score_that_is_nan_counts_as_the_most_unsafe():
 
 
 def test_one_class_alone_has_no_area():
-    figure = auc(np.array([0.1, 0.2]), np.array([True, True]), np.array([0, 1]))
-    assert math.isnan(figure.value)
-    assert math.isnan(figure.low)
+    estimate = auc(np.array([0.1, 0.2]), np.array([True, True]), np.array([0, 1]))
+    assert math.isnan(estimate.value)
+    assert math.isnan(estimate.low)
 
 
 def test_repeating_the_segments_of_an_episode_adds_no_certainty():
@@ -146,8 +146,8 @@ def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
     for trial in range(200):
         label = rng.random(120) < 0.5
         bootstrap = Bootstrap(num_resamples=200, seed=trial)
-        figure = auc(rng.normal(size=120) + label, label, np.arange(120), bootstrap=bootstrap)
-        num_covered += figure.low <= truth <= figure.high
+        estimate = auc(rng.normal(size=120) + label, label, np.arange(120), bootstrap=bootstrap)
+        num_covered += estimate.low <= truth <= estimate.high
     assert 0.90 <= num_covered / 200 <= 0.99
 
 
@@ -163,59 +163,59 @@ def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetri
 
 
 def test_segment_figures_of_the_truth_are_perfect_and_their_recalls_still_uncertain(segments):
-    figures = segment_figures(segments, segments.is_unsafe.astype(float), threshold=0.5)
-    assert set(figures) == {"auc", "safe_recall", "unsafe_recall", "brier"}
-    assert [figures[k].value for k in figures] == [1.0, 1.0, 1.0, 0.0]
+    estimates = segment_estimates(segments, segments.is_unsafe.astype(float), threshold=0.5)
+    assert set(estimates) == {"auc", "safe_recall", "unsafe_recall", "brier"}
+    assert [estimates[k].value for k in estimates] == [1.0, 1.0, 1.0, 0.0]
     num_unsafe = len(np.unique(segments.episode[segments.is_unsafe]))
-    assert figures["unsafe_recall"] == proportion(num_unsafe, num_unsafe)
+    assert estimates["unsafe_recall"] == proportion(num_unsafe, num_unsafe)
 
 
 def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segments):
     score = blurred_truth(segments)
-    figures = segment_figures(segments, score, threshold=0.6)
+    estimates = segment_estimates(segments, score, threshold=0.6)
     label = segments.is_unsafe
-    assert figures["unsafe_recall"].value == pytest.approx((score[label] > 0.6).mean())
-    assert figures["safe_recall"].value == pytest.approx((score[~label] <= 0.6).mean())
-    assert figures["brier"].value == pytest.approx(((score - label) ** 2).mean())
-    assert figures["auc"].n == figures["brier"].n == len(np.unique(segments.episode))
-    assert figures["safe_recall"].n == len(np.unique(segments.episode[~label]))
-    for figure in figures.values():
-        assert figure.low < figure.value < figure.high
+    assert estimates["unsafe_recall"].value == pytest.approx((score[label] > 0.6).mean())
+    assert estimates["safe_recall"].value == pytest.approx((score[~label] <= 0.6).mean())
+    assert estimates["brier"].value == pytest.approx(((score - label) ** 2).mean())
+    assert estimates["auc"].n == estimates["brier"].n == len(np.unique(segments.episode))
+    assert estimates["safe_recall"].n == len(np.unique(segments.episode[~label]))
+    for estimate in estimates.values():
+        assert estimate.low < estimate.value < estimate.high
 
 
 def test_recalls_of_one_segment_an_episode_are_proportions(segments):
     first = segments.take(segments.is_first)
     score = blurred_truth(segments)[segments.is_first]
-    figures = segment_figures(first, score, threshold=0.5)
+    estimates = segment_estimates(first, score, threshold=0.5)
     unsafe = first.is_unsafe
-    assert figures["unsafe_recall"] == proportion(
+    assert estimates["unsafe_recall"] == proportion(
         int((score[unsafe] > 0.5).sum()), int(unsafe.sum())
     )
-    assert figures["safe_recall"] == proportion(
+    assert estimates["safe_recall"] == proportion(
         int((score[~unsafe] <= 0.5).sum()), int((~unsafe).sum())
     )
-    assert figures["auc"].value == area_under_curve(score, unsafe)
+    assert estimates["auc"].value == area_under_curve(score, unsafe)
 
 
 def test_not_knowing_is_judged_unsafe_and_charged_as_certainty(segments):
-    figures = segment_figures(segments, np.full(len(segments), np.nan), threshold=0.5)
-    assert figures["unsafe_recall"].value == 1.0
-    assert figures["safe_recall"].value == 0.0
-    assert figures["auc"].value == 0.5
-    assert figures["brier"].value == pytest.approx((~segments.is_unsafe).mean())
+    estimates = segment_estimates(segments, np.full(len(segments), np.nan), threshold=0.5)
+    assert estimates["unsafe_recall"].value == 1.0
+    assert estimates["safe_recall"].value == 0.0
+    assert estimates["auc"].value == 0.5
+    assert estimates["brier"].value == pytest.approx((~segments.is_unsafe).mean())
 
 
 def test_scores_that_are_no_probabilities_have_no_brier_score(segments):
     logit = 4.0 * segments.is_unsafe - 2.0
     with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got -2.0..2.0"):
-        segment_figures(segments, logit, threshold=0.0)
-    figures = segment_figures(segments, logit, threshold=0.0, is_probability=False)
-    assert set(figures) == {"auc", "safe_recall", "unsafe_recall"}
+        segment_estimates(segments, logit, threshold=0.0)
+    estimates = segment_estimates(segments, logit, threshold=0.0, is_probability=False)
+    assert set(estimates) == {"auc", "safe_recall", "unsafe_recall"}
 
 
 def test_there_must_be_one_score_a_segment(segments):
-    with pytest.raises(ValueError, match="segment_figures: scores, labels and episodes"):
-        segment_figures(segments, np.zeros(3), threshold=0.5)
+    with pytest.raises(ValueError, match="segment_estimates: scores, labels and episodes"):
+        segment_estimates(segments, np.zeros(3), threshold=0.5)
     with pytest.raises(ValueError, match="labels must be boolean, got float64"):
         area_under_curve(np.zeros(3), np.zeros(3))
 

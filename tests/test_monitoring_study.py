@@ -70,33 +70,33 @@ def figures_of(alarm, **options):
 
 def test_what_is_noticed_is_noticed_between_push_and_leaving():
     study = figures_of(seen())
-    figures = study.figures
+    estimates = study.estimates
     # The first two in time, the third too late but before the fall, the fourth only too early.
-    assert figures["monitoring.sharpened.detected"].value == 2 / 4
+    assert estimates["monitoring.sharpened.detected"].value == 2 / 4
     assert study.lead_s["sharpened"] == pytest.approx([0.3, 0.1, -0.1, -math.inf])
-    assert figures["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
-    assert figures["monitoring.sharpened.falls_detected"].value == 2 / 2
-    assert figures["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
-    assert figures["monitoring.motions.leave_safe_set"].value == 4 / 6
-    assert figures["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
+    assert estimates["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
+    assert estimates["monitoring.sharpened.falls_detected"].value == 2 / 2
+    assert estimates["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
+    assert estimates["monitoring.motions.leave_safe_set"].value == 4 / 6
+    assert estimates["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
 
 
 def test_who_sees_the_same_later_has_that_much_less_time():
-    late = figures_of(seen(delay_rows=2)).figures
-    prompt = figures_of(seen()).figures
+    late = figures_of(seen(delay_rows=2)).estimates
+    prompt = figures_of(seen()).estimates
     lead = [f["monitoring.sharpened.lead_to_fall_s"].value for f in (prompt, late)]
     assert lead[0] - lead[1] == pytest.approx(0.2)
     assert late["monitoring.sharpened.detected"].value == 1 / 4
 
 
 def test_false_alarms_are_counted_once_a_motion_over_all_hours():
-    figures = figures_of(seen()).figures
-    assert figures["monitoring.sharpened.false_alarm_share"].value == 1 / 2
+    estimates = figures_of(seen()).estimates
+    assert estimates["monitoring.sharpened.false_alarm_share"].value == 1 / 2
     # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
-    assert figures["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
-    rate = figures["monitoring.sharpened.undisturbed_false_alarms_per_hour"]
+    assert estimates["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
+    rate = estimates["monitoring.sharpened.undisturbed_false_alarms_per_hour"]
     assert rate.value == pytest.approx(600)
-    assert figures["monitoring.motions.safe_hours"].value == pytest.approx(0.002)
+    assert estimates["monitoring.motions.safe_hours"].value == pytest.approx(0.002)
 
 
 def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
@@ -112,10 +112,10 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
 
 
 def test_an_alarm_is_the_same_in_whatever_unit_it_is_measured():
-    metres = figures_of(seen()).figures
+    metres = figures_of(seen()).estimates
     inches = figures_of(
         Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0)
-    ).figures
+    ).estimates
     for key in metres.keys() - {"monitoring.sharpened.threshold"}:
         np.testing.assert_equal(metres[key], inches[key])
 
@@ -140,15 +140,15 @@ def test_motions_that_leave_before_the_push_are_left_out():
     early = motion_of(6, {}, leaves=True, push_time_s=2.0)
     unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
     study = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
-    assert study.figures["monitoring.motions.left_out"].value == 2 / 8
+    assert study.estimates["monitoring.motions.left_out"].value == 2 / 8
     assert len(study.is_unsafe) == 6
 
 
 def test_rates_have_the_exact_interval_of_a_poisson_process():
-    figure = rate_per_hour(5, 7200.0, 100)
-    assert figure.value == 2.5
-    assert poisson.sf(4, 2 * figure.low) == pytest.approx(0.025)
-    assert poisson.cdf(5, 2 * figure.high) == pytest.approx(0.025)
+    estimate = rate_per_hour(5, 7200.0, 100)
+    assert estimate.value == 2.5
+    assert poisson.sf(4, 2 * estimate.low) == pytest.approx(0.025)
+    assert poisson.cdf(5, 2 * estimate.high) == pytest.approx(0.025)
     assert rate_per_hour(0, 3600.0, 1).low == 0.0
     assert math.isnan(rate_per_hour(0, 0.0, 0).value)
 
@@ -196,10 +196,10 @@ def test_what_an_engineer_would_watch_is_found_by_name():
 
 def test_the_table_says_where_another_alarm_is_ahead():
     study = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST)
-    table = alarm_table(Results(figures=study.figures))
+    table = alarm_table(Results(estimates=study.estimates))
     assert [row.key for row in table.rows] == ["sharpened", "tilt"]
-    (first, *_) = table.rivals_ahead()
-    assert first.startswith("noticed in time: tilt, 50.0 % against 25.0 %")
+    (first, *_) = table.better_baselines()
+    assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
     assert "4 of" not in table.meaning and "66.7 % leave the safe set" in table.meaning
 
 
@@ -208,8 +208,8 @@ def test_the_figure_marks_the_threshold_on_its_own_curve():
     roc, lead = monitoring_figure(study).axes
     for i, name in enumerate(study.thresholds):
         curve, dot = roc.lines[2 * i], roc.lines[2 * i + 1]
-        figure = study.figures[f"monitoring.{name}.detected"]
-        assert dot.get_ydata()[0] == figure.value
+        estimate = study.estimates[f"monitoring.{name}.detected"]
+        assert dot.get_ydata()[0] == estimate.value
         points = set(zip(*(np.round(xy, 9) for xy in curve.get_data()), strict=True))
         assert (round(dot.get_xdata()[0], 9), round(dot.get_ydata()[0], 9)) in points
     # At zero the right panel says what is noticed in time.

@@ -13,7 +13,7 @@ from drake_safety.evaluation.plan_study import (
     PlanRule,
     evaluate_plans,
     named_causes,
-    outcome_figures,
+    outcome_estimates,
     plans_of,
     promised_miss_rate,
     reachability_rule,
@@ -100,30 +100,30 @@ def test_episodes_that_diverged_are_counted_but_no_plans(fresh):
     broken = replace(fresh[0], is_safe=False, cause=DIVERGED)
     plans = plans_of(shuttling().make_loop(), Episodes(fresh.info, [broken, *fresh[1:10]]))
     assert (len(plans), len(plans.outcomes)) == (9, 10)
-    figures = outcome_figures(plans)
-    assert figures["outcomes.diverged"].value == 0.1
+    estimates = outcome_estimates(plans)
+    assert estimates["outcomes.diverged"].value == 0.1
     np.testing.assert_array_equal(plans.first.state[0], fresh[1].state[0])
 
 
 def test_outcomes_and_controller_failures_are_counted(fresh, plans):
-    figures = outcome_figures(plans)
-    shares = [figures[f"outcomes.{name}"] for name in (SAFE, "front", "flank", DIVERGED)]
+    estimates = outcome_estimates(plans)
+    shares = [estimates[f"outcomes.{name}"] for name in (SAFE, "front", "flank", DIVERGED)]
     assert sum(share.value for share in shares) == pytest.approx(1.0)
     assert {share.n for share in shares} == {len(fresh)}
     assert shares[0].value == fresh.num_safe / len(fresh)
     # A failure is counted where the velocity says so, which the start point shifts a little.
     num_failing = np.sum(plans.goals[:, 2] - plans.first.state[:, 2] > FAILING_Z_M)
-    assert figures["controller_failures"].value == num_failing
-    assert figures["episodes_with_controller_failures"].value == num_failing / len(fresh)
+    assert estimates["controller_failures"].value == num_failing
+    assert estimates["episodes_with_controller_failures"].value == num_failing / len(fresh)
 
 
 def test_every_rule_has_every_figure_on_every_set(study):
     for prefix in ("plans", "plans.fair", "plans.other", "plans.other.fair"):
         for rule in RULES:
             for key in ("safe_recall", "unsafe_recall", "auc", "brier", "threshold"):
-                assert f"{prefix}.{rule.name}.{key}" in study.figures
-        assert f"{prefix}.causes.right_cause" in study.figures
-        assert f"{prefix}.outcomes.safe" in study.figures
+                assert f"{prefix}.{rule.name}.{key}" in study.estimates
+        assert f"{prefix}.causes.right_cause" in study.estimates
+        assert f"{prefix}.outcomes.safe" in study.estimates
 
 
 def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, plans, assessment):
@@ -134,8 +134,8 @@ def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, pl
     alone = evaluate_plans(RULES, assessment, calibration, {"plans": plans.fair()})
     assert alone.thresholds == study.thresholds
     # Told as the safety probability below which a plan is refused.
-    assert study.figures["plans.sharpened.threshold"].value == 1.0 - expected
-    assert study.figures["plans.sharpened.threshold"].n == len(calibration)
+    assert study.estimates["plans.sharpened.threshold"].value == 1.0 - expected
+    assert study.estimates["plans.sharpened.threshold"].n == len(calibration)
 
 
 def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
@@ -145,7 +145,7 @@ def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
     assert promised_miss_rate(calibration) == 1.0 / (num_unsafe + 1)
     assert f"{num_unsafe} unsafe calibration episodes promise an unsafe recall" in caplog.text
     assert "0.992 takes 124" in caplog.text
-    promised = study.figures["plans.promised_unsafe_recall"]
+    promised = study.estimates["plans.promised_unsafe_recall"]
     assert (promised.value, promised.n) == (1.0 - 1.0 / (num_unsafe + 1), num_unsafe)
     safe = replace(calibration, first=calibration.first.take(~calibration.is_unsafe))
     with pytest.raises(ValueError, match=r"0 of .* calibration plans are unsafe; it takes 124"):
@@ -158,13 +158,13 @@ def test_no_unsafe_calibration_plan_is_missed_when_there_are_few(study, calibrat
 
 
 def test_who_sees_what_happens_is_right_and_who_refuses_all_has_no_safe_recall(study, plans):
-    figures = study.figures
-    assert figures["plans.sharpened.auc"].value == 1.0
-    assert figures["plans.sharpened.unsafe_recall"].n == plans.is_unsafe.sum()
-    assert figures["plans.stubborn.unsafe_recall"].value == 1.0
-    assert figures["plans.stubborn.safe_recall"].value == 0.0
+    estimates = study.estimates
+    assert estimates["plans.sharpened.auc"].value == 1.0
+    assert estimates["plans.sharpened.unsafe_recall"].n == plans.is_unsafe.sum()
+    assert estimates["plans.stubborn.unsafe_recall"].value == 1.0
+    assert estimates["plans.stubborn.safe_recall"].value == 0.0
     # One score for all: nothing is accepted rather than an unsafe plan.
-    assert figures["plans.blind.safe_recall"].value == 0.0
+    assert estimates["plans.blind.safe_recall"].value == 0.0
 
 
 def test_the_mirrored_loop_sees_the_same_plans_as_the_loop_itself():
@@ -187,16 +187,16 @@ def test_the_cause_is_the_constraint_whose_predicted_margin_is_smallest(study, a
     rows = plans.is_unsafe & (RULES[0].unsafe_score(plans) > study.thresholds["sharpened"])
     for name, causes in named.items():
         right = np.mean((causes == plans.first.cause)[rows])
-        assert study.figures[f"plans.causes.{name}"].value == right
+        assert study.estimates[f"plans.causes.{name}"].value == right
 
 
 def test_causes_are_judged_on_the_correctly_refused_alone(study, plans):
     is_refused = RULES[0].unsafe_score(plans) > study.thresholds["sharpened"]
-    figures = study.figures
-    of_all = figures["plans.causes.right_cause"]
+    estimates = study.estimates
+    of_all = estimates["plans.causes.right_cause"]
     assert of_all.n == np.sum(is_refused & plans.is_unsafe)
-    by_cause = [figures[f"plans.causes.{name}"] for name in plans.constraint_names]
-    assert sum(figure.n for figure in by_cause) == of_all.n
+    by_cause = [estimates[f"plans.causes.{name}"] for name in plans.constraint_names]
+    assert sum(estimate.n for estimate in by_cause) == of_all.n
     assert sum(f.value * f.n for f in by_cause) == pytest.approx(of_all.value * of_all.n)
 
 
@@ -209,7 +209,7 @@ def test_reachability_answers_for_the_hand_that_reaches_and_for_no_other(plans):
     score = rule.unsafe_score(replace(plans, hand="left"))
     np.testing.assert_array_equal(score, (plans.goals[:, 0] >= 1.0).astype(float))
     for hand in (None, "right"):
-        with pytest.raises(ValueError, match=rf"no hand '{hand}' is known; known are \['left'\]"):
+        with pytest.raises(ValueError, match=rf"unknown hand '{hand}'; the hands are \['left'\]"):
             rule.unsafe_score(replace(plans, hand=hand))
 
 
@@ -220,7 +220,7 @@ def test_the_promise_leaves_room_above_the_papers_figure():
 def test_recall_losses_compare_the_pairs_alone(plans):
     unsafe = plans.is_unsafe
     none_lost = recall_losses(plans, unsafe, plans, unsafe)
-    assert {figure.value for figure in none_lost.values()} == {0.0}
+    assert {estimate.value for estimate in none_lost.values()} == {0.0}
     # Twins of the first half, of which one safe plan is refused.
     half = plans.first.take(plans.first.episode < 20)
     twins = replace(plans, first=half, goals=plans.goals[: len(half)])

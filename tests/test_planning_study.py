@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.planning.plan_choice import plan_inputs
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import episode_rng
@@ -95,23 +95,23 @@ def test_a_stopped_study_goes_on_with_the_motions_it_has(trials, tmp_path, monke
 
 
 def test_who_knows_comes_all_the_way_to_hindsight_and_who_errs_does_not(trials):
-    figures = planning_study(Knowing(), trials, threshold=0.0).figures
+    estimates = planning_study(Knowing(), trials, threshold=0.0).estimates
     default = np.mean([trial.is_safe[0] for trial in trials])
     best = np.mean([trial.is_safe.any() for trial in trials])
-    assert figures["default"].value == default < best
-    assert figures["chosen"].value == figures["best_in_hindsight"].value == best
-    assert figures["gain"].value == 1.0
+    assert estimates["default"].value == default < best
+    assert estimates["chosen"].value == estimates["best_in_hindsight"].value == best
+    assert estimates["gain"].value == 1.0
     # The default is the fastest: taking the least safe is taking it.
-    wrong = planning_study(Knowing(sign=-1.0), trials, threshold=0.0).figures
+    wrong = planning_study(Knowing(sign=-1.0), trials, threshold=0.0).estimates
     assert wrong["gain"].value == 0.0
-    assert default < figures["any_candidate"].value < best
+    assert default < estimates["any_candidate"].value < best
 
 
 def test_starts_that_no_plan_is_accepted_for_are_told_apart(trials):
     study = planning_study(Knowing(), trials, threshold=0.5)
     accepted = [values.max() >= 0.5 for values in study.safety_probability]
-    assert study.figures["accepted"].value == np.mean(accepted)
-    assert study.figures["chosen_if_accepted"].n == sum(accepted)
+    assert study.estimates["accepted"].value == np.mean(accepted)
+    assert study.estimates["chosen_if_accepted"].n == sum(accepted)
 
 
 def test_without_starts_or_plans_there_is_nothing_to_study():
@@ -123,17 +123,20 @@ def test_without_starts_or_plans_there_is_nothing_to_study():
 
 
 @pytest.mark.parametrize(
-    ("gain", "said"),
+    ("gain", "start"),
     [
-        ((0.5, 0.1, 0.8), "Γ wins: 75.0 % (58.8–87.3) of the starts stay safe with the plan that"),
-        ((-0.5, -0.9, -0.1), "The default plan wins: "),
-        ((0.1, -0.2, 0.4), "Nobody wins beyond chance: "),
-        ((np.nan, np.nan, np.nan), "Nobody wins: "),
+        (
+            (0.5, 0.1, 0.8),
+            "Γ is better: 75.0 % (58.8–87.3) of the starts stay safe with the plan that",
+        ),
+        ((-0.5, -0.9, -0.1), "The default plan is better: "),
+        ((0.1, -0.2, 0.4), "No significant difference: "),
+        ((np.nan, np.nan, np.nan), "No difference: "),
     ],
 )
-def test_who_wins_is_what_the_interval_of_the_gain_says(gain, said):
-    figures = {"default": proportion(24, 40), "chosen": proportion(30, 40)}
-    figures["gain"] = Figure(*gain, 40)
-    assert planning_verdict(figures).startswith(said)
-    del figures["gain"]
-    assert "incomplete" in planning_verdict(figures)
+def test_the_verdict_follows_from_the_interval_of_the_gain(gain, start):
+    estimates = {"default": proportion(24, 40), "chosen": proportion(30, 40)}
+    estimates["gain"] = Estimate(*gain, 40)
+    assert planning_verdict(estimates).startswith(start)
+    del estimates["gain"]
+    assert "incomplete" in planning_verdict(estimates)

@@ -47,7 +47,7 @@ def test_beyond_a_wall_the_truth_is_that_wall(assessment):
         shuttling(), assessment, threshold=0.5, x_m=1.2, step_m=0.6, num_workers=1
     )
     assert set(region.outcomes[region.outcomes != "flank"]) == {"front"}
-    assert region.figures()["share_safe"].value == 0.0
+    assert region.estimates()["share_safe"].value == 0.0
 
 
 def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
@@ -64,15 +64,15 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
 
 
 def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
-    figures = region.figures()
+    estimates = region.estimates()
     verdict = region.safety_probability >= region.threshold
     rows = [int(np.argmin(np.abs(region.z_m - z))) for z in region.simulated_z_m]
     columns = [int(np.argmin(np.abs(region.y_m - y))) for y in region.simulated_y_m]
     is_right = verdict[np.ix_(rows, columns)] == (region.outcomes == SAFE)
-    assert figures["sharpened.right"].value == pytest.approx(is_right.mean())
-    assert figures["sharpened.right"].n == region.outcomes.size
+    assert estimates["sharpened.right"].value == pytest.approx(is_right.mean())
+    assert estimates["sharpened.right"].n == region.outcomes.size
     # A task without a hand has no kinematics to compare with.
-    assert "reachability.right" not in figures
+    assert "reachability.right" not in estimates
 
 
 def test_the_plane_is_in_the_middle_of_the_fair_box_unless_it_is_said_where():

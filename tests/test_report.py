@@ -150,10 +150,10 @@ def test_every_figure_is_there_as_svg_and_png_and_every_table_as_csv_and_json(wh
     ):
         assert {f"{stem}.csv", f"{stem}.json"} <= tables
     with (whole.folder / "report/tables/segments.csv").open() as file:
-        rows = {row["who judges"]: row for row in csv.DictReader(file)}
-    figure = make_figures()["segments.sharpened.auc"]
-    assert float(rows["sharpened"]["auc"]) == figure.value
-    assert float(rows["sharpened"]["auc.low"]) == figure.low
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    estimate = make_figures()["segments.sharpened.auc"]
+    assert float(rows["sharpened"]["auc"]) == estimate.value
+    assert float(rows["sharpened"]["auc.low"]) == estimate.low
     assert int(rows["sharpened"]["auc.n"]) == 60
 
 
@@ -164,7 +164,7 @@ def test_what_was_trained_is_told_with_its_share_of_unsafe_ones(whole):
     assert "drake-safety train lip --episodes 60" in whole.page.words
 
 
-def test_figures_that_no_table_knows_and_where_a_rival_is_ahead_are_shown(whole):
+def test_figures_that_no_table_knows_and_where_a_baseline_is_better_are_shown(whole):
     assert "miss rate 5" in whole.page.words
     assert "0.025 (0.001–0.132)" in whole.page.words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in (
@@ -235,7 +235,7 @@ def test_empty_cells_have_no_colour_and_safer_ones_are_bluer(whole):
     ("gone", "named"),
     [
         (["episodes"], "Training episodes"),
-        (["evaluation.json"], "It was not evaluated yet"),
+        (["evaluation.json"], "The run was not evaluated"),
         (["paper.safetensors"], "The learned assessment, mode “paper”"),
         (["run/recording.html"], "A recorded motion"),
         (["episodes", "sharpened.safetensors", "paper.safetensors"], "Training episodes"),
@@ -264,7 +264,7 @@ def test_damaged_files_and_a_stopped_training_are_named_and_the_rest_shown(copy)
     page = Page(page_of(copy).read_text(encoding="utf-8"))
     assert "evaluation.json is not JSON" in page.words
     assert "is not a safety assessment or truncated" in page.words
-    assert "60 are here, 2048 were asked for" in page.words
+    assert "60 of 2048 are here" in page.words
     assert len(page.all("article", **{"data-mode": "paper"})) == 1
     assert not page.all("article", **{"data-mode": "sharpened"})
 
@@ -272,7 +272,7 @@ def test_damaged_files_and_a_stopped_training_are_named_and_the_rest_shown(copy)
 def test_an_evaluation_of_another_simulation_is_shown_and_said_to_be_foreign(copy):
     write_evaluation(copy, scenario_hash="f" * 64)
     page = Page(page_of(copy).read_text(encoding="utf-8"))
-    assert "its figures below are of something else" in page.words
+    assert "its results below are of another scenario" in page.words
     assert "0.900 (0.795–0.962)" in page.words
 
 

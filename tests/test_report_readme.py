@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.report.results import Results
 from report_runs import make_figures
 from studies.readme import generate, rewrite_readme
@@ -22,9 +22,9 @@ ENTRIES = {
 BLOCK = "<!-- results: lip -->\nstale words\n<!-- end -->\n"
 
 
-def write_readme(folder, figures, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
+def write_readme(folder, estimates, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
     store_results(
-        Results(figures=figures, entries=ENTRIES),
+        Results(estimates=estimates, entries=ENTRIES),
         folder / "docs/results/lip.json",
         train_command="drake-safety train lip --resume --out=/somebodys/own/lip",
     )
@@ -48,10 +48,10 @@ def test_a_summary_is_one_table_with_and_without_targets(tmp_path):
     rewrite_readme(readme, tmp_path / "docs/results")
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in readme.read_text()
     assert "```sh" not in readme.read_text()
-    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    estimates = {"plans.outcomes.safe": proportion(20, 50)}
     for column in ("safe_recall", "unsafe_recall", "auc"):
-        figures[f"plans.sharpened.{column}"] = proportion(19, 20)
-    readme = write_readme(tmp_path, figures, summary)
+        estimates[f"plans.sharpened.{column}"] = proportion(19, 20)
+    readme = write_readme(tmp_path, estimates, summary)
     rewrite_readme(readme, tmp_path / "docs/results")
     assert "| *the paper's own* | *0.952* | *0.987* | |" in readme.read_text()
 
@@ -59,11 +59,11 @@ def test_a_summary_is_one_table_with_and_without_targets(tmp_path):
 def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
     write_readme(tmp_path, make_figures())
     results = read_results(tmp_path / "docs/results/lip.json")
-    assert list(results.figures) == list(make_figures())
-    for key, figure in make_figures().items():
-        stored = results.figures[key]
-        assert (stored.value, stored.low) == pytest.approx((figure.value, figure.low), rel=1e-5)
-        assert stored.n == figure.n
+    assert list(results.estimates) == list(make_figures())
+    for key, estimate in make_figures().items():
+        stored = results.estimates[key]
+        assert (stored.value, stored.low) == pytest.approx((estimate.value, estimate.low), rel=1e-5)
+        assert stored.n == estimate.n
     assert results.entries["command"] == (
         "drake-safety evaluate lip --assessment runs/lip --episodes 60"
     )
@@ -78,7 +78,7 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety train lip")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
     assert "stale words" not in text
-    assert "Learned from 64 episodes of seed 7. Judged on 60 fresh ones of seed 1000" in text
+    assert "Trained on 64 episodes of seed 7. Evaluated on 60 fresh ones of seed 1000" in text
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
     again = text
@@ -87,35 +87,35 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
 
 
 def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
-    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    estimates = {"plans.outcomes.safe": proportion(20, 50)}
     for name, count in (("sharpened", 19), ("paper", 10)):
         for column in ("safe_recall", "unsafe_recall", "auc"):
-            figures[f"plans.{name}.{column}"] = proportion(count, 20)
-    figures["plans.causes.right_cause"] = proportion(9, 10)
-    readme = write_readme(tmp_path, figures)
+            estimates[f"plans.{name}.{column}"] = proportion(count, 20)
+    estimates["plans.causes.right_cause"] = proportion(9, 10)
+    readme = write_readme(tmp_path, estimates)
     rewrite_readme(readme, tmp_path / "docs/results")
     text = readme.read_text()
     assert "| all targets | safe recall | unsafe recall | AUC |" in text
     assert "| *the paper's own* | *0.952* | *0.987* | |" in text
     assert "of which 40.0 % (26.4–54.8) are safe" in text
-    assert "named for 90.0 % (55.5–99.7) of the 10 rightly refused" in text
+    assert "named for 90.0 % (55.5–99.7) of the 10 correctly refused" in text
 
 
 def test_what_the_other_hand_loses_and_what_fewer_episodes_cost_is_told(tmp_path):
-    figures = {"plans.outcomes.safe": proportion(20, 50)}
+    estimates = {"plans.outcomes.safe": proportion(20, 50)}
     for prefix in ("plans.sharpened", "plans.other_hand.sharpened", "plans.learning_curve.512"):
         for column in ("safe_recall", "unsafe_recall", "auc"):
-            figures[f"{prefix}.{column}"] = proportion(19, 20)
-    readme = write_readme(tmp_path, figures)
+            estimates[f"{prefix}.{column}"] = proportion(19, 20)
+    readme = write_readme(tmp_path, estimates)
     rewrite_readme(readme, tmp_path / "docs/results")
     text = readme.read_text()
     assert "mirrored" not in text
     assert "| training episodes | safe recall | unsafe recall | AUC |" in text
     assert "| 512 | 0.950 (0.751–0.999) | 0.950" in text
-    lost = {"safe": Figure(0.011, -0.002, 0.024, 40), "unsafe": Figure(0.0, 0.0, 0.0, 40)}
-    for what, figure in lost.items():
-        figures[f"plans.other_hand.sharpened.{what}_recall_loss"] = figure
-    rewrite_readme(write_readme(tmp_path, figures), tmp_path / "docs/results")
+    lost = {"safe": Estimate(0.011, -0.002, 0.024, 40), "unsafe": Estimate(0.0, 0.0, 0.0, 40)}
+    for what, estimate in lost.items():
+        estimates[f"plans.other_hand.sharpened.{what}_recall_loss"] = estimate
+    rewrite_readme(write_readme(tmp_path, estimates), tmp_path / "docs/results")
     assert (
         "On the same 40 targets, mirrored, the other hand minus the trained one: -1.1 (-2.4 to "
         "+0.2) points of safe recall, +0.0 (+0.0 to +0.0) points of unsafe recall."

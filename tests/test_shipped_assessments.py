@@ -34,7 +34,7 @@ def test_what_is_shipped_is_what_was_evaluated(name):
     assert set(results.entries["assessment_sha256"]) == set(MODES)
     assert len(results.entries["first_episodes"]) == NUM_EPISODES
     assert {"command", "train_command", "seed", "versions"} <= set(results.entries)
-    assert any(key.endswith(".sharpened.unsafe_recall") for key in results.figures)
+    assert any(key.endswith(".sharpened.unsafe_recall") for key in results.estimates)
     assert load_assessment(name).info_.scenario == name
 
 
@@ -74,7 +74,7 @@ def run(tmp_path_factory):
         options = ("--assessment", folder, "--workers", 1)
         calibrated = ("--episodes", 120, "--splits", 0, "--miss-rate", 0.1)
         assert call(patch, "calibrate", NAME, *options, *calibrated) == 0
-        patch.setattr("drake_safety.evaluation.figure_style.save", lambda figure, path: [])
+        patch.setattr("drake_safety.evaluation.figure_style.save", lambda estimate, path: [])
         judged = ("--episodes", 30, "--calibration-episodes", 20, "--plane-step", 0)
         assert call(patch, "evaluate", NAME, *options, *judged, "--other-hand", 0) == 0
     return scenarios, folder
@@ -128,7 +128,7 @@ def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped
         assert {one["kind"] for one in entries["calibrations"][mode]} == {"plan", "motion"}
     assert entries["train_command"] == f"drake-safety train {NAME} --out runs/own"
     assert entries["seed"] == 1_000_000
-    assert results.figures["plans.sharpened.unsafe_recall"].n > 0
+    assert results.estimates["plans.sharpened.unsafe_recall"].n > 0
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_a_file_too_few_and_a_scenario_that_changed_are_noticed(package, scenari
         ("gone", "there is no 'paper' assessment"),
         ("uncalibrated", "holds no calibrated threshold: `drake-safety calibrate` chooses one"),
         ("changed", "`drake-safety evaluate` them as they are now"),
-        ("untold", "does not tell what its assessments were trained with"),
+        ("untold", "the training command of"),
         ("unjudged", "holds no evaluation to store: `drake-safety evaluate` makes one"),
     ],
 )

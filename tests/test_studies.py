@@ -114,7 +114,7 @@ def test_a_learning_curve_is_drawn_and_stored_with_the_evaluation(monkeypatch, c
     (folder / "evaluation.json").write_text(json.dumps(report))
     stored = folder / "stored.json"
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) in (0, None)
-    found = read_results(stored).figures
+    found = read_results(stored).estimates
     assert {"plans.sharpened.auc", "plans.learning_curve.40.auc"} <= found.keys()
     (folder / "evaluation.json").write_text(json.dumps(report | {"seed": 7}))
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) == 2
@@ -131,7 +131,7 @@ def test_sizes_of_a_learning_curve_are_numbers_between_commas():
 
 
 @pytest.mark.slow
-def test_adaptation_is_judged_in_several_orders_beside_its_rivals(monkeypatch, capsys, run):
+def test_adaptation_is_judged_in_several_orders_beside_its_baselines(monkeypatch, capsys, run):
     file, folder = run
     scenario = load_scenario(file)
     name = next(one for one in scenario.variations if one != "nominal")

@@ -84,13 +84,13 @@ def study_of(rules, **options):
 
 def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(simulation):
     study = study_of([rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)])
-    assert study.figures["throws.falls_without_recovery"].value == 3 / 9
-    assert study.figures["throws.prompt.falls_with_recovery"].value == 0.0
-    assert study.figures["throws.late.falls_with_recovery"].value == 3 / 9
-    assert study.figures["throws.late.falls_missed"].value == 0.0
-    assert study.figures["throws.prompt.trigger_after_impact_s"].value == pytest.approx(0.0)
-    assert study.figures["throws.late.trigger_after_impact_s"].value == pytest.approx(0.2)
-    assert study.figures["throws.late.trigger_before_fall_s"].value == pytest.approx(0.3)
+    assert study.estimates["throws.falls_without_recovery"].value == 3 / 9
+    assert study.estimates["throws.prompt.falls_with_recovery"].value == 0.0
+    assert study.estimates["throws.late.falls_with_recovery"].value == 3 / 9
+    assert study.estimates["throws.late.falls_missed"].value == 0.0
+    assert study.estimates["throws.prompt.trigger_after_impact_s"].value == pytest.approx(0.0)
+    assert study.estimates["throws.late.trigger_after_impact_s"].value == pytest.approx(0.2)
+    assert study.estimates["throws.late.trigger_before_fall_s"].value == pytest.approx(0.3)
     assert study.outcomes("prompt") == 3 * ["recovered", "survived", "survived"]
     assert study.outcomes("late") == study.outcomes() == 3 * ["fell", "survived", "survived"]
 
@@ -112,7 +112,7 @@ def test_a_recovery_that_rules_agree_on_is_simulated_once(simulation):
 def test_thresholds_left_open_are_chosen_on_other_throws(simulation):
     study = study_of([rule("given", 0.6), rule("open", None)])
     assert study.thresholds["given"] == 0.6
-    assert study.thresholds["open"] == study.figures["throws.open.threshold"].value > 0.6
+    assert study.thresholds["open"] == study.estimates["throws.open.threshold"].value > 0.6
     assert simulation.calls[0] == ((0, 1, 2, 3, 4, 5), None)
     assert [log.index for log in study.calibration_logs] == [0, 1, 2, 3, 4, 5]
 
@@ -137,7 +137,7 @@ def test_the_chosen_threshold_is_the_highest_with_few_enough_false_triggers():
 def test_outcomes_are_told_in_the_words_of_the_figure():
     logs = [log_of(0), log_of(1), log_of(2, leaves=True), log_of(3, falls=True)]
     study = ThrowStudy(
-        figures={},
+        estimates={},
         logs=logs,
         trigger_times_s={},
         recovered={"rule": {1: log_of(1), 2: log_of(2, leaves=True)}},

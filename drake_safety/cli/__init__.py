@@ -46,8 +46,8 @@ _COMMANDS = (
 _DEBUG = "--debug"
 
 app = typer.Typer(
-    help="Learn from simulations how safe a robot's motion is, and ask before and while it moves. "
-    f"With {_DEBUG}, anywhere in the line, errors show their traceback.",
+    help="Learn safety assessments of robot motions from simulations, and use them before and "
+    f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
     no_args_is_help=True,
     rich_markup_mode=None,
     add_completion=False,
@@ -63,11 +63,11 @@ def main() -> None:
 
 
 def run_app(commands: typer.Typer, program: str) -> None:
-    """Runs a command; what a user did wrong is one line, and with --debug a traceback.
+    """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
     Args:
         commands: The commands.
-        program: What they are called by.
+        program: Name of the program.
     """
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
@@ -85,7 +85,7 @@ def run_app(commands: typer.Typer, program: str) -> None:
             if isinstance(error, EpisodeError):
                 console.print(f"{_DEBUG} in the command line shows where", highlight=False)
             sys.exit(2)
-        # Typer's own errors (unknown options, wrong types) know how to show themselves.
+        # Typer's own errors (unknown options, wrong types) have `show`.
         if not hasattr(error, "exit_code") or not hasattr(error, "show"):
             raise
         error.show()

@@ -1,4 +1,4 @@
-"""``drake-safety adapt``: adapts Γ to an actual robot, and judges it before and after."""
+"""``drake-safety adapt``: adapts Γ to an actual robot, and evaluates it before and after."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.feedback import EpisodePairs
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _JUDGED = {"before": "before feedback", "after": "after feedback"}
 _COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
-_THRESHOLD = 0.5  # Safety probability below which a segment counts as judged unsafe.
+_THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
 
 
 def adapt(
@@ -53,10 +53,10 @@ def adapt(
     feedback: Annotated[
         int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
     ] = 160,
-    variation: Annotated[str, typer.Option(help="Which plant is the actual one.")] = "actual",
+    variation: Annotated[str, typer.Option(help="Variation of the actual plant.")] = "actual",
     evaluate: Annotated[
         int,
-        typer.Option(help="Fresh actual episodes to judge by; 0 leaves judging out.", min=0),
+        typer.Option(help="Fresh actual episodes for evaluation; 0 for none.", min=0),
     ] = 0,
     log: Annotated[
         list[Path] | None,
@@ -66,19 +66,18 @@ def adapt(
         ),
     ] = None,
     log_map: Annotated[
-        Path | None, typer.Option("--map", help="What is where in the logs, a YAML file.")
+        Path | None, typer.Option("--map", help="Map of the columns of the logs, a YAML file.")
     ] = None,
     seed: Annotated[
-        int, typer.Option(help="Seed of the feedback; those of judging follow it.")
+        int, typer.Option(help="Seed of the feedback; that of the evaluation follows.")
     ] = ADAPTATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Adapt Γ to what an actual robot does, and judge it before and after.
+    """Adapt Γ to an actual robot, and evaluate it before and after.
 
     Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
-    --log it is named after the first log. Episodes are kept in ASSESSMENT: an adaptation that was
-    stopped goes on when it is called again. For an assessment that came with the package,
-    ASSESSMENT is runs/SCENARIO-shipped.
+    --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
+    continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
     from drake_safety.simulation.scenario import load_scenario
 
@@ -91,15 +90,15 @@ def adapt(
         prior.check_unused(seed, purpose="adaptation")
     logs = log or []
     if bool(logs) != (log_map is not None):
-        raise ValueError("adapt: --log and --map go together: a log is read by its map")
+        raise ValueError("adapt: --log needs --map, and --map needs --log")
     if logs and evaluate:
-        raise ValueError("adapt: there is nothing fresh in a log to judge by; leave out --evaluate")
+        raise ValueError("adapt: a log has no fresh episodes for evaluation; leave out --evaluate")
     if len({one.resolve() for one in logs}) < len(logs):
-        raise ValueError(f"adapt: each log counts once; got {', '.join(str(one) for one in logs)}")
+        raise ValueError(f"adapt: logs must differ; got {', '.join(str(one) for one in logs)}")
     name = logs[0].stem if logs else variation
     print_shipped(learned)
     folder = adapted_folder(learned.out, name)
-    judged: dict[str, Figure] = {}
+    judged: dict[str, Estimate] = {}
     with open_stages() as stages:
         if log_map is not None:
             pairs = _logged_pairs(loaded, logs, log_map, seed)
@@ -122,9 +121,9 @@ def adapt(
             )
             for mode in MODES:
                 judged |= {
-                    f"{mode}.{who}.{key}": figure
+                    f"{mode}.{who}.{key}": estimate
                     for who, one in (("before", priors[mode]), ("after", adapted[mode]))
-                    for key, figure in _judge(one, fresh).items()
+                    for key, estimate in _judge(one, fresh).items()
                 }
     differing, num_pairs = pairs.gap
     report = {
@@ -139,7 +138,7 @@ def adapt(
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
-        **{key: figure.to_json() for key, figure in judged.items()},
+        **{key: estimate.to_json() for key, estimate in judged.items()},
     }
     file = folder / "adaptation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
@@ -160,16 +159,16 @@ def paired_episodes(
     workers: int | None,
     stages: Stages,
 ) -> EpisodePairs:
-    """Actual episodes beside their nominal twins; those that the folder has are not run again.
+    """Simulates pairs of actual episodes and nominal twins, and keeps them in the folder.
 
     Args:
         scenario: The scenario.
-        num_pairs: How many.
-        variation: Which plant is the actual one.
-        seed: Of the episodes.
-        folder: The folder of the training.
-        workers: Processes; None for as many as there are cores.
-        stages: Shows how far it is.
+        num_pairs: Number of pairs.
+        variation: Variation of the actual plant.
+        seed: Seed of the episodes.
+        folder: Folder of the training.
+        workers: Number of worker processes; None for one a core.
+        stages: Progress bars.
     """
     from drake_safety.simulation.feedback import run_pairs
 
@@ -195,17 +194,17 @@ def fresh_actual_episodes(
     stages: Stages,
     what: str = "fresh actual episodes",
 ) -> Episodes:
-    """Other episodes of the actual plant, kept and gone on with as the pairs are.
+    """Simulates other episodes of the actual plant, and keeps them in the folder.
 
     Args:
         scenario: The scenario.
-        num_episodes: How many.
-        variation: Which plant.
-        seed: Of the episodes.
-        folder: The folder of the training.
-        workers: Processes; None for as many as there are cores.
-        stages: Shows how far it is.
-        what: What the stage is called.
+        num_episodes: Number of episodes.
+        variation: Variation of the plant.
+        seed: Seed of the episodes.
+        folder: Folder of the training.
+        workers: Number of worker processes; None for one a core.
+        stages: Progress bars.
+        what: Name of the stage.
     """
     from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.rollouts import run_episodes
@@ -234,9 +233,9 @@ def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int
     return pair_starts(scenario, actual, starts, seed=seed)
 
 
-def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Figure]:
-    """How well Γ judges every segment of fresh actual episodes, by its heads and by its grid."""
-    from drake_safety.evaluation.metrics import segment_figures
+def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
+    """Estimates of Γ on every segment of fresh actual episodes, calibrated and by its grid."""
+    from drake_safety.evaluation.metrics import segment_estimates
     from drake_safety.learning.segments import split
 
     segments = split(fresh, stride=1, discount=1.0, shortest=assessment.parameters.shortest)
@@ -246,10 +245,10 @@ def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Figure]:
         segments.desired_preview,
         segments.features if assessment.uses_features else None,
     )
-    found: dict[str, Figure] = {}
+    found: dict[str, Estimate] = {}
     for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
-        figures = segment_figures(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
-        found |= {f"{name}.{key}": figure for key, figure in figures.items()}
+        estimates = segment_estimates(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
+        found |= {f"{name}.{key}": estimate for key, estimate in estimates.items()}
     return found
 
 
@@ -273,12 +272,12 @@ def _adaptation_table(
     return table
 
 
-def _judged_table(judged: dict[str, Figure], variation: str) -> Table:
+def _judged_table(judged: dict[str, Estimate], variation: str) -> Table:
     n = judged[f"{MODES[0]}.before.grid.auc"].n
     table = new_table("", *_COLUMNS, title=f"{n} fresh episodes of '{variation}'")
     for mode in MODES:
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
             for who, label in _JUDGED.items():
-                figures = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
-                table.add_row(f"{mode}, {published}, {label}", *map(interval, figures))
+                estimates = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
+                table.add_row(f"{mode}, {published}, {label}", *map(interval, estimates))
     return table

@@ -1,4 +1,4 @@
-"""``drake-safety ask``: may the robot go there? Answered before anything moves."""
+"""``drake-safety ask``: the verdict on a target, without motion."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def ask(
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Ask whether the robot may reach for a target from where it stands; nothing moves.
+    """Print the verdict on reaching a target from the standing posture; nothing moves.
 
-    Tells the belief and the verdict; of a refusal also the likely cause and the nearest target
-    that would be accepted. Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
+    Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
+    Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
     from drake_safety.planning.goal_verdict import assess_goal
     from drake_safety.simulation.scenario import load_scenario

@@ -1,4 +1,4 @@
-"""``drake-safety calibrate``: thresholds of Γ with a promised miss rate, kept beside Γ."""
+"""``drake-safety calibrate``: thresholds of Γ with a promised miss rate, stored with Γ."""
 
 from __future__ import annotations
 
@@ -39,28 +39,28 @@ def calibrate(
     scenario: ScenarioArgument,
     assessment: AssessmentOption = None,
     miss_rate: Annotated[
-        float, typer.Option(help="Promised share of unsafe episodes that are called safe.")
+        float, typer.Option(help="Promised miss rate: share of unsafe episodes classified safe.")
     ] = 0.01,
     false_alarm_rate: Annotated[
         float,
-        typer.Option(help="Promised share of safe episodes called unsafe, not 'don't know'."),
+        typer.Option(help="Promised share of safe episodes classified unsafe, not 'don't know'."),
     ] = 0.05,
     confidence: Annotated[
         float | None,
-        typer.Option(help="With which the promise holds, such as 0.95; on average by default."),
+        typer.Option(help="Confidence of the promise, such as 0.95; on average by default."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=2)] = 1000,
     splits: Annotated[
-        int, typer.Option(help="How often to split them, to see promises kept; 0: not.", min=0)
+        int, typer.Option(help="Number of splits that check the promises; 0 for none.", min=0)
     ] = 200,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Choose thresholds that keep a promised miss rate, on fresh episodes.
+    """Choose thresholds with a promised miss rate on fresh episodes.
 
-    `ask`, `run` and `evaluate` use what is stored. The episodes are kept in ASSESSMENT: a
-    calibration that was stopped goes on, and another promise costs nothing more. An assessment that
-    came with the package stays as it is; what is calibrated goes to runs/SCENARIO-shipped.
+    `ask`, `run` and `evaluate` use them. Episodes are kept in ASSESSMENT: a stopped calibration
+    continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
+    copy is written to runs/SCENARIO-shipped.
     """
     from drake_safety.evaluation.calibration_study import repeated_splits
     from drake_safety.evaluation.scorers import assessment_scorer
@@ -120,11 +120,11 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
     one = next(iter(found.values()))[0]
     table = new_table(
         "mode",
-        "judged by",
+        "score",
         "safe from Γ",
         "unsafe below",
-        "unsafe called safe",
-        "safe called safe",
+        "misses",
+        "safe recall",
         title=f"Promised: {one.promise}",
     )
     for mode, calibrations in found.items():
@@ -142,17 +142,17 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
 
 def _splits_table(kind: str, promises: list[PromiseKept], num_splits: int) -> Table:
     table = new_table(
-        "promised [%]",
+        "promised miss rate [%]",
         "observed [%]",
         "splits above it [%]",
-        "safe called safe [%]",
-        title=f"{MODES[0]}, {kind}: calibrated on one half and judged on the other, "
+        "safe recall [%]",
+        title=f"{MODES[0]}, {kind}: calibrated on one half and tested on the other, "
         f"{num_splits} splits",
     )
     for one in promises:
         promised = f"{100 * one.miss_rate:g}"
         if one.observed.n == 0:
-            missing = f"takes {one.num_needed} unsafe episodes a half; there are "
+            missing = f"needs {one.num_needed} unsafe episodes in each half; there are "
             table.add_row(promised, f"{missing}{one.num_calibration}", "-", "-")
             continue
         table.add_row(

@@ -1,4 +1,4 @@
-"""``drake-safety compare``: one table over several robots or scenarios."""
+"""``drake-safety compare``: one table of several scenarios."""
 
 from __future__ import annotations
 
@@ -26,20 +26,19 @@ def compare(
     scenarios: Annotated[
         list[str], typer.Argument(help="Names of scenarios, or paths of YAML files.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder: one inside it a scenario, and the table.")],
-    episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=20)] = 2048,
-    fresh: Annotated[int, typer.Option(help="Fresh nominal episodes to judge by.", min=20)] = 500,
+    out: Annotated[Path, typer.Option(help="Folder for the table and a subfolder per scenario.")],
+    episodes: Annotated[int, typer.Option(help="Nominal training episodes.", min=20)] = 2048,
+    fresh: Annotated[int, typer.Option(help="Fresh nominal episodes for tests.", min=20)] = 500,
     throws: Annotated[
-        int, typer.Option(help="Fresh balls at the actual plant, where it can recover.", min=1)
+        int, typer.Option(help="Fresh throws at the actual plant, for tasks with recovery.", min=1)
     ] = 300,
-    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed.")] = 0,
     workers: WorkersOption = None,
 ) -> None:
-    """Train several scenarios alike and write one table: recalls, falls with and without recovery.
+    """Train and evaluate scenarios in one table: recalls, falls with and without recovery.
 
-    Where nothing recovers plans alone are judged. A picture shows the robots beside the table.
-
-    A comparison that was stopped goes on when it is called again; finished rows are kept.
+    Without recovery only plans are evaluated. A figure shows the robots. A stopped comparison
+    continues when called again; finished rows are kept.
     """
     from drake_safety.evaluation.comparison import (
         Effort,
@@ -63,7 +62,7 @@ def compare(
                 scenario, out / scenario.name, effort, num_workers=workers, progress=stages
             )
             rows.append(row)
-            # After every row: what is finished can be read while the next is simulated.
+            # After every row, so that finished rows can be read during the next.
             _write(out, rows, comparison_table(rows))
     console.print(figures_table(comparison_table(rows)))
     for suffix in ("json", "csv", "md"):

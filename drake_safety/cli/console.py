@@ -1,4 +1,4 @@
-"""What all commands share: the arguments that several take, and what they write with."""
+"""Common arguments and output of the commands."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from drake_safety.cli.training_folder import AssessmentFolder
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.report.tables import Table as Figures
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
@@ -55,17 +55,17 @@ WorkersOption = Annotated[
     int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
 ]
 
-# Square brackets are units here, not markup. A log has no width of its own.
+# Square brackets are units here, not markup. Output to a file has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 
 
 def new_table(*columns: str, title: str | None = None) -> Table:
-    """A table whose cells fold where they do not fit: no figure is cut short."""
+    """A table whose cells fold if they do not fit, so that no number is truncated."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
 
 
 def figures_table(found: Figures) -> Table:
-    """A table of the report on the console: figures with their intervals, and what they mean.
+    """A table of the report for the console, with its explanation.
 
     Args:
         found: The table.
@@ -73,21 +73,22 @@ def figures_table(found: Figures) -> Table:
     table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
     for row in found.rows:
         cells = [
-            column.text(figure) for column, figure in zip(found.columns, row.figures, strict=True)
+            column.text(estimate)
+            for column, estimate in zip(found.columns, row.estimates, strict=True)
         ]
         table.add_row(row.label, *cells)
-    ahead = found.rivals_ahead()
+    ahead = found.better_baselines()
     table.caption = found.meaning or None
     if ahead:
-        table.caption = f"{found.meaning}\nAhead of sharpened: {'; '.join(ahead)}"
+        table.caption = f"{found.meaning}\nBetter than sharpened: {'; '.join(ahead)}"
     return table
 
 
-def interval(figure: Figure, scale: float = 1.0, digits: int = 3) -> str:
-    """A figure with its interval, as tables show it; a dash where there was nothing to see."""
-    if math.isnan(figure.value):
+def interval(estimate: Estimate, scale: float = 1.0, digits: int = 3) -> str:
+    """An estimate with its interval; a dash for NaN."""
+    if math.isnan(estimate.value):
         return "-"
-    value, low, high = (scale * x for x in (figure.value, figure.low, figure.high))
+    value, low, high = (scale * x for x in (estimate.value, estimate.low, estimate.high))
     return f"{value:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
 
 
@@ -113,37 +114,37 @@ def cause_words(
 
 
 def print_path(what: str, path: Path) -> None:
-    """Prints a path whole on one line, so that it can be copied."""
+    """Prints a path without line breaks, so that it can be copied."""
     console.print(what, str(path), soft_wrap=True, highlight=False)
 
 
 def print_shipped(folder: AssessmentFolder) -> None:
-    """Says which assessment is used where none was asked for."""
+    """Prints which assessment is used by default."""
     if folder.is_shipped:
         print_path("assessment        comes with the package,", folder.path)
 
 
 def command_line(program: str = "drake-safety") -> str:
-    """The command as it was typed.
+    """The command line.
 
     Args:
-        program: What was called.
+        program: Name of the program.
     """
     return shlex.join([*program.split(), *sys.argv[1:]])
 
 
 def versions() -> dict[str, str]:
-    """Versions of the library and of what its figures depend on."""
+    """Versions of the library and of packages that its results depend on."""
     from drake_safety.learning.segments import installed_versions
 
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
 class Stages:
-    """Progress bars, one a stage, that show the time left.
+    """Progress bars, one a stage, with the remaining time.
 
     Args:
-        progress: Where the bars stand.
+        progress: Display of the bars.
     """
 
     def __init__(self, progress: Progress):
@@ -151,12 +152,12 @@ class Stages:
         self._tasks: dict[str, TaskID] = {}
 
     def __call__(self, stage: str, done: float, total: float) -> None:
-        """Shows a stage's bar, made at the first call.
+        """Updates the bar of a stage, created at the first call.
 
         Args:
-            stage: What is under way.
-            done: How much of it is done.
-            total: How much there is.
+            stage: Name of the stage.
+            done: Number done.
+            total: Number wanted.
         """
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(stage, total=total)
@@ -165,7 +166,7 @@ class Stages:
 
 @contextlib.contextmanager
 def open_stages() -> Iterator[Stages]:
-    """Shows the stages of a command for as long as the block runs."""
+    """Shows progress bars while the block runs."""
     columns = (
         TextColumn("{task.description:<34}"),
         BarColumn(bar_width=30),

@@ -1,4 +1,4 @@
-"""``drake-safety evaluate``: judges Γ on fresh episodes and throws, beside its rivals."""
+"""``drake-safety evaluate``: evaluates Γ on fresh episodes and throws, beside baselines."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Picture
+    from matplotlib.figure import Figure
 
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.throw_study import ThrowStudy
     from drake_safety.learning.segments import Episodes
 
@@ -55,20 +55,20 @@ def evaluate(
     throws: Annotated[
         int | None,
         typer.Option(
-            help="Fresh balls at the actual plant; 600 by default, none where nothing recovers.",
+            help="Fresh throws at the actual plant; 600 by default for tasks with recovery.",
             min=0,
         ),
     ] = None,
     calibration_episodes: Annotated[
-        int, typer.Option(help="Other nominal episodes, to choose the recalls' thresholds.", min=20)
+        int, typer.Option(help="Other nominal episodes, for thresholds of the recalls.", min=20)
     ] = 300,
     calibration_throws: Annotated[
-        int, typer.Option(help="Other balls, to choose the classifiers' thresholds.", min=1)
+        int, typer.Option(help="Other throws, for thresholds of the baseline classifiers.", min=1)
     ] = 200,
     other_hand: Annotated[
         int | None,
         typer.Option(
-            help="Targets: how many to mirror to the other hand; at most 400 by default.", min=0
+            help="Targets: number mirrored to the other hand; at most 400 by default.", min=0
         ),
     ] = None,
     plane_x: Annotated[
@@ -77,13 +77,15 @@ def evaluate(
     ] = None,
     plane_step: Annotated[
         float,
-        typer.Option(help="Targets: spacing of those simulated on it [m]; 0 leaves it out.", min=0),
+        typer.Option(
+            help="Targets: spacing of those simulated on it [m]; 0 to leave it out.", min=0
+        ),
     ] = 0.1,
     pushes: Annotated[
         int,
         typer.Option(
-            help="Targets: motions on whose way the actual robot is pushed, to see who notices; "
-            "as many more for thresholds.",
+            help="Targets: pushed motions of the actual robot, to evaluate alarms; as many more "
+            "for thresholds.",
             min=0,
         ),
     ] = 0,
@@ -91,23 +93,22 @@ def evaluate(
         bool,
         typer.Option(
             "--baselines/--no-baselines",
-            help="Beside direct classifiers, trained on the same episodes; takes half of the time.",
+            help="Baseline classifiers, trained on the same episodes; they take half of the time.",
         ),
     ] = True,
     seed: Annotated[
-        int, typer.Option(help="First of the seeds of all that is fresh.")
+        int, typer.Option(help="First of the seeds of fresh simulations.")
     ] = EVALUATION.first,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
-    """Judge Γ on fresh episodes and throws, beside the paper's form and direct classifiers.
+    """Evaluate Γ on fresh episodes and throws, beside the paper's form and baseline classifiers.
 
-    Where plans have a goal, Γ is judged on fresh targets, before anything moves, and beside inverse
-    kinematics too. Episodes are kept in ASSESSMENT: an evaluation that was stopped goes on.
-    With throws, or --pushes, Γ is judged as an alarm too, beside margins and errors that one would
-    watch instead.
+    For plans with a goal, verdicts on fresh targets at k = 0 are evaluated, beside inverse
+    kinematics. Episodes are kept in ASSESSMENT: a stopped evaluation continues. With throws, or
+    --pushes, Γ is evaluated as an alarm too, beside margins and tracking errors.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
@@ -132,7 +133,7 @@ def evaluate(
     if throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
     if pushes:
-        require(loop, HasGoals, "evaluate: leave out --pushes; thrown balls are watched, too")
+        require(loop, HasGoals, "evaluate: leave out --pushes; alarms are evaluated on throws")
         require(loop, CanBePushed, "evaluate: leave out --pushes")
         loaded.variation("actual")
     options = PlanOptions(
@@ -198,7 +199,7 @@ def evaluate(
                     judged,
                     pushes,
                     pushes,
-                    threshold=findings.figures["plans.sharpened.threshold"].value,
+                    threshold=findings.estimates["plans.sharpened.threshold"].value,
                     seed=seeds["disturbances"],
                     calibration_seed=seeds["disturbance thresholds"],
                 )
@@ -213,11 +214,11 @@ def evaluate(
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
         **findings.entries,
-        **{key: figure.to_json() for key, figure in findings.figures.items()},
+        **{key: estimate.to_json() for key, estimate in findings.estimates.items()},
     }
     file = folder / "evaluation.json"
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for table in verdict_tables(Results(figures=findings.figures)):
+    for table in verdict_tables(Results(estimates=findings.estimates)):
         console.print(figures_table(table))
     print_path("figures", file)
     for picture in findings.pictures:
@@ -225,7 +226,7 @@ def evaluate(
 
 
 def _evaluate_segments(judged: Judged) -> Findings:
-    """Everyone on fresh episodes, per segment and at k = 0."""
+    """Evaluates all scorers on fresh episodes, on every segment and at k = 0."""
     from drake_safety.evaluation.episode_study import evaluate_episodes
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.roc_figure import roc_figure
@@ -236,10 +237,10 @@ def _evaluate_segments(judged: Judged) -> Findings:
         assessment_scorer("paper", judged.paper, "calibrated"),
         *judged.classifiers,
     ]
-    figures, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
+    estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
     curves = {name: (score, labels) for name, score in scores.items()}
     return Findings(
-        figures=figures,
+        estimates=estimates,
         pictures=save(roc_figure(curves), judged.folder / "roc"),
     )
 
@@ -247,7 +248,7 @@ def _evaluate_segments(judged: Judged) -> Findings:
 def _evaluate_throws(
     judged: Judged, num_throws: int, num_calibration: int, seeds: dict[str, int]
 ) -> Findings:
-    """Everyone as a trigger of recovery."""
+    """Evaluates all rules as triggers of recovery, and alarms on the same throws."""
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
     from drake_safety.simulation.watched_motion import WatchedMotion
@@ -270,10 +271,10 @@ def _evaluate_throws(
         num_workers=judged.workers,
         progress=judged.stages,
     )
-    figures = dict(study.figures)
-    figures["throws.falls_with_recovery"] = figures["throws.sharpened.falls_with_recovery"]
+    estimates = dict(study.estimates)
+    estimates["throws.falls_with_recovery"] = estimates["throws.sharpened.falls_with_recovery"]
     findings = Findings(
-        figures=figures,
+        estimates=estimates,
         pictures=save(_throws_picture(study), judged.folder / "throws"),
     )
     findings.add(
@@ -286,7 +287,7 @@ def _evaluate_throws(
     return findings
 
 
-def _throws_picture(study: ThrowStudy) -> Picture:
+def _throws_picture(study: ThrowStudy) -> Figure:
     from drake_safety.evaluation.throws_figure import throws_figure
 
     balls = [log.throw for log in study.logs]
@@ -294,7 +295,7 @@ def _throws_picture(study: ThrowStudy) -> Picture:
         np.array([ball.speed_m_s for ball in balls]),
         np.array([ball.direction_rad for ball in balls]),
         {
-            "balancing alone": study.outcomes(),
+            "without recovery": study.outcomes(),
             "with recovery, triggered by Γ": study.outcomes("sharpened"),
         },
         mass_kg=np.array([ball.mass_kg for ball in balls]),
@@ -302,7 +303,7 @@ def _throws_picture(study: ThrowStudy) -> Picture:
 
 
 def _evaluate_calibration(judged: Judged) -> Findings:
-    """Reliability of either mode at k = 0, and whether stored promises are kept."""
+    """Reliability of both modes at k = 0, and rates of stored calibrations."""
     from drake_safety.evaluation.calibration_study import reliability, verdict_shares
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.metrics import Bootstrap
@@ -312,7 +313,7 @@ def _evaluate_calibration(judged: Judged) -> Findings:
     from drake_safety.learning.segments import split
 
     segments = split(judged.test_set, stride=1, discount=1.0, shortest=1)
-    figures: dict[str, Figure] = {}
+    estimates: dict[str, Estimate] = {}
     curves = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
         score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
@@ -325,12 +326,15 @@ def _evaluate_calibration(judged: Judged) -> Findings:
             drawn = np.repeat(np.arange(len(p)), weight.astype(int))
             return reliability(p[drawn], label[drawn]).calibration_error
 
-        figures[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
+        estimates[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
             num_resamples=100
         ).over_episodes(error, np.arange(len(expected)))
         for kind, one in gamma.calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            figures |= {f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()}
+            estimates |= {
+                f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()
+            }
     return Findings(
-        figures=figures, pictures=save(reliability_figure(curves), judged.folder / "reliability")
+        estimates=estimates,
+        pictures=save(reliability_figure(curves), judged.folder / "reliability"),
     )

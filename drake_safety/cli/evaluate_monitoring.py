@@ -1,4 +1,4 @@
-"""What ``evaluate`` does with pushed motions: Γ as an alarm, beside what one watches instead."""
+"""Evaluation of alarms on pushed motions by ``evaluate``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drake_safety.cli.training_folder import fresh_episodes_folder
 if TYPE_CHECKING:
     from drake_safety.simulation.watched_motion import WatchedMotion
 
-_PLANT = "actual"  # Which is pushed.
+_PLANT = "actual"
 
 
 def evaluate_pushes(
@@ -24,17 +24,17 @@ def evaluate_pushes(
     seed: int,
     calibration_seed: int,
 ) -> Findings:
-    """Pushes a robot on its way to goals that it accepts, and reaches safely by itself.
+    """Evaluates alarms on motions to accepted goals that are safe without a push.
 
-    The motions are kept with the run, as other fresh sets are; those to goals that Γ refuses, too.
+    All motions are kept with the run, as other fresh sets are.
 
     Args:
-        judged: What is judged.
-        num_motions: Fresh motions, each undisturbed and pushed.
-        num_calibration: Other motions, for thresholds.
-        threshold: From which the calibrated Γ accepts a goal.
-        seed: Of the motions.
-        calibration_seed: Of the others.
+        judged: The evaluated assessments.
+        num_motions: Number of test motions, each undisturbed and pushed.
+        num_calibration: Number of calibration motions.
+        threshold: Lowest calibrated Γ of an accepted goal.
+        seed: Seed of the test motions.
+        calibration_seed: Seed of the calibration motions.
     """
     from drake_safety.evaluation.metrics import proportion
     from drake_safety.evaluation.monitoring_study import begun
@@ -63,7 +63,7 @@ def evaluate_pushes(
     calibration = run("calibration pushes", num_calibration, calibration_seed)
     accepted = begun(test, verdict, threshold)
     findings = Findings(
-        figures={"monitoring.motions.refused": proportion(len(test) - len(accepted), len(test))}
+        estimates={"monitoring.motions.refused": proportion(len(test) - len(accepted), len(test))}
     )
     findings.add(evaluate_monitoring(judged, begun(calibration, verdict, threshold), accepted))
     return findings
@@ -72,12 +72,12 @@ def evaluate_pushes(
 def evaluate_monitoring(
     judged: Judged, calibration: Sequence[WatchedMotion], test: Sequence[WatchedMotion]
 ) -> Findings:
-    """Judges everyone who could watch these motions.
+    """Evaluates all alarms on given motions.
 
     Args:
-        judged: What is judged.
+        judged: The evaluated assessments.
         calibration: Motions on which thresholds are chosen.
-        test: Fresh motions.
+        test: Test motions.
     """
     from drake_safety.evaluation.alarms import assessment_alarms, scorer_alarm, threshold_alarms
     from drake_safety.evaluation.figure_style import save
@@ -86,7 +86,7 @@ def evaluate_monitoring(
     from drake_safety.simulation.capabilities import CanFall
 
     if all(motion.has_left for motion in calibration):
-        # Nobody could be allowed the same share of false alarms: thresholds need calm motions.
+        # Thresholds need motions that stay safe.
         return Findings()
     loop = judged.scenario.make_loop()
     watched = loop.watched_features if isinstance(loop, CanFall) else {}
@@ -98,6 +98,6 @@ def evaluate_monitoring(
     ]
     study = evaluate_alarms(alarms, calibration, test)
     return Findings(
-        figures=study.figures,
+        estimates=study.estimates,
         pictures=save(monitoring_figure(study), judged.folder / "monitoring"),
     )

@@ -1,4 +1,4 @@
-"""What ``evaluate`` does for tasks whose plans have a goal: verdicts before anything moves."""
+"""Evaluation of verdicts on plans with a goal by ``evaluate``."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _DEFAULT_OTHER_HAND = 400
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions:
-    """What the command line may ask for beyond verdicts on fresh targets.
+    """Options of the command line.
 
     Attributes:
-        other_hand: Number of targets that are mirrored to the other hand; None for the default.
-        plane_x: Where the plane of the reachable region is [m]; None for the task's own.
-        plane_step: Between two of its simulated targets [m]; 0 leaves it out.
+        other_hand: Number of targets mirrored to the other hand; None for the default.
+        plane_x: Position of the plane of the reachable region [m]; None for that of the task.
+        plane_step: Spacing of its simulated targets [m]; 0 to leave it out.
     """
 
     other_hand: int | None = None
@@ -35,14 +35,14 @@ class PlanOptions:
 
 
 def check_options(loop: ClosedLoop, options: PlanOptions) -> None:
-    """Refuses what cannot be, before anything is simulated for it.
+    """Checks options before the simulations.
 
     Args:
-        loop: The task's nominal diagram.
-        options: What is asked for.
+        loop: The nominal diagram of the task.
+        options: The options.
 
     Raises:
-        ValueError: It cannot be.
+        ValueError: The task does not support an option.
     """
     from drake_safety.evaluation.reachable_region import plane_of
     from drake_safety.simulation.capabilities import HasGoals, require
@@ -70,13 +70,13 @@ def _mirror_options(loop: ClosedLoop) -> dict[str, Any]:
 def evaluate_plans(
     judged: Judged, options: PlanOptions, run_set: Callable[..., Episodes]
 ) -> Findings:
-    """Judges Γ and its rivals at k = 0 on fresh targets, for either hand.
+    """Evaluates Γ and baselines at k = 0 on fresh targets, for both hands.
 
     Args:
-        judged: What is judged.
-        options: What is asked for.
-        run_set: Simulates the episodes of the other hand: takes what they are, their number and
-            options of the task's diagram.
+        judged: The evaluated assessments.
+        options: The options.
+        run_set: Simulates the episodes of the other hand, given the name of the stage, their number
+            and options of the diagram.
     """
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.plan_study import evaluate_plans, plans_of
@@ -94,7 +94,7 @@ def evaluate_plans(
     if num_other is None:
         num_other = min(len(judged.test_set), _DEFAULT_OTHER_HAND)
     if mirror and num_other:
-        # The same draws: what this hand is asked for is the mirror image of what that one was.
+        # The same random draws, mirrored.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
         sets["plans.other_hand"] = plans_of(
             scenario.make_loop(**judging_options(type(loop)), **mirror), episodes
@@ -102,7 +102,7 @@ def evaluate_plans(
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     twins = [key for key in sets if key != "plans"]
     study = evaluate_plans(rules, sharpened, calibration, sets, twins)
-    figures = dict(study.figures)
+    estimates = dict(study.estimates)
     pictures = _pictures(study, test, judged.folder)
     if options.plane_step:
         region = reachable_region(
@@ -114,11 +114,13 @@ def evaluate_plans(
             num_workers=judged.workers,
             progress=judged.stages,
         )
-        figures |= {f"plans.plane.{key}": figure for key, figure in region.figures().items()}
+        estimates |= {
+            f"plans.plane.{key}": estimate for key, estimate in region.estimates().items()
+        }
         picture = region_figure(region, test.constraint_names)
         pictures += save(picture, judged.folder / "reachable_region")
     return Findings(
-        figures=figures,
+        estimates=estimates,
         entries={"calibration_episodes": len(judged.calibration_set)},
         pictures=pictures,
     )

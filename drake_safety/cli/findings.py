@@ -1,4 +1,4 @@
-"""What the parts of ``evaluate`` are given, and what they hand back."""
+"""Inputs and results of the parts of ``evaluate``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drake_safety.cli.console import Stages
-    from drake_safety.evaluation.metrics import Figure
+    from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.scorers import Scorer
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What is judged, and by what.
+    """The evaluated assessments and baselines, and the episodes.
 
     Attributes:
         scenario: The scenario.
         sharpened: Γ.
         paper: Γ in the paper's form.
-        classifiers: Direct classifiers.
-        run_folder: Folder that `train` wrote.
-        train_set: The episodes that all of them have learned from.
-        calibration_set: Fresh episodes, for thresholds and other choices.
-        test_set: Fresh episodes.
-        folder: Where pictures go.
-        workers: Processes; None for as many as there are cores.
-        stages: Shows how far it is.
+        classifiers: Baseline classifiers.
+        run_folder: Folder written by `train`.
+        train_set: Training episodes.
+        calibration_set: Fresh episodes for thresholds.
+        test_set: Other fresh episodes.
+        folder: Folder of the figures.
+        workers: Number of worker processes; None for one a core.
+        stages: Progress bars.
     """
 
     scenario: Scenario
@@ -49,20 +49,20 @@ class Judged:
 
 @dataclass(kw_only=True)
 class Findings:
-    """What was found.
+    """Results of a part.
 
     Attributes:
-        figures: By dotted key.
-        entries: What else belongs in the report.
-        pictures: Files that were written.
+        estimates: By dotted key.
+        entries: Other entries of the report.
+        pictures: Files of the figures.
     """
 
-    figures: dict[str, Figure] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
     entries: dict[str, Any] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
 
     def add(self, other: Findings) -> None:
-        """Takes over what another part has found."""
-        self.figures |= other.figures
+        """Adds the results of another part."""
+        self.estimates |= other.estimates
         self.entries |= other.entries
         self.pictures += other.pictures

@@ -1,4 +1,4 @@
-"""``drake-safety play``: throw balls, move targets, and watch what Γ makes of it."""
+"""``drake-safety play``: throw balls or move targets interactively, with Γ beside the robot."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def play(
     scenario: ScenarioArgument,
     assessment: AssessmentOption = None,
     hand: HandOption = None,
-    variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
+    variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
     recovery: Annotated[
         bool | None,
-        typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
+        typer.Option("--recovery/--no-recovery", help="Recovery steps; on by default."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
@@ -30,9 +30,9 @@ def play(
         int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")
     ] = None,
 ) -> None:
-    """Play with the robot in the browser, in real time, until Stop or Ctrl-C.
+    """Run the robot in the browser, in real time, until Stop or Ctrl-C.
 
-    Sliders and buttons throw a ball or move the target; Γ, belief and verdict stand beside it.
+    Sliders and buttons throw a ball or move the target; Γ, belief and verdict are shown.
     """
     from pydrake.geometry import Meshcat, MeshcatParams
 
@@ -45,7 +45,7 @@ def play(
     gamma = load_assessment(folder.path, mode)
     given = {"hand": hand, "recovery": recovery}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    # What a task offers is asked of its diagram, before a browser is opened for it.
+    # Check the capabilities of the task before a browser is opened.
     asked = loaded.make_loop(variation, assessment=gamma, **options)
     has_goals = isinstance(asked, HasGoals)
     if not has_goals:

@@ -1,4 +1,4 @@
-"""What comes before a training: ``drake-safety scenarios``, ``new`` and ``check``."""
+"""Commands before training: ``drake-safety scenarios``, ``new`` and ``check``."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def new(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
-    """Write a robot's folder and its first scenario from a URDF, to be looked over.
+    """Write the folder of a robot and a first scenario from a URDF, for review.
 
-    What a URDF does not tell is marked ASK in the files, with its unit.
+    Values that a URDF does not have are marked ASK in the files, with their units.
     """
     from drake_safety.robots.robot_template import write_robot
 
@@ -82,9 +82,9 @@ def check(
     ] = 16,
     seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
 ) -> None:
-    """Say what a scenario and its robot lack, item by item, and how to mend it.
+    """Check a scenario and its robot, and print problems with their remedies.
 
-    The exit code is 1 when there is a problem.
+    The exit code is 1 if there is a problem.
     """
     from drake_safety.simulation.scenario_check import check_scenario
 

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Folder that `train` and more wrote.")],
+    run: Annotated[Path, typer.Argument(help="Folder written by `train` and other commands.")],
 ) -> None:
-    """Write one self-contained HTML page about a run, into RUN/report.
+    """Write a self-contained HTML page of a run into RUN/report.
 
-    A run that is not finished gets a page, too: it says what is missing.
+    The page of an unfinished run lists the missing parts.
     """
     from drake_safety.evaluation.report.page import write_report
     from drake_safety.evaluation.report.run_folder import read_run
@@ -36,7 +36,7 @@ def report(
 
 
 def _angular_constraints(run: Run) -> tuple[str, ...]:
-    """Constraints whose margins are angles; none where the task cannot be asked any more."""
+    """Constraints whose margins are angles; empty if the task cannot be loaded."""
     import yaml
 
     from drake_safety.simulation.capabilities import angular_constraints

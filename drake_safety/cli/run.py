@@ -1,4 +1,4 @@
-"""``drake-safety run``: simulates once with Γ in the loop, and shows what happened when."""
+"""``drake-safety run``: simulates once with Γ in the loop, and shows the events."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from drake_safety.cli.run_settings import (
     Recording,
     RunSettings,
     events_table,
-    save_moving_picture,
 )
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
@@ -46,7 +45,7 @@ _PORTS = (
     "predicted_margins",
     "ball_state",
 )
-# Of a ball on the command line: the key there, and the field of a throw.
+# Keys of a ball on the command line, and fields of a throw.
 _THROW_FIELDS = {
     "time": "time_s",
     "mass": "mass_kg",
@@ -70,20 +69,21 @@ def run(
     push: Annotated[
         list[str] | None,
         typer.Option(
-            help="On the way to a target: a push that the scenario names. Else: 'ball' throws the "
-            "scenario's own balls; or your own, repeatable: 'time=1 mass=3 speed=9 direction=90' "
+            help="With a target: the name of a push in the scenario. Otherwise: 'ball' for the "
+            "scenario's balls, or a ball, repeatable: 'time=1 mass=3 speed=9 direction=90' "
             "[s, kg, m/s, degrees from x]."
         ),
     ] = None,
-    variation: Annotated[str, typer.Option(help="Which plant.")] = "actual",
+    variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
     recovery: Annotated[
         bool | None,
-        typer.Option("--recovery/--no-recovery", help="Step when Γ falls; it does by default."),
+        typer.Option("--recovery/--no-recovery", help="Recovery steps; on by default."),
     ] = None,
     duration: Annotated[
         float | None,
         typer.Option(
-            help="Seconds to simulate; 5, or to a target one more than an episode.", min=0.1
+            help="Seconds to simulate; by default 5, or with a target one more than an episode.",
+            min=0.1,
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = (
@@ -93,20 +93,20 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for recording and pictures; by default ASSESSMENT, or else "
+            help="Folder for recording and figures; by default ASSESSMENT, or else "
             "runs/SCENARIO-shipped."
         ),
     ] = None,
     meshcat: Annotated[
-        bool, typer.Option("--meshcat", help="Watch live in the browser, in real time.")
+        bool, typer.Option("--meshcat", help="Show the run live in the browser, in real time.")
     ] = False,
     animation: Annotated[
-        bool, typer.Option("--animation", help="Also write a moving picture, animation.gif.")
+        bool, typer.Option("--animation", help="Also write animation.gif.")
     ] = False,
 ) -> None:
-    """Simulate once with Γ in the loop: a recording, a timeline, and what happened when.
+    """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
-    A target that Γ refuses is not gone to, and the exit code is 1; --force goes there.
+    If Γ refuses a target, nothing moves and the exit code is 1; --force goes there.
     """
     from drake_safety.simulation.capabilities import HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
@@ -134,11 +134,11 @@ def run(
         return
     if force:
         raise ValueError(f"run: --force goes to a target that Γ refuses: pass {TARGET} too")
-    # What a task offers is asked of its diagram, before a browser is opened for it.
+    # Check the capabilities of the task before a browser is opened.
     loop = settings.make_loop()
     if isinstance(loop, HasGoals):
         raise ValueError(
-            f"run: task '{type(loop).__name__}' goes to a target: pass {TARGET} X Y Z, or one of "
+            f"run: task '{type(loop).__name__}' needs a target: pass {TARGET} X Y Z, or one of "
             f"the names {list(loop.named_targets)}"
         )
     require(loop, HasBall, "run")
@@ -165,8 +165,7 @@ def _run_with_balls(settings: RunSettings) -> None:
     recording.save(
         _timeline(loop, log, throws), _table_of_events(loop, settings.assessment, log, throws)
     )
-    save_moving_picture(
-        settings,
+    recording.save_animation(
         loop,
         log.time_s,
         {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]},
@@ -177,14 +176,14 @@ def _run_with_balls(settings: RunSettings) -> None:
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
-    """The balls that ``--push`` asks for.
+    """The balls of ``--push``.
 
     Args:
-        scenario: Whose own balls 'ball' throws.
+        scenario: The scenario, whose balls 'ball' stands for.
         pushes: Each 'ball', or KEY=NUMBER pairs.
 
     Raises:
-        ValueError: An unknown key, what is no number, or a ball that cannot be.
+        ValueError: A key is unknown, a value is not a number, or a ball is invalid.
     """
     from drake_safety.plants.balls import Throw
 

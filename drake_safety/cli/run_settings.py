@@ -1,4 +1,4 @@
-"""What every kind of run is given, and the recording that it leaves."""
+"""Settings and recordings of runs."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ LOG_PERIOD_S = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """What ``drake-safety run`` was asked for.
+    """Settings of ``drake-safety run``.
 
     Attributes:
         scenario: The scenario.
         assessment: Γ.
-        variation: Which plant.
-        options: Of the task's diagram.
-        pushes: As they were typed.
-        seed: Of start, plan and noise.
-        duration_s: How long to simulate [s]; None for as long as this kind of run takes.
-        folder: Where recording and pictures go.
-        is_live: Whether somebody watches in the browser, in real time.
-        is_animated: Whether a moving picture is wanted, too.
+        variation: Variation of the plant.
+        options: Options of the diagram.
+        pushes: Values of ``--push``.
+        seed: Seed of start, plan and noise.
+        duration_s: Duration of the simulation [s]; None for the default.
+        folder: Folder of recording and figures.
+        is_live: Whether the run is shown in the browser, in real time.
+        is_animated: Whether an animation is written.
     """
 
     scenario: Scenario
@@ -53,15 +53,15 @@ class RunSettings:
 
     @property
     def realtime_rate(self) -> float:
-        """How fast to run at most; 0 for as fast as it goes."""
+        """Target real-time rate; 0 for as fast as possible."""
         return 1.0 if self.is_live else 0.0
 
     def make_loop(self, meshcat: Meshcat | None = None, **options: Any) -> ClosedLoop:
-        """The task's diagram.
+        """Makes the diagram of the task.
 
         Args:
-            meshcat: Adds a visualiser.
-            **options: More of the task's options.
+            meshcat: Adds a visualizer.
+            **options: More options of the diagram.
         """
         return self.scenario.make_loop(
             self.variation,
@@ -73,10 +73,10 @@ class RunSettings:
 
 
 class Recording:
-    """A run in Meshcat: watched live, and kept as one HTML file.
+    """A run in Meshcat, shown live or recorded in one HTML file.
 
     Args:
-        settings: Of the run.
+        settings: Settings of the run.
     """
 
     def __init__(self, settings: RunSettings):
@@ -88,17 +88,17 @@ class Recording:
             console.print(f"live at {self.viewer.web_url()}")
 
     def start(self) -> None:
-        """Records from here on; waits for whoever watches live."""
+        """Starts recording; with a live view, after the user confirms."""
         if self._settings.is_live:
             input("Press Enter when the browser shows the robot. ")
         self.viewer.StartRecording()
 
     def save(self, timeline: Figure, events: Table) -> None:
-        """Writes recording and timeline, and prints the events and where both are.
+        """Writes recording and timeline, and prints the events and the paths.
 
         Args:
-            timeline: Γ over the time of the run.
-            events: What happened when.
+            timeline: Figure of Γ over time.
+            events: Table of the events.
         """
         from drake_safety.evaluation.figure_style import save
 
@@ -115,14 +115,49 @@ class Recording:
         for path in pictures:
             print_path("picture  ", path)
 
+    def save_animation(
+        self,
+        loop: ClosedLoop,
+        time_s: np.ndarray,
+        states: Mapping[str, np.ndarray],
+        gamma: np.ndarray,
+        threshold: float,
+        event_times_s: Sequence[float],
+    ) -> None:
+        """Writes animation.gif beside the recording, if the settings ask for it.
+
+        Args:
+            loop: The simulated closed loop.
+            time_s: Instants of its log [s], (N,).
+            states: Positions and velocities by name of the model instance, (N, n).
+            gamma: Safety probability, (N,).
+            threshold: Threshold on Γ of triggers or alarms.
+            event_times_s: Times of these [s].
+        """
+        if not self._settings.is_animated:
+            return
+        from drake_safety.evaluation.animation import save_animation
+        from drake_safety.evaluation.stills import stack_positions
+
+        path = save_animation(
+            loop,
+            time_s,
+            stack_positions(loop, states),
+            gamma,
+            threshold,
+            self._settings.folder / "animation.gif",
+            event_times_s=event_times_s,
+        )
+        print_path("animation", path)
+
 
 def events_table(
     events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray
 ) -> Table:
-    """What happened when, and what Γ was then.
+    """A table of events with Γ at their times.
 
     Args:
-        events: When [s], and what.
+        events: Times [s] and descriptions.
         time_s: Instants of the log [s], (N,).
         gamma: Safety probability, (N,).
     """
@@ -133,45 +168,8 @@ def events_table(
     return table
 
 
-def save_moving_picture(
-    settings: RunSettings,
-    loop: ClosedLoop,
-    time_s: np.ndarray,
-    states: Mapping[str, np.ndarray],
-    gamma: np.ndarray,
-    threshold: float,
-    event_times_s: Sequence[float],
-) -> None:
-    """Writes animation.gif beside the recording, if it was asked for.
-
-    Args:
-        settings: Of the run.
-        loop: The closed loop that was simulated.
-        time_s: Instants of its log [s], (N,).
-        states: Per model instance by name its positions and velocities, (N, n).
-        gamma: Safety probability, (N,).
-        threshold: Below it something is done.
-        event_times_s: When it was [s].
-    """
-    if not settings.is_animated:
-        return
-    from drake_safety.evaluation.animation import save_animation
-    from drake_safety.evaluation.stills import stack_positions
-
-    path = save_animation(
-        loop,
-        time_s,
-        stack_positions(loop, states),
-        gamma,
-        threshold,
-        settings.folder / "animation.gif",
-        event_times_s=event_times_s,
-    )
-    print_path("animation", path)
-
-
 def _events_json(events: Table) -> str:
-    """What happened when, for the report: where it comes from, and the table's columns and rows."""
+    """The events for the report: command, versions, columns and rows."""
     content = {
         "command": command_line(),
         "versions": versions(),

@@ -1,4 +1,4 @@
-"""``drake-safety run --target``: goes where Γ lets it go, or where it is forced to."""
+"""``drake-safety run --target``: a motion to a target that Γ accepts, or that is forced."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from drake_safety.cli.run_settings import (
     Recording,
     RunSettings,
     events_table,
-    save_moving_picture,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 
@@ -33,23 +32,23 @@ _MOTION_PORTS = (
     "predicted_margins",
 )
 _NUM_STILLS = 5
-_AFTER_PUSH_S = 0.15  # When a push shows.
-_AFTER_EPISODE_S = 1.0  # What is shown beyond an episode: whether the robot stays there.
+_AFTER_PUSH_S = 0.15  # Time at which the effect of a push is visible.
+_AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.
 
 
 def run_to_target(
     settings: RunSettings, target: str, rule: GoalThreshold, *, is_forced: bool
 ) -> bool:
-    """Tells the verdict on a target and, unless that is a refusal to be obeyed, goes there.
+    """Prints the verdict on a target and goes there if it is accepted or forced.
 
     Args:
-        settings: Of the run.
-        target: The target as it was typed.
-        rule: What the verdict on it is read from.
-        is_forced: Whether to go there in any case.
+        settings: Settings of the run.
+        target: Value of ``--target``.
+        rule: Thresholds of the verdict.
+        is_forced: Whether to go there even if it is refused.
 
     Returns:
-        Whether the robot went.
+        Whether the robot moved.
 
     Raises:
         ValueError: The task has no goals, or no such target, hand or push.
@@ -67,7 +66,7 @@ def run_to_target(
     nearest = None if verdict.is_accepted else nearest_accepted(loop, settings.assessment, verdict)
     print_verdict(loop, verdict, nearest, rule.remark)
     if not (verdict.is_accepted or is_forced):
-        console.print("refused: nothing moved; --force goes there all the same", highlight=False)
+        console.print("refused: nothing moved; --force goes there", highlight=False)
         return False
     recording = Recording(settings)
     loop = settings.make_loop(recording.viewer)
@@ -85,16 +84,15 @@ def run_to_target(
         ports=_MOTION_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    watched = settings.assessment.calibrations_.get("motion")
-    # While it moves there are many rows to judge: the promise of a motion has its own threshold.
-    threshold = threshold if watched is None else watched.threshold
+    calibration = settings.assessment.calibrations_.get("motion")
+    # A motion has many rows: its promise has its own threshold.
+    threshold = threshold if calibration is None else calibration.threshold
     recording.save(
         draw_motion(loop, motion, threshold),
         table_of_motion(loop, settings.assessment, motion, threshold),
     )
     alarm = alarm_row(motion, threshold)
-    save_moving_picture(
-        settings,
+    recording.save_animation(
         loop,
         motion.time_s,
         {loop.robot.name: motion.plant_state},
@@ -106,14 +104,14 @@ def run_to_target(
 
 
 def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
-    """The push that ``--push`` asks for, if it does.
+    """The push of ``--push``, if any.
 
     Args:
-        loop: Whose pushes there are.
-        names: What was asked for.
+        loop: The closed loop.
+        names: Values of ``--push``.
 
     Raises:
-        ValueError: No such push, or more than one.
+        ValueError: The push does not exist, or there is more than one.
     """
     from drake_safety.simulation.capabilities import CanBePushed, require
 
@@ -132,18 +130,18 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
 
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
-    """The first row in which Γ, accepted at the start, is below the threshold; None for never."""
+    """First row with Γ below the threshold, if Γ was above at the start; None for never."""
     is_below = ~(motion.extra["calibrated_safety_probability"][:, 0] >= threshold)
     return int(np.argmax(is_below)) if is_below.any() and not is_below[0] else None
 
 
 def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figure:
-    """Γ along a motion, with pictures of it.
+    """Plots Γ along a motion, with stills.
 
     Args:
-        loop: The closed loop that was simulated.
-        motion: What came of it, with Γ and what it expects.
-        threshold: From which Γ on a goal is accepted.
+        loop: The simulated closed loop.
+        motion: Log of the motion, with Γ and its predictions.
+        threshold: Lowest Γ of an accepted goal.
     """
     from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
     from drake_safety.evaluation.timeline_figure import timeline_figure
@@ -177,16 +175,16 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
 def table_of_motion(
     loop: ClosedLoop, assessment: SafetyAssessment, motion: GoalMotion, threshold: float
 ) -> Table:
-    """What happened when, and what Γ was then.
+    """A table of the events of a motion, with Γ at their times.
 
     Args:
-        loop: The closed loop that was simulated.
+        loop: The simulated closed loop.
         assessment: Γ.
-        motion: What came of it, with Γ and what it expects.
-        threshold: From which Γ on a goal is accepted.
+        motion: Log of the motion, with Γ and its predictions.
+        threshold: Lowest Γ of an accepted goal.
     """
     gamma = motion.extra["calibrated_safety_probability"][:, 0]
-    events = [(0.0, f"the {loop.hand} hand sets out")]
+    events = [(0.0, f"the {loop.hand} hand starts")]
     if motion.push is not None:
         push = motion.push
         events.append(

@@ -1,4 +1,4 @@
-"""Targets on the command line: how they are typed, and how a verdict on one is told."""
+"""Targets on the command line: parsing them, and printing verdicts."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from drake_safety.simulation.closed_loop import ClosedLoop
 
 TARGET = "--target"
-TARGET_HELP = "Where to reach: three numbers in the world [m], or a name that the scenario gives."
+TARGET_HELP = "Target: three numbers in the world frame [m], or a name in the scenario."
 HandOption = Annotated[
     str | None,
-    typer.Option("--hand", help="Which hand reaches; the one that was trained by default."),
+    typer.Option("--hand", help="Reaching hand; the trained one by default."),
 ]
 
-_SEARCH_SEED = 0  # The same question has the same answer.
+_SEARCH_SEED = 0  # Fixed, so that results are reproducible.
 
 
 class TargetCommand(TyperCommand):
-    """A command whose ``--target`` takes three numbers, negative ones too, or one name."""
+    """A command whose ``--target`` takes three numbers, possibly negative, or one name."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the arguments, the numbers of a target as one word."""
+        """Parses the arguments with the numbers of a target joined to one word."""
         return super().parse_args(ctx, join_targets(args))
 
 
@@ -63,14 +63,14 @@ def _is_number(word: str) -> bool:
 
 
 def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
-    """The target that ``--target`` asks for, in the world, (3,) [m].
+    """The target of ``--target`` in the world, (3,) [m].
 
     Args:
-        loop: Whose named targets there are.
-        text: A name, or three numbers with spaces between them.
+        loop: The closed loop, which names targets.
+        text: A name, or three numbers separated by spaces.
 
     Raises:
-        ValueError: The task's plans have no goal, no such name, or not three numbers.
+        ValueError: The plans of the task have no goal, or the text is neither.
     """
     from drake_safety.simulation.capabilities import HasGoals, require
 
@@ -89,7 +89,7 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
 def nearest_accepted(
     loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
 ) -> GoalVerdict | None:
-    """What would be accepted with reserve instead of a target that was refused, if anything."""
+    """The nearest target accepted with reserve to a refused one, if any."""
     from drake_safety.planning.nearest_goal import nearest_accepted_goal
 
     return nearest_accepted_goal(
@@ -104,13 +104,13 @@ def nearest_accepted(
 def print_verdict(
     loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, remark: str
 ) -> None:
-    """Tells a verdict, and if it is a refusal, why and what would be accepted.
+    """Prints a verdict; for a refusal also the likely cause and the nearest accepted target.
 
     Args:
-        loop: The closed loop that was asked about.
+        loop: The closed loop.
         verdict: The verdict.
-        nearest: The nearest target that would be accepted; told of a refusal only.
-        remark: Where the threshold comes from, if that is worth saying.
+        nearest: The nearest accepted target, for a refusal.
+        remark: Remark on the threshold, or "".
     """
     lines = {"target": f"{_point(verdict.goal)} of the {loop.hand} hand"}
     if verdict.reason:
@@ -147,7 +147,7 @@ def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None
     if not np.isfinite(verdict.goal).all():
         return lines
     if nearest is None:
-        lines["nearest accepted"] = "none was found that is accepted with reserve"
+        lines["nearest accepted"] = "none found that is accepted with reserve"
     else:
         distance_m = float(np.linalg.norm(nearest.goal - verdict.goal))
         lines["nearest accepted"] = (

@@ -1,4 +1,4 @@
-"""``drake-safety train``: simulates the nominal closed loop, and learns Γ from it."""
+"""``drake-safety train``: simulates the nominal closed loop and trains Γ."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ if TYPE_CHECKING:
 def train(
     scenario: ScenarioArgument,
     out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
-    episodes: Annotated[int, typer.Option(help="Nominal episodes to learn from.", min=1)] = 2048,
+    episodes: Annotated[int, typer.Option(help="Nominal training episodes.", min=1)] = 2048,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = TRAINING.first,
     mode: Annotated[
-        str, typer.Option(help="'sharpened', 'paper' (literally the paper's), or 'both'.")
+        str, typer.Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
     ] = "both",
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the episodes that are in OUT.")
+        bool, typer.Option("--resume", help="Continue with the episodes in OUT.")
     ] = False,
     accept_code_change: Annotated[
         bool,
         typer.Option(
             "--accept-code-change",
-            help="Resume although other source code simulated OUT.",
+            help="Resume although the source code has changed since.",
         ),
     ] = False,
     workers: WorkersOption = None,
 ) -> None:
-    """Simulate the nominal closed loop and learn Γ from it.
+    """Simulate the nominal closed loop and train Γ.
 
-    Episodes are kept as they finish: a run that was stopped goes on with --resume.
+    Episodes are kept as they finish: a stopped run continues with --resume.
     """
     from drake_safety.simulation.dataset import completed
     from drake_safety.simulation.rollouts import run_episodes
@@ -64,7 +64,7 @@ def train(
     folder = episodes_folder(out)
     if folder.exists() and completed(folder) and not resume:
         raise ValueError(
-            f"{folder} already holds {len(completed(folder))} episodes: pass --resume to go on "
+            f"{folder} already holds {len(completed(folder))} episodes: pass --resume to continue "
             "with them, or choose another --out"
         )
     with open_stages() as stages:
@@ -78,7 +78,7 @@ def train(
             extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
             accept_code_change=accept_code_change,
         )
-        # The modes are independent: the first is learned here, the others in processes beside.
+        # The modes are independent: the first is trained here, the others in worker processes.
         with _worker_processes(len(modes) - 1) as submit:
             beside = {name: submit(_learn, loaded, name, out) for name in modes[1:]}
             learned = [_learn(loaded, modes[0], out, data, stages)]
@@ -98,7 +98,7 @@ def train(
 
 @contextlib.contextmanager
 def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
-    """Gives what submits a call to a worker process; on an error or Ctrl-C the workers end."""
+    """Yields a function that submits calls to workers, which end on an error or Ctrl-C."""
     from joblib.externals.loky import ProcessPoolExecutor
 
     executor = ProcessPoolExecutor(max_workers=max(num_workers, 1))
@@ -117,14 +117,14 @@ def _learn(
     data: Episodes | None = None,
     stages: Stages | None = None,
 ) -> tuple[int, float]:
-    """Learns and saves one mode.
+    """Trains and saves one mode.
 
     Args:
         scenario: The scenario.
         mode: The mode.
-        out: The folder of this training.
+        out: Folder of the training.
         data: The episodes; read from the folder by default, as in a worker process.
-        stages: Shows how far it is.
+        stages: Progress bars.
 
     Returns:
         The number of segments and the CPU time [s].

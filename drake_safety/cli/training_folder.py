@@ -1,4 +1,4 @@
-"""The folder that ``train`` writes and the other commands read: episodes, an assessment a mode."""
+"""The folder written by ``train``, with episodes and an assessment for each mode."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 class AssessmentFolder(NamedTuple):
-    """Where a command finds the assessments of a scenario, and where it writes.
+    """Folders of the assessments of a scenario.
 
     Attributes:
-        path: Holds an assessment a mode.
-        out: Where what is made of them goes: the same folder, unless they came with the package.
+        path: Folder of the assessments.
+        out: Folder of results: the same, unless the assessments are shipped with the package.
     """
 
     path: Path
@@ -27,17 +27,17 @@ class AssessmentFolder(NamedTuple):
 
     @property
     def is_shipped(self) -> bool:
-        """Whether the assessments came with the package."""
+        """Whether the assessments are shipped with the package."""
         return self.path != self.out
 
 
 class GoalThreshold(NamedTuple):
-    """What a verdict on a goal is read from.
+    """Thresholds of verdicts on goals.
 
     Attributes:
-        threshold: From which Γ, calibrated, on it is accepted.
-        unsafe_below: Below which it is unsafe; between the two the answer is "don't know".
-        remark: Where they come from, if that is worth saying.
+        threshold: Lowest calibrated Γ of an accepted goal.
+        unsafe_below: Γ below which a goal is unsafe; in between the verdict is "don't know".
+        remark: Remark on their origin, or "".
     """
 
     threshold: float
@@ -46,26 +46,26 @@ class GoalThreshold(NamedTuple):
 
 
 MODES = ("sharpened", "paper")
-"""Modes that are trained and compared, the default first."""
+"""Modes, the default first."""
 DEFAULT_THRESHOLD = 0.5
-"""From which Γ on a goal is accepted where no threshold was calibrated."""
+"""Lowest Γ of an accepted goal without calibrated threshold."""
 
 
 def episodes_folder(folder: Path) -> Path:
-    """Where ``train`` keeps the nominal episodes."""
+    """Folder of the training episodes."""
     return folder / "episodes"
 
 
 def fresh_episodes_folder(
     folder: Path, scenario_hash: str, seed: int, loop_options: dict[str, str]
 ) -> Path:
-    """Where ``evaluate`` keeps the nominal episodes it judges by, so that it can go on with them.
+    """Folder of fresh episodes of ``evaluate``.
 
     Args:
-        folder: The folder of the training.
-        scenario_hash: Of what was simulated: another simulation is another set.
-        seed: Of the set.
-        loop_options: Options of the task's diagram.
+        folder: Folder of the training.
+        scenario_hash: Hash of the simulation.
+        seed: Seed of the set.
+        loop_options: Options of the diagram.
     """
     options = [f"{name}-{value}" for name, value in sorted(loop_options.items())]
     return folder / "fresh" / "-".join([scenario_hash[:12], f"{seed}", *options])
@@ -80,16 +80,16 @@ def run_fresh_episodes(
     num_workers: int | None = None,
     **loop_options: str,
 ) -> Episodes:
-    """Simulates nominal episodes to judge by, and keeps them; goes on with those that are there.
+    """Simulates fresh nominal episodes, and keeps them; existing ones are reused.
 
     Args:
         scenario: The scenario.
-        folder: The folder of the training.
-        num_episodes: How many.
-        seed: Of the set.
+        folder: Folder of the training.
+        num_episodes: Number of episodes.
+        seed: Seed of the set.
         progress: Called with the number done and the number wanted.
-        num_workers: Processes; as many as there are cores by default.
-        **loop_options: Of the task's diagram, besides those that it is judged with.
+        num_workers: Number of worker processes; one a core by default.
+        **loop_options: Options of the diagram, besides those of evaluations.
     """
     from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
@@ -107,41 +107,41 @@ def run_fresh_episodes(
 
 
 def feedback_folder(folder: Path, scenario_hash: str, seed: int) -> Path:
-    """Where ``adapt`` keeps pairs of actual episodes and their twins, a folder a plant.
+    """Folder of pairs of actual episodes and nominal twins of ``adapt``.
 
     Args:
-        folder: The folder of the training.
-        scenario_hash: Of the actual plant's simulation: another simulation is another set.
-        seed: Of the set.
+        folder: Folder of the training.
+        scenario_hash: Hash of the simulation of the actual plant.
+        seed: Seed of the set.
     """
     return folder / "feedback" / f"{scenario_hash[:12]}-{seed}"
 
 
 def adapted_folder(folder: Path, variation: str) -> Path:
-    """Where ``adapt`` writes the adapted assessments; other commands take it for a training's.
+    """Folder of adapted assessments, which other commands accept as that of a training.
 
     Args:
-        folder: The folder of the training.
-        variation: What they are adapted to.
+        folder: Folder of the training.
+        variation: Variation of the actual plant.
     """
     return folder / f"adapted-{variation}"
 
 
 def assessment_file(folder: Path, mode: str) -> Path:
-    """Where ``train`` keeps the assessment of a mode."""
+    """File of the assessment of a mode."""
     return folder / f"{mode}.safetensors"
 
 
 def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolder:
-    """The folder that was asked for; else the one that comes with the package, which is told.
+    """The given folder, or by default that of the shipped assessments.
 
     Args:
         scenario: The scenario.
-        given: What ``--assessment`` says.
+        given: Value of ``--assessment``.
 
     Raises:
-        ValueError: Nothing is given, and no assessment of this scenario comes with the package, or
-            one of another scenario of this name.
+        ValueError: Nothing is given, and the package has no assessment of this scenario, or one of
+            another scenario of this name.
     """
     if given is not None:
         return AssessmentFolder(given, given)
@@ -161,12 +161,12 @@ def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolde
             f"scenario with hash {learned[:12]}, this one has {scenario.simulation_hash()[:12]}: "
             f"{advice}"
         )
-    # A folder of its own: nobody's training is written over.
+    # A separate folder, so that no training is overwritten.
     return AssessmentFolder(shipped, Path("runs") / f"{scenario.name}-shipped")
 
 
 def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
-    """Loads what ``train`` wrote.
+    """Loads the assessment of a mode.
 
     Raises:
         ValueError: The folder does not hold it.
@@ -186,16 +186,16 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
 def check_fresh(
     assessment: SafetyAssessment, scenario: Scenario, seeds: Iterable[int] = ()
 ) -> None:
-    """Refuses what an assessment cannot be judged by.
+    """Checks that an assessment can be evaluated on fresh episodes.
 
     Args:
         assessment: The assessment.
-        scenario: That fresh episodes are simulated of.
-        seeds: Of the fresh sets.
+        scenario: Scenario of the fresh episodes.
+        seeds: Seeds of the fresh episodes.
 
     Raises:
-        ValueError: The scenario is no longer the one that was learned from, or the assessment has
-            used one of the seeds.
+        ValueError: The scenario has changed since the training, or the assessment has used one of
+            the seeds.
     """
     trained = assessment.info_
     scenario_hash = scenario.simulation_hash()
@@ -209,25 +209,25 @@ def check_fresh(
 
 
 def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> GoalThreshold:
-    """What a verdict on a goal is read from.
+    """Thresholds of verdicts on goals.
 
     Args:
-        folder: The folder of a training.
-        mode: Of the assessment that is asked.
-        assessment: The assessment itself.
+        folder: Folder of a training.
+        mode: Mode of the assessment.
+        assessment: The assessment.
 
     Returns:
-        What ``calibrate`` stored with the assessment; else the threshold that ``evaluate`` chose on
-        its calibration episodes; else the default, and a remark that says so.
+        The thresholds of ``calibrate``; else the threshold that ``evaluate`` chose on its
+        calibration episodes; else the default with a remark.
     """
     calibration = assessment.calibrations_.get("plan")
     if calibration is not None:
         return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.promise)
     file = folder / "evaluation.json"
-    figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    figure = figures.get(f"plans.{mode}.threshold")
-    if figure is not None:
-        return GoalThreshold(float(figure["value"]), float(figure["value"]))
+    estimates = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    estimate = estimates.get(f"plans.{mode}.threshold")
+    if estimate is not None:
+        return GoalThreshold(float(estimate["value"]), float(estimate["value"]))
     return GoalThreshold(
         DEFAULT_THRESHOLD,
         DEFAULT_THRESHOLD,

@@ -1,1 +1,1 @@
-"""How good an assessment is: figures with intervals, direct classifiers beside it, and pictures."""
+"""Evaluation of assessments: metrics with intervals, baselines, studies, figures and the report."""

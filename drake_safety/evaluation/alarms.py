@@ -1,7 +1,7 @@
-"""Alarms: whoever watches a motion and cries when a number falls below a threshold.
+"""Alarms: monitored values that raise an alarm when they fall below a threshold.
 
-The number of an alarm is larger where the robot is safer: Γ, a classifier's probability, or what a
-control engineer would watch instead.
+A value is larger where the robot is safer: Γ, the probability of a baseline classifier, or a
+quantity that control engineers monitor, such as a margin.
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUBLISHED = {"": "normalized", "_literal": "safety_probability", "_calibrated": "calibrated"}
-"""What an assessment publishes, by what is appended to its name."""
+"""Fields of an assessment's result, by the suffix of the alarm's name."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _TRACKING = "tracking_error_"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
-    """Somebody who watches a motion.
+    """A monitored value.
 
     Attributes:
         name: Its key in tables.
-        value: How safe it takes every row of a motion to be, (N,); NaN where it does not know,
-            which is an alarm.
+        value: Maps a motion to the value of each row, (N,); NaN means "don't know", an alarm.
     """
 
     name: str
@@ -36,11 +35,11 @@ class Alarm:
 
 
 def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
-    """Γ in every form that is published: b_safe / (1 - μ), literal b_safe, and by its heads.
+    """Alarms on Γ: normalised b_safe / (1 - μ), literal b_safe, and calibrated.
 
     Args:
-        name: Key of the first; those of the others go on from it.
-        assessment: A fitted assessment; one without heads has no third form of its own.
+        name: Key of the first, and prefix of the others.
+        assessment: A fitted assessment; without heads there is no calibrated Γ.
     """
     has_heads = assessment.base_logit_ is not None
     return [
@@ -51,7 +50,7 @@ def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
 
 
 def scorer_alarm(scorer: Scorer) -> Alarm:
-    """A scorer of segments as an alarm."""
+    """An alarm on the safety probability of a scorer."""
     return Alarm(
         name=scorer.name,
         value=lambda motion: scorer.probability(
@@ -63,20 +62,19 @@ def scorer_alarm(scorer: Scorer) -> Alarm:
 def threshold_alarms(
     state_names: Sequence[str], feature_names: Sequence[str], watched: Mapping[str, str]
 ) -> list[Alarm]:
-    """What a control engineer would set a threshold on, as far as a task records it.
+    """Baseline alarms on recorded quantities.
 
-    Those are the features that the task says to watch, such as the margins of base and capture
-    point to the edge of the support polygon; the distance from the desired output; the base's
-    tilt; and the smallest of the safe set's margins. That last one is of the true state, which
-    nobody can measure: it is favoured.
+    They are the features that the task names, such as the margins of base and capture point to the
+    edge of the support polygon; the tracking error; the base's tilt; and the smallest margin of the
+    safe set. The last uses the true state, which cannot be measured, and so has an advantage.
 
     Args:
         state_names: Columns of the state.
         feature_names: Columns of the features.
-        watched: Features to watch, by what they measure.
+        watched: Monitored features, by the name of the alarm.
 
     Raises:
-        ValueError: A feature to watch does not exist.
+        ValueError: A monitored feature does not exist.
     """
     features, states = list(feature_names), list(state_names)
     unknown = [name for name in watched.values() if name not in features]

@@ -1,4 +1,4 @@
-"""A run as a moving picture: the robot, and Gamma up to the instant that is shown."""
+"""Animation of a run: the robot, and Γ up to the current time."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ def save_animation(
         time_s: Instants of the log [s], (N,), increasing.
         positions: All of the plant's positions at these instants, (N, n_q).
         gamma: Safety probability, (N,).
-        threshold: Below it something is done.
-        path: Where to write it.
-        event_times_s: When something was done, each a mark on the curve [s].
-        frames_per_second: Of the picture.
+        threshold: Threshold on Γ of triggers or alarms.
+        path: Path of the GIF.
+        event_times_s: Times of triggers or alarms, marked on the curve [s].
+        frames_per_second: Frame rate.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: Logs of different lengths, or a rate that is not positive.
+        ValueError: Logs have different lengths, or the frame rate is not positive.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
@@ -105,9 +105,9 @@ def save_animation(
                 mark.set_visible(bool(event <= time_s[row]))
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    # With one palette for all, what stands still is stored once.
+    # With a common palette, unchanged pixels are stored once.
     joined = _joined(frames[:: max(len(frames) // _PALETTE_FRAMES, 1)])
-    # Not by the median cut: a ball has few pixels, and a colour of its own.
+    # The median cut would drop the colour of a ball, which has few pixels.
     palette = joined.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration_ms = round(100 / frames_per_second) * 10  # GIFs count in hundredths of a second.

@@ -1,4 +1,4 @@
-"""Direct classifiers on the same inputs as the assessment: what a black box makes of the data."""
+"""Baseline classifiers: direct classification of the inputs of the assessment."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _MLP_PATIENCE = 20
 
 
 class DirectClassifier:
-    """Predicts from x whether an episode ends unsafely, with no embedding or beliefs in between.
+    """Predicts from x whether an episode ends unsafely, without embedding or beliefs.
 
-    It learns from the segments that the assessment learns from (every start row, label: the
-    episode's end), and stops when a tenth of the *episodes*, held out, no longer improves. It
-    runs on one thread, so that the same seed gives the same bits.
+    It learns from the segments that the assessment learns from (every start row, labelled by the
+    end of its episode), with early stopping on a held-out tenth of the *episodes*. It runs on one
+    thread, so that the same seed gives the same bits.
 
     Args:
         kind: "gradient_boosting" (scikit-learn's HistGradientBoostingClassifier) or "mlp" (its
             MLPClassifier on standardised inputs).
-        uses_features: Whether x has the features, as in the assessment's sharpened mode.
-        seed: Seeds the held-out episodes and the training.
-        shortest: Steps that a safe episode's segment has at least; the horizon by default.
+        uses_features: Whether x includes the features, as in the sharpened mode of the assessment.
+        seed: Seed of the held-out episodes and of the training.
+        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
 
     Raises:
         ValueError: Unknown kind.
@@ -50,13 +50,10 @@ class DirectClassifier:
         self.shortest = shortest
 
     def fit(self, episodes: Episodes) -> DirectClassifier:
-        """Learns from episodes.
-
-        Returns:
-            Itself.
+        """Fits the classifier to episodes and returns it.
 
         Raises:
-            ValueError: There are fewer than two safe or two unsafe episodes to learn from.
+            ValueError: There are fewer than two safe or two unsafe episodes.
         """
         from threadpoolctl import threadpool_limits
 
@@ -91,7 +88,7 @@ class DirectClassifier:
             The probabilities, (N,); NaN for an input that is not finite.
 
         Raises:
-            ValueError: It has not been fitted, or to inputs of another width.
+            ValueError: It has not been fitted, or the inputs have another width.
         """
         from threadpoolctl import threadpool_limits
 
@@ -122,7 +119,7 @@ class DirectClassifier:
         return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
 
     def _held_out(self, segments: Segments) -> np.ndarray:
-        """Mask of the segments of the episodes that decide when to stop, (N,)."""
+        """Mask of the segments of held-out episodes, (N,)."""
         rng = np.random.default_rng(self.seed)
         chosen = []
         for name, is_class in (("safe", ~segments.is_unsafe), ("unsafe", segments.is_unsafe)):
@@ -160,7 +157,7 @@ class DirectClassifier:
 
         spread = x.std(axis=0, dtype=float)
         self.mean_ = x.mean(axis=0, dtype=float)
-        # A column that never changes carries nothing, and must not blow up elsewhere.
+        # A column that is constant in training must not be scaled up elsewhere.
         self.scale_ = np.where(spread > 1e-9, spread, 1.0)
         x, x_held_out = self._standardised(x), self._standardised(x_held_out)
         model = MLPClassifier(
@@ -173,7 +170,7 @@ class DirectClassifier:
         best, smallest_error, waited = None, np.inf, 0
         for _ in range(_MLP_EPOCHS):
             model.partial_fit(x, label, classes=[False, True])
-            # The log loss would stop a net that is overconfident but still learning to rank.
+            # The log loss would stop an overconfident net whose ranking still improves.
             error = np.mean((model.predict_proba(x_held_out)[:, 1] - label_held_out) ** 2)
             waited += 1
             if error < smallest_error:
@@ -187,5 +184,5 @@ class DirectClassifier:
         self.model_ = model
 
     def _standardised(self, x: np.ndarray) -> np.ndarray:
-        # Double precision: the penalty drives idle weights into float32's slow subnormal range.
+        # Double precision: the penalty drives unused weights into slow subnormal float32.
         return (x - self.mean_) / self.scale_

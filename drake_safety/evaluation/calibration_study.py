@@ -1,4 +1,4 @@
-"""Are promises kept? Calibration on some fresh episodes, judged on others, again and again."""
+"""Evaluation of calibration: promised and observed miss rates, and reliability."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.calibration import (
     SAFE,
     UNKNOWN,
@@ -20,47 +20,37 @@ from drake_safety.learning.calibration import (
 )
 
 MISS_RATES = (0.01, 0.05, 0.1)
-"""What is promised in the study."""
+"""Promised miss rates."""
 NUM_SPLITS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class PromiseKept:
-    """What a promise came to over many splits of the same episodes.
+    """A promised miss rate and the rates observed over many splits of the same episodes.
 
     Attributes:
-        miss_rate: As promised.
-        confidence: As promised; None for on average.
-        num_needed: Unsafe episodes that the promise takes.
-        num_calibration: Unsafe episodes that each split calibrates with.
-        observed: Mean share of unsafe episodes called safe; its interval is the binomial one of as
-            many unsafe episodes as there are in all. NaN where they were too few.
-        share_broken: Share of splits in which the test half missed more than promised.
-        safe_recall: The price: mean share of safe episodes called safe, and its 5 % and 95 %
-            quantiles over the splits.
+        miss_rate: Promised miss rate.
+        confidence: Confidence of the promise; None for a promise on average.
+        num_needed: Number of unsafe episodes that the promise needs.
+        num_calibration: Number of unsafe calibration episodes of each split.
+        observed: Mean observed miss rate, with the binomial interval of the total number of unsafe
+            episodes; NaN with too few of them.
+        share_broken: Share of splits whose test half exceeds the promised miss rate.
+        safe_recall: Mean safe recall, with its 5 % and 95 % quantiles over the splits.
     """
 
     miss_rate: float
     confidence: float | None
     num_needed: int
     num_calibration: int
-    observed: Figure
+    observed: Estimate
     share_broken: float
-    safe_recall: Figure
+    safe_recall: Estimate
 
     @property
     def is_kept(self) -> bool:
-        """Whether what was observed does not speak against the promise."""
+        """Whether the promise lies within or above the interval of the observed miss rate."""
         return not self.observed.low > self.miss_rate
-
-    def figures(self) -> dict[str, Figure]:
-        """The figures by key."""
-        splits = Figure(self.share_broken, self.share_broken, self.share_broken, self.observed.n)
-        return {
-            "observed_miss_rate": self.observed,
-            "share_broken": splits,
-            "safe_recall": self.safe_recall,
-        }
 
 
 def repeated_splits(
@@ -72,17 +62,17 @@ def repeated_splits(
     num_splits: int = NUM_SPLITS,
     seed: int = 0,
 ) -> list[PromiseKept]:
-    """Splits episodes in halves, calibrates on the one and counts misses in the other.
+    """Splits episodes in halves, calibrates on one and counts misses in the other.
 
-    Each class is halved by itself, so that all splits calibrate with as many unsafe episodes.
+    The classes are split separately, so that all splits have the same number of unsafe episodes.
 
     Args:
-        unsafe_score: One score an episode, (N,); NaN counts as the most unsafe of all.
+        unsafe_score: Unsafe score of each episode, (N,); NaN counts as the most unsafe.
         is_unsafe: Whether each ended unsafely, (N,).
-        miss_rates: What is promised.
-        confidence: With which; None for on average.
-        num_splits: How often.
-        seed: Of the splits.
+        miss_rates: Promised miss rates.
+        confidence: Confidence of the promise; None for on average.
+        num_splits: Number of splits.
+        seed: Seed of the splits.
 
     Raises:
         ValueError: A rate is not in (0, 1), or one of the classes has fewer than two episodes.
@@ -99,7 +89,7 @@ def repeated_splits(
     num_calibration = unsafe.size // 2
     kept = []
     for miss_rate in miss_rates:
-        # The same splits for all promises.
+        # All promises use the same splits.
         rng = np.random.default_rng(seed)
         is_possible = allowed_misses(num_calibration, miss_rate, confidence=confidence) >= 0
         missed, accepted = [], []
@@ -123,30 +113,30 @@ def repeated_splits(
     return kept
 
 
-def _observed(missed: list[float], num_unsafe: int) -> Figure:
+def _observed(missed: list[float], num_unsafe: int) -> Estimate:
     if not missed:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate.exact(math.nan, 0)
     mean = float(np.mean(missed))
-    # Splits of the same episodes are no further evidence: there are no more than these.
+    # Splits of the same episodes are not independent: n is the number of episodes.
     binomial = proportion(round(mean * num_unsafe), num_unsafe)
-    return Figure(mean, min(binomial.low, mean), max(binomial.high, mean), num_unsafe)
+    return Estimate(mean, min(binomial.low, mean), max(binomial.high, mean), num_unsafe)
 
 
-def _spread(values: list[float], n: int) -> Figure:
+def _spread(values: list[float], n: int) -> Estimate:
     if not values:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate.exact(math.nan, 0)
     low, high = np.quantile(values, [0.05, 0.95])
-    return Figure(float(np.mean(values)), float(low), float(high), n)
+    return Estimate(float(np.mean(values)), float(low), float(high), n)
 
 
 def verdict_shares(
     calibration: Calibration, unsafe_score: np.ndarray, is_unsafe: np.ndarray
-) -> dict[str, Figure]:
-    """What a stored calibration does to other fresh episodes.
+) -> dict[str, Estimate]:
+    """Rates of the verdicts of a stored calibration on fresh episodes.
 
     Args:
         calibration: The calibration.
-        unsafe_score: 1 - Γ of each episode, (N,), by the calibration's kind.
+        unsafe_score: 1 - Γ of each episode, (N,), for the kind of the calibration.
         is_unsafe: Whether each ended unsafely, (N,).
 
     Returns:
@@ -156,12 +146,12 @@ def verdict_shares(
     verdict = calibration.verdicts(1.0 - np.asarray(unsafe_score, dtype=float))
     label = np.asarray(is_unsafe, dtype=bool)
 
-    def share(of: np.ndarray, said: str) -> Figure:
-        return proportion(int(np.sum(verdict[of] == said)), int(of.sum()))
+    def share(rows: np.ndarray, expected: str) -> Estimate:
+        return proportion(int(np.sum(verdict[rows] == expected)), int(rows.sum()))
 
     promised = calibration.miss_rate
     return {
-        "promised_miss_rate": Figure(promised, promised, promised, calibration.num_unsafe),
+        "promised_miss_rate": Estimate.exact(promised, calibration.num_unsafe),
         "miss_rate": share(label, SAFE),
         "unsafe_unknown": share(label, UNKNOWN),
         "safe_recall": share(~label, SAFE),
@@ -172,14 +162,14 @@ def verdict_shares(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reliability:
-    """What was expected against what came of it, bin by bin.
+    """Predicted probabilities against observed frequencies, by bin.
 
     Attributes:
-        expected: Mean probability of an unsafe end, (B,).
-        observed: Share that ended unsafely, (B,).
+        expected: Mean predicted probability of an unsafe end, (B,).
+        observed: Share of unsafe ends, (B,).
         low: Lower end of its 95 % interval, (B,).
         high: Upper end, (B,).
-        count: Episodes in each bin, (B,).
+        count: Number of episodes, (B,).
     """
 
     expected: np.ndarray
@@ -190,19 +180,19 @@ class Reliability:
 
     @property
     def calibration_error(self) -> float:
-        """Expected calibration error: mean distance of what was expected and observed."""
+        """Expected calibration error: mean distance between predicted and observed values."""
         return float(self.count @ np.abs(self.expected - self.observed) / self.count.sum())
 
 
 def reliability(
     unsafe_probability: np.ndarray, is_unsafe: np.ndarray, *, num_bins: int = 10
 ) -> Reliability:
-    """Compares probabilities with outcomes, in bins of equally many episodes.
+    """Compares probabilities with outcomes in bins of equal numbers of episodes.
 
     Args:
         unsafe_probability: 1 - Γ of each episode, (N,), in [0, 1]; NaN counts as one.
         is_unsafe: Whether each ended unsafely, (N,).
-        num_bins: Number of bins; fewer where episodes have the same probability.
+        num_bins: Number of bins; fewer if episodes share probabilities.
 
     Raises:
         ValueError: There is no episode, or a probability outside [0, 1].
@@ -215,7 +205,7 @@ def reliability(
             f"reliability: expected probabilities in [0, 1], got {p.size} of them"
             + (f" in {p.min()}..{p.max()}" if p.size else "")
         )
-    # Equal probabilities share a bin: edges are values that occur.
+    # Edges are occurring values, so that equal probabilities share a bin.
     edges = np.unique(np.quantile(p, np.linspace(0, 1, num_bins + 1)[1:-1], method="nearest"))
     members = np.searchsorted(edges, p, side="right")
     bins = np.unique(members)

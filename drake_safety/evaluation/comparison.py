@@ -1,4 +1,4 @@
-"""One row a scenario: how well Γ judges plans beforehand, and what recovery saves, if any."""
+"""Comparison of scenarios: recalls of Γ at k = 0, and falls with and without recovery."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.metrics import Figure
-from drake_safety.evaluation.report.results import as_figure
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
@@ -24,7 +24,7 @@ from drake_safety.simulation.capabilities import HasBall, judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
-_FIGURES = {
+_ESTIMATES = {
     "share_unsafe": "episodes.share_unsafe",
     "auc": "episodes.sharpened.auc",
     "safe_recall": "episodes.sharpened.safe_recall",
@@ -35,19 +35,23 @@ _FIGURES = {
     "recoveries_with_legs_collide": "throws.sharpened.recoveries_with_legs_collide",
     "recoveries_with_joint_velocity": "throws.sharpened.recoveries_with_joint_velocity",
 }
-"""Columns, and the figures behind them. Recalls and AUC are of whole episodes, at k = 0."""
+"""Columns and the keys of their estimates. Recalls and AUC are those of episodes at k = 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How much is simulated for a row."""
+    """Numbers of simulations of a row.
+
+    Attributes:
+        num_episodes: Training episodes.
+        num_fresh: Test episodes; half as many others are for thresholds.
+        num_throws: Throws, for robots that can recover.
+        seed: Seed.
+    """
 
     num_episodes: int
-    """To learn from."""
     num_fresh: int
-    """To judge by; half as many others choose the threshold."""
     num_throws: int
-    """At robots that can recover."""
     seed: int
 
 
@@ -59,23 +63,23 @@ def compare_scenario(
     num_workers: int | None = None,
     progress: StageProgress,
 ) -> dict[str, Any]:
-    """Learns a scenario's Γ and judges it; what the folder already holds is not done again.
+    """Trains and evaluates Γ of a scenario, and reuses what the folder already holds.
 
-    A task without recovery is not thrown at: its row says how its plans are judged, no more. Plans
-    are judged as ``evaluate`` judges them, undisturbed.
+    The row of a task without recovery has no throws. Plans are evaluated without disturbances, as
+    in ``evaluate``.
 
     Args:
         scenario: A scenario.
-        folder: Where its episodes, its assessment and its row are kept.
-        effort: How much is simulated.
-        num_workers: Processes.
+        folder: Folder of its episodes, its assessment and its row.
+        effort: Numbers of simulations.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Returns:
-        The row: names and numbers, and for each figure its value, interval and n.
+        The row: names and numbers, and for each estimate its value, interval and n.
 
     Raises:
-        ValueError: The folder holds another scenario's episodes.
+        ValueError: The folder holds episodes of another scenario.
     """
     has_ball = isinstance(scenario.make_loop(), HasBall)
     recovery = scenario.parameters.recovery if has_ball else None
@@ -122,7 +126,7 @@ def compare_scenario(
     if recovery is not None:
         published = "normalized" if recovery.is_normalized else "safety_probability"
     scorer = assessment_scorer("sharpened", assessment, published)
-    figures, _, _ = evaluate_episodes([scorer], calibration, fresh)
+    estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
     if recovery is not None:
         study = evaluate_throws(
             scenario,
@@ -134,14 +138,14 @@ def compare_scenario(
             num_workers=num_workers,
             progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
         )
-        figures |= study.figures
+        estimates |= study.estimates
     row = {
         "scenario": scenario.name,
-        # A task of one's own may call its robot as it likes.
+        # A user's scenario may name its robot by the path of its file.
         "robot": load_robot(robot).name if Path(robot).suffix else robot,
         "episodes": effort.num_episodes,
         "throws": effort.num_throws if recovery is not None else 0,
-        **{name: figures[key].to_json() for name, key in _FIGURES.items() if key in figures},
+        **{name: estimates[key].to_json() for name, key in _ESTIMATES.items() if key in estimates},
     }
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"made_by": made_by, "row": row}, indent=2)
@@ -151,23 +155,23 @@ def compare_scenario(
     return row
 
 
-def row_figure(row: Mapping[str, Any], name: str) -> Figure | None:
-    """A figure of a row; None where the study had nothing to say."""
+def row_estimate(row: Mapping[str, Any], name: str) -> Estimate | None:
+    """An estimate of a row; None if the row has none."""
     stored = row.get(name)
     if not isinstance(stored, dict) or stored["value"] is None:
         return None
-    return as_figure(stored)
+    return as_estimate(stored)
 
 
 def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """The rows side by side, shares in percent."""
-    nothing = Figure(math.nan, math.nan, math.nan, 0)
+    """The rows as a table, shares in percent."""
+    nothing = Estimate.exact(math.nan, 0)
     counts = [Column(key=name, title=name, meaning="", unit="n") for name in ("episodes", "throws")]
     columns = [
         Column(key=name, title=spoken(name), meaning="")
         if name == "auc"
         else Column(key=name, title=spoken(name), meaning="", unit="%", digits=1)
-        for name in _FIGURES
+        for name in _ESTIMATES
     ]
     return Table(
         key="comparison",
@@ -179,9 +183,9 @@ def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             Row(
                 key=row["scenario"],
                 label=f"{row['scenario']} ({row['robot']})",
-                figures=[
-                    *(Figure(row[one.key], math.nan, math.nan, row[one.key]) for one in counts),
-                    *(row_figure(row, one.key) or nothing for one in columns),
+                estimates=[
+                    *(Estimate(row[one.key], math.nan, math.nan, row[one.key]) for one in counts),
+                    *(row_estimate(row, one.key) or nothing for one in columns),
                 ],
             )
             for row in rows

@@ -1,4 +1,4 @@
-"""The robots of a comparison side by side, each with what became of it."""
+"""Stills of the robots of a comparison with their results."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_safety.evaluation.comparison import row_figure
+from drake_safety.evaluation.comparison import row_estimate
 from drake_safety.evaluation.figure_style import drawing_style, new_figure
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Picture
+    from matplotlib.figure import Figure
 
 _COLUMNS = 4
 _SIZE = (480, 400)  # Of a still [pixels].
 
 
 def standing_still(loop: ClosedLoop) -> np.ndarray | None:
-    """A picture of the robot as it stands, RGB (height, width, 3); None without a robot to draw.
+    """A still of the standing robot, RGB (height, width, 3); None for a task without legs.
 
     Args:
         loop: A closed loop.
@@ -39,12 +39,12 @@ def standing_still(loop: ClosedLoop) -> np.ndarray | None:
 
 def comparison_figure(
     rows: Sequence[Mapping[str, Any]], stills: Mapping[str, np.ndarray]
-) -> Picture:
-    """Stills in a grid, and under each how well Γ tells and what recovery saves.
+) -> Figure:
+    """Plots stills in a grid with AUC and falls below.
 
     Args:
-        rows: Of the comparison.
-        stills: By scenario, RGB (height, width, 3); rows without one are left out.
+        rows: Rows of the comparison.
+        stills: By scenario, RGB (height, width, 3); rows without a still are left out.
     """
     shown = [row for row in rows if row["scenario"] in stills]
     num_columns = min(_COLUMNS, len(shown))
@@ -60,21 +60,20 @@ def comparison_figure(
             axes.text(
                 0.0,
                 -0.04,
-                "\n".join(_words(row)),
+                "\n".join(_captions(row)),
                 transform=axes.transAxes,
                 va="top",
             )
     return fig
 
 
-def _words(row: Mapping[str, Any]) -> list[str]:
-    """What is said of a row."""
-    words = []
-    auc = row_figure(row, "auc")
+def _captions(row: Mapping[str, Any]) -> list[str]:
+    captions = []
+    auc = row_estimate(row, "auc")
     if auc is not None:
-        words.append(f"AUC at planning time {auc.value:.3f}")
-    ends = [row_figure(row, f"falls_{how}_recovery") for how in ("without", "with")]
+        captions.append(f"AUC at planning time {auc.value:.3f}")
+    ends = [row_estimate(row, f"falls_{how}_recovery") for how in ("without", "with")]
     if None not in ends:
         before, after = (100 * end.value for end in ends if end is not None)
-        words.append(f"falls {before:.0f} % → {after:.1f} %")
-    return words
+        captions.append(f"falls {before:.0f} % → {after:.1f} %")
+    return captions

@@ -1,4 +1,4 @@
-"""The map of an assessment: its segments in the plane, the beliefs of its cells, their causes."""
+"""The map of an assessment: embedded segments, beliefs of the cells, and causes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 _MAX_POINTS = 12000
 FIRST_CAUSE = 3
-"""Column of a cell's masses at which those of the causes begin."""
+"""Column of the first cause in the masses of a cell."""
 SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80")
-"""From unsafe over a pale middle to safe."""
+"""Colours from unsafe through a pale middle to safe."""
 
 
 def embedding_figure(
@@ -44,16 +44,16 @@ def embedding_figure(
     beliefs: np.ndarray | None = None,
     right: str = "causes",
 ) -> Figure:
-    """The map: segments in the embedding, the beliefs of its cells, and their causes.
+    """Plots the map: segments in the embedding, beliefs of the cells, and causes.
 
-    Of an ensemble it is the first map.
+    It shows the first map of an ensemble.
 
     Args:
         assessment: A fitted assessment.
-        episodes: Episodes whose segments are drawn, best ones it has not learned from.
-        beliefs: Beliefs instead of the assessment's own, (K, R*R, 3 + n_c).
-        right: What the right panel shows: "causes", the constraint most likely to be violated, or
-            "uncertainty", mu.
+        episodes: Episodes whose segments are drawn, preferably not the training episodes.
+        beliefs: Beliefs, (K, R*R, 3 + n_c); those of the assessment by default.
+        right: Content of the right panel: "causes", the constraint most likely to be violated, or
+            "uncertainty", μ.
 
     Raises:
         ValueError: Unknown `right`.
@@ -128,17 +128,17 @@ def draw_safety(
     label: str,
     most: float = 1.0,
 ) -> None:
-    """Cells by how safe they are, over the number of segments each was learned from.
+    """Draws cells coloured by safety, with their numbers of training segments.
 
     Args:
         fig: The figure.
-        axes: Where to in it.
+        axes: Its axes.
         grid: The grid.
-        safe: What the colour shows of each cell, (R*R,).
-        is_empty: Whether it holds no belief, (R*R,).
-        count: Segments in each cell, (R*R,).
-        label: What the colour is.
-        most: What has the bluest colour.
+        safe: Value of each cell, (R*R,).
+        is_empty: Whether each cell holds no belief, (R*R,).
+        count: Number of segments in each cell, (R*R,).
+        label: Label of the colour bar.
+        most: Upper end of the colour scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -155,12 +155,12 @@ def draw_safety(
             axes.text(
                 x, y, _short(number), ha="center", va="center_baseline", fontsize=6.5, color=ink
             )
-    axes.set_xlabel("numbers: segments learned from; hatched: EMPTY")
+    axes.set_xlabel("numbers: training segments; hatched: EMPTY")
     add_colour_bar(fig, axes, shade, label)
 
 
 def cause_colours(num_causes: int) -> list[str]:
-    """A colour a cause; from the second of the series on: the first is the colour of safe."""
+    """A colour for each cause; the first of the series is that of safe and is skipped."""
     return [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(num_causes)]
 
 
@@ -173,7 +173,7 @@ def _draw_causes(
     palette = np.array([to_rgb(colour) for colour in cause_colours(len(names))])
     cause = cells[:, FIRST_CAUSE:].argmax(axis=1)
     is_empty = cells[:, UNCERTAINTY] >= 1.0
-    # White where nothing is unsafe, the cause's own colour where all that is known is.
+    # From white, nothing unsafe, to the colour of the cause, all that is known unsafe.
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
     colours = np.column_stack([1.0 - depth * (1.0 - palette[cause]), np.ones(len(cells))])
     colours[:, :3] *= 0.97
@@ -201,14 +201,14 @@ def _draw_uncertainty(fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray) ->
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
-    """The lines between the cells."""
+    """Draws the lines between the cells."""
     edges = np.linspace(-grid.half_width, grid.half_width, grid.resolution + 1)
     axes.vlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
     axes.hlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
 
 
 def draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
-    """Squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
+    """Draws squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
@@ -228,21 +228,21 @@ def draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray
 
 
 def safety_colours() -> Colormap:
-    """From unsafe (0) over a pale middle to safe (1)."""
+    """Colour map from unsafe (0) through a pale middle to safe (1)."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("safety", list(SAFETY_STOPS))
 
 
 def add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:
-    """A colour bar beside a panel."""
+    """Adds a colour bar beside a panel."""
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
     bar.outline.set_visible(False)
     return bar
 
 
 def _short(count: int) -> str:
-    """A count as short as a cell is narrow: 12345 → 12k."""
+    """A count in at most four characters: 12345 → 12k."""
     if count < 1000:
         return str(count)
     return f"{count / 1000:.1f}k" if count < 9950 else f"{count / 1000:.0f}k"

@@ -1,7 +1,7 @@
-"""What all pictures share: colours that stay apart for colour-blind eyes, style, and saving.
+"""Common style of all figures: colours distinct for colour-blind readers, fonts, and saving.
 
-Blue is safe, vermilion unsafe, grey unknown. A figure belongs to no window, and drawing it leaves
-matplotlib's own settings as they are.
+Blue is safe, vermilion unsafe, grey unknown. Figures have no window, and the global settings of
+matplotlib are not changed.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ SERIES_COLOURS = (
     FALSE_ALARM_COLOUR,
     "#4d4d4d",
 )
-"""Curves in one panel, in this order."""
+"""Colours of the curves in a panel, in this order."""
 SERIES_DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
-"""Their dashes: curves stay apart in print, too."""
+"""Dashes of these curves, which distinguish them in print."""
 
 _STYLE: dict[Any, Any] = {
     "font.size": 10.0,
@@ -60,7 +60,7 @@ _DPI = 200
 
 @contextmanager
 def drawing_style() -> Iterator[None]:
-    """What is drawn or saved inside the block looks alike; settings outside are not touched."""
+    """Applies the style to figures drawn or saved inside the block."""
     import matplotlib as mpl
 
     with mpl.rc_context(_STYLE):
@@ -68,7 +68,7 @@ def drawing_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure that belongs to no window.
+    """Creates an empty figure without a window.
 
     Args:
         width: Its width [inches].
@@ -86,7 +86,7 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
 
     Args:
         fig: The figure.
-        path: Where to; its suffix is replaced.
+        path: Path of the files; its suffix is replaced.
 
     Returns:
         The two paths, PNG first.
@@ -96,11 +96,11 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
     with drawing_style():
         paths = [path.with_suffix(".png"), path.with_suffix(".svg")]
         fig.savefig(paths[0], dpi=_DPI)
-        # Without the date, the same figure is the same file.
+        # Without the date, equal figures are equal files.
         fig.savefig(paths[1], dpi=_DPI, metadata={"Date": None})
     return paths
 
 
 def spoken(name: str) -> str:
-    """A constraint's name as one reads it: `support_polygon` → support polygon."""
+    """A name as readable text: `support_polygon` → support polygon."""
     return name.replace("_", " ")

@@ -1,8 +1,8 @@
-"""Figures of merit with intervals that respect what is independent: episodes, not their segments.
+"""Metrics with confidence intervals over episodes: the segments of one are not independent.
 
-A scorer gives every segment an unsafe score: a number that is larger where it expects an unsafe
-end, such as 1 - Gamma. A segment is judged unsafe when its score exceeds a threshold, as a recovery
-triggers on Gamma < Gamma_thre. A score that is NaN says "don't know", which counts as unsafe.
+A scorer gives every segment an unsafe score, such as 1 - Γ: larger means an unsafe end is more
+likely. A segment is classified unsafe when its score exceeds a threshold, as a recovery triggers on
+Γ < Γ_thre. A NaN score means "don't know" and counts as unsafe.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ CRITERIA = ("balanced_accuracy", "equal_error")
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A figure of merit and its interval.
+class Estimate:
+    """An estimated value and its interval.
 
     Attributes:
-        value: The estimate; NaN where there is nothing to estimate it from.
+        value: The estimate; NaN without samples.
         low: Lower end of the interval.
         high: Upper end of the interval.
-        n: Number of independent samples behind it: episodes, throws, never segments.
+        n: Number of independent samples: episodes or throws, never segments.
     """
 
     value: float
@@ -34,8 +34,13 @@ class Figure:
     high: float
     n: int
 
+    @classmethod
+    def exact(cls, value: float, n: int) -> Estimate:
+        """A value without uncertainty, such as a threshold: both ends of the interval equal it."""
+        return cls(value, value, value, n)
+
     def to_json(self) -> dict[str, float | int | None]:
-        """The figure as JSON knows it; what is not finite becomes None."""
+        """The estimate as JSON types; non-finite numbers become None."""
         fields = {"value": self.value, "low": self.low, "high": self.high}
         finite = {k: float(v) if math.isfinite(v) else None for k, v in fields.items()}
         return {**finite, "n": int(self.n)}
@@ -43,12 +48,12 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
-    """How an interval is found by drawing the independent samples again, with replacement.
+    """Bootstrap intervals: percentiles over resamples of the independent samples.
 
     Attributes:
-        confidence: Of the interval.
-        num_resamples: How often as many samples are drawn.
-        seed: Of the draws.
+        confidence: Confidence of the interval.
+        num_resamples: Number of resamples.
+        seed: Seed of the resamples.
     """
 
     confidence: float = 0.95
@@ -57,23 +62,23 @@ class Bootstrap:
 
     @property
     def quantiles(self) -> list[float]:
-        """The two shares of the draws that lie below the interval's ends."""
+        """Quantiles of the resamples at the ends of the interval."""
         return [0.5 - 0.5 * self.confidence, 0.5 + 0.5 * self.confidence]
 
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
-    ) -> Figure:
-        """A statistic of weighted samples, and its percentiles when whole episodes are drawn again.
+    ) -> Estimate:
+        """A statistic of weighted samples, with an interval from resampling whole episodes.
 
         Args:
-            statistic: Takes the weight of each sample, (N,); NaN where it is not defined.
-            episode: Which episode each sample belongs to, (N,).
+            statistic: Maps the weight of each sample, (N,), to a number; NaN where undefined.
+            episode: Index of each sample's episode, (N,).
         """
         members = np.unique(episode, return_inverse=True)[1]
         value = statistic(np.ones(len(members)))
         num_episodes = int(members.max()) + 1 if members.size else 0
         if math.isnan(value):
-            return Figure(math.nan, math.nan, math.nan, num_episodes)
+            return Estimate.exact(math.nan, num_episodes)
         rng = np.random.default_rng(self.seed)
         shares = np.full(num_episodes, 1.0 / num_episodes)
         drawn = np.array(
@@ -82,16 +87,16 @@ class Bootstrap:
                 for _ in range(self.num_resamples)
             ]
         )
-        # A draw without one of the classes says nothing.
+        # A resample without one of the classes has no value.
         low, high = np.quantile(drawn[~np.isnan(drawn)], self.quantiles)
-        return Figure(value, float(low), float(high), num_episodes)
+        return Estimate(value, float(low), float(high), num_episodes)
 
 
 _BOOTSTRAP = Bootstrap()
 _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
-def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
+def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
     """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
 
     Raises:
@@ -102,15 +107,15 @@ def proportion(count: int, n: int, *, confidence: float = 0.95) -> Figure:
     from scipy.stats import binomtest
 
     if n == 0:
-        return Figure(value=math.nan, low=0.0, high=1.0, n=0)
+        return Estimate(value=math.nan, low=0.0, high=1.0, n=0)
     interval = binomtest(count, n).proportion_ci(confidence, method="exact")
-    return Figure(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
+    return Estimate(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
 
 
-def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Figure:
+def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Estimate:
     """The median of independent values (N,), with its bootstrap interval.
 
-    Infinite values take part: a fall that never comes is later than any other.
+    Infinite values are allowed: a fall that never happens is later than any other.
 
     Raises:
         ValueError: A value is NaN.
@@ -119,17 +124,17 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> F
     if np.isnan(values).any():
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
-        return Figure(math.nan, math.nan, math.nan, 0)
+        return Estimate.exact(math.nan, 0)
     rng = np.random.default_rng(bootstrap.seed)
     size = (bootstrap.num_resamples, values.size)
     drawn = np.sort(rng.integers(values.size, size=size), axis=1)
     # Order statistics, not interpolation, which would subtract infinities.
     low, high = np.quantile(_middle(values[drawn]), bootstrap.quantiles, method="nearest")
-    return Figure(float(_middle(values)), float(low), float(high), values.size)
+    return Estimate(float(_middle(values)), float(low), float(high), values.size)
 
 
 def _middle(ordered: np.ndarray) -> np.ndarray:
-    """Median along the last axis of what is already in order."""
+    """Median along the last axis of sorted values."""
     size = ordered.shape[-1]
     return 0.5 * (ordered[..., (size - 1) // 2] + ordered[..., size // 2])
 
@@ -137,12 +142,12 @@ def _middle(ordered: np.ndarray) -> np.ndarray:
 def area_under_curve(
     unsafe_score: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray | None = None
 ) -> float:
-    """Area under the ROC curve: how often an unsafe sample scores above a safe one, ties half.
+    """Area under the ROC curve: probability that an unsafe sample scores above a safe one.
 
     Args:
-        unsafe_score: Unsafe scores, (N,); NaN counts as the most unsafe of all.
+        unsafe_score: Unsafe scores, (N,); NaN counts as the most unsafe. Ties count one half.
         is_unsafe: Labels, (N,).
-        weight: Weights, (N,); one each by default.
+        weight: Weights, (N,); ones by default.
 
     Returns:
         The area; NaN unless both classes have weight.
@@ -159,17 +164,16 @@ def auc(
     episode: np.ndarray,
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> Figure:
+) -> Estimate:
     """The area under the ROC curve, with an interval from a bootstrap over episodes.
 
-    Where the scores of unsafe and safe samples do not overlap the bootstrap sees no spread, and low
-    is 1 as well.
+    If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
 
     Args:
         unsafe_score: Unsafe scores, (N,).
         is_unsafe: Labels, (N,).
-        episode: Which episode each sample belongs to, (N,).
-        bootstrap: How the interval is found.
+        episode: Index of each sample's episode, (N,).
+        bootstrap: Settings of the interval.
     """
     score, label = _checked("auc", unsafe_score, is_unsafe, episode)
     rank = _ranks(score)
@@ -187,15 +191,15 @@ def auc_difference(
     episode: np.ndarray,
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> Figure:
-    """By how much one scorer's area exceeds another's on the same samples, resampled in pairs.
+) -> Estimate:
+    """The AUC of one scorer minus that of another on the same samples, from paired resamples.
 
     Args:
-        unsafe_score: Unsafe scores of the one, (N,).
-        other_score: Unsafe scores of the other, (N,).
+        unsafe_score: Unsafe scores of the first, (N,).
+        other_score: Unsafe scores of the second, (N,).
         is_unsafe: Labels, (N,).
-        episode: Which episode each sample belongs to, (N,).
-        bootstrap: How the interval is found.
+        episode: Index of each sample's episode, (N,).
+        bootstrap: Settings of the interval.
     """
     score, label = _checked("auc_difference", unsafe_score, is_unsafe, episode)
     other, _ = _checked("auc_difference", other_score, is_unsafe)
@@ -207,38 +211,37 @@ def auc_difference(
     return bootstrap.over_episodes(difference, episode)
 
 
-def segment_figures(
+def segment_estimates(
     segments: Segments,
     unsafe_score: np.ndarray,
     *,
     threshold: float,
     is_probability: bool = True,
     bootstrap: Bootstrap = _BOOTSTRAP,
-) -> dict[str, Figure]:
-    """How well a scorer tells segments that lead to an unsafe end from those that do not.
+) -> dict[str, Estimate]:
+    """AUC, recalls and Brier score of a scorer on segments.
 
-    The segments of one episode are not independent: every interval is a bootstrap over episodes.
-    Recalls have Clopper-Pearson's interval where that is exact, as each episode has one sample
-    (k = 0 alone: `segments.take(segments.is_first)`), and for as many episodes where there is not
-    a single error (or hit), and so no spread to resample.
+    Intervals are bootstraps over episodes. Recalls have Clopper-Pearson intervals where these are
+    exact, with one sample an episode (k = 0 alone: `segments.take(segments.is_first)`), and, over
+    the number of episodes, where all samples are right or all wrong and resampling has no spread.
 
     Args:
         segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
         unsafe_score: Unsafe score of each, (N,).
-        threshold: Above it a segment is judged unsafe.
-        is_probability: Whether the scores are probabilities, and there is a Brier score.
-        bootstrap: How the intervals are found.
+        threshold: Score above which a segment is classified unsafe.
+        is_probability: Whether the scores are probabilities and have a Brier score.
+        bootstrap: Settings of the intervals.
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall`, and `brier` for probabilities.
 
     Raises:
-        ValueError: Not one score a segment, or a probability outside [0, 1].
+        ValueError: The number of scores differs, or a probability is outside [0, 1].
     """
-    score, label = _checked("segment_figures", unsafe_score, segments.is_unsafe)
+    score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode
 
-    def mean(values: np.ndarray, rows: np.ndarray) -> Figure:
+    def mean(values: np.ndarray, rows: np.ndarray) -> Estimate:
         values, members = values[rows].astype(float), episode[rows]
 
         def average(weight: np.ndarray) -> float:
@@ -247,7 +250,7 @@ def segment_figures(
 
         return bootstrap.over_episodes(average, members)
 
-    def recall(is_right: np.ndarray, rows: np.ndarray) -> Figure:
+    def recall(is_right: np.ndarray, rows: np.ndarray) -> Estimate:
         num_right, num_samples = int(is_right[rows].sum()), int(rows.sum())
         num_episodes = len(np.unique(episode[rows]))
         confidence = bootstrap.confidence
@@ -258,30 +261,30 @@ def segment_figures(
             return proportion(count, num_episodes, confidence=confidence)
         return mean(is_right, rows)
 
-    figures = {
+    estimates = {
         "auc": auc(score, label, episode, bootstrap=bootstrap),
         "safe_recall": recall(score <= threshold, ~label),
         "unsafe_recall": recall(score > threshold, label),
     }
     if is_probability:
-        squared = _squared_error("segment_figures", score, label)
-        figures["brier"] = mean(squared, np.ones(len(label), dtype=bool))
-    return figures
+        squared = _squared_error("segment_estimates", score, label)
+        estimates["brier"] = mean(squared, np.ones(len(label), dtype=bool))
+    return estimates
 
 
 def threshold_at(
     unsafe_score: np.ndarray, is_unsafe: np.ndarray, criterion: str = "balanced_accuracy"
 ) -> float:
-    """Chooses a threshold; choose it on other samples than those it is then judged by.
+    """Chooses a threshold on calibration samples.
 
     Args:
         unsafe_score: Unsafe scores, (N,).
         is_unsafe: Labels, (N,).
-        criterion: "balanced_accuracy" makes the mean of both recalls as large as it gets;
-            "equal_error" makes the recalls as equal as they get.
+        criterion: "balanced_accuracy" maximises the mean of both recalls; "equal_error" minimises
+            their difference.
 
     Returns:
-        A threshold midway between two scores. Of equally good ones it is the middle one.
+        A threshold midway between two scores; the middle one of equally good ones.
 
     Raises:
         ValueError: Unknown criterion, or one of the classes is missing.
@@ -297,7 +300,7 @@ def threshold_at(
             f"threshold_at: {num_unsafe} of {len(label)} samples are unsafe; it takes both classes"
         )
     values, rank = np.unique(score, return_inverse=True)
-    # After value i: how many of each class lie at or below it, and so are judged safe.
+    # Per value, the samples of each class at or below it, which are classified safe.
     below_unsafe = np.cumsum(np.bincount(rank, weights=label, minlength=len(values)))
     below_safe = np.cumsum(np.bincount(rank, weights=~label, minlength=len(values)))
     unsafe_recall = 1.0 - np.concatenate([[0.0], below_unsafe]) / num_unsafe
@@ -307,7 +310,7 @@ def threshold_at(
         raise ValueError(f"threshold_at: none of the {len(score)} scores is finite")
     lowest = np.nextafter(finite[0], -math.inf)
     middle = 0.5 * (finite[:-1] + finite[1:])
-    # What is infinitely unsafe stays above every threshold.
+    # Infinite scores stay above every threshold.
     candidates = np.concatenate([[lowest], middle, [finite[-1]]])
     unsafe_recall, safe_recall = (r[: len(candidates)] for r in (unsafe_recall, safe_recall))
     balanced = 0.5 * (unsafe_recall + safe_recall)

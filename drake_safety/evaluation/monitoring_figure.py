@@ -1,4 +1,4 @@
-"""Who notices a push: the receiver operating characteristic, and how long before it matters."""
+"""Alarms on pushed motions: receiver operating characteristic and lead times."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ _LATEST_S = -0.3  # Alarms this late are still drawn.
 
 
 def monitoring_figure(study: MonitoringStudy, names: Sequence[str] | None = None) -> Figure:
-    """The alarms of a study, side by side.
+    """Plots the alarms of a study.
 
-    On the left what each notices against its false alarms, for every threshold; a dot marks the
-    one that was chosen. On the right the share that is noticed at least so long before the robot
-    leaves the safe set, at that threshold.
+    Left: detection rate against the share of motions with a false alarm, for every threshold; a dot
+    marks the chosen one. Right: share of motions detected by each lead time, at that threshold.
 
     Args:
         study: The study.
-        names: Which alarms; all of them by default.
+        names: Alarms to show; all by default.
     """
     names = list(study.thresholds) if names is None else list(names)
     label = study.is_unsafe
@@ -39,29 +38,29 @@ def monitoring_figure(study: MonitoringStudy, names: Sequence[str] | None = None
         for i, name in enumerate(names):
             score = study.unsafe_score[name]
             style = series_style(i) | {"linewidth": 2.4 if i == 0 else 1.5, "zorder": 4 - (i > 0)}
-            words = f"{spoken(name)}   {study.figures[f'monitoring.{name}.auc'].value:.3f}"
-            draw_roc(roc, score, label, words, -study.thresholds[name], **style)
+            text = f"{spoken(name)}   {study.estimates[f'monitoring.{name}.auc'].value:.3f}"
+            draw_roc(roc, score, label, text, -study.thresholds[name], **style)
             lead_s = np.sort(study.lead_s[name])
             if lead_s.size:
                 shown = np.concatenate([[longest], lead_s[::-1]])
-                noticed = np.arange(len(shown)) / lead_s.size
+                detected = np.arange(len(shown)) / lead_s.size
                 is_shown = shown >= _LATEST_S
-                shown, noticed = shown[is_shown], noticed[is_shown]
+                shown, detected = shown[is_shown], detected[is_shown]
                 lead_axes.step(
                     np.append(shown, _LATEST_S),
-                    np.append(noticed, noticed[-1]),
+                    np.append(detected, detected[-1]),
                     where="post",
                     **style,
                 )
         roc.set(xlim=(0, 1), ylim=(0, 1.005))
-        roc.set_xlabel("motions that stay safe, with a false alarm")
-        roc.set_ylabel("motions that leave the safe set, noticed before")
+        roc.set_xlabel("share of safe motions with a false alarm")
+        roc.set_ylabel("detection rate")
         roc.set_title("At every threshold")
         roc.legend(loc="lower right", title="area under the curve", alignment="left")
         lead_axes.axvline(0.0, color=FAINT_INK, linewidth=0.8)
         lead_axes.set(xlim=(max(longest, 0.1), _LATEST_S), ylim=(0, 1.005))
-        lead_axes.set_xlabel("time left until the robot leaves the safe set [s]")
-        lead_axes.set_ylabel("noticed by then")
+        lead_axes.set_xlabel("lead time until the robot leaves the safe set [s]")
+        lead_axes.set_ylabel("detection rate")
         lead_axes.set_title("At the chosen thresholds")
         for axes in (roc, lead_axes):
             axes.grid(color="#eceef0", linewidth=0.7)

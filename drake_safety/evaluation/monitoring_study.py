@@ -1,8 +1,7 @@
-"""Watching a robot that is pushed: who notices, how long before, and how often for nothing.
+"""Detection rate, lead time and false-alarm rate of alarms on pushed motions.
 
-An alarm is told from a false one by what comes of the motion: in one that stays in the safe set
-every alarm is false, and so is one before the push. What is noticed is noticed between the push and
-the instant at which the robot leaves the safe set.
+In a motion that stays in the safe set every alarm is false, and so is any alarm before the push. A
+detection is an alarm between the push and the instant at which the robot leaves the safe set.
 """
 
 from __future__ import annotations
@@ -14,29 +13,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.alarms import Alarm
-from drake_safety.evaluation.metrics import Figure, auc, median, proportion
+from drake_safety.evaluation.metrics import Estimate, auc, median, proportion
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 
 FALSE_ALARM_SHARE = 0.05
-"""Share of the calibration motions that stay safe in which everyone may give a false alarm."""
+"""Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
 _SLACK_S = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MonitoringStudy:
-    """What :func:`evaluate_alarms` found.
+    """The result of :func:`evaluate_alarms`.
 
     Attributes:
-        figures: By dotted key.
-        thresholds: By alarm: below it there is one.
-        unsafe_score: By alarm, minus the smallest value that it could have cried at, (N,).
-        is_unsafe: Which of the N motions leave the safe set.
-        lead_s: By alarm, time from its cry to leaving, of the motions that leave [s]; negative
-            when it is late, minus infinity when it never comes.
+        estimates: By dotted key.
+        thresholds: By alarm, the value below which it is raised.
+        unsafe_score: By alarm, minus the lowest value of each motion, (N,).
+        is_unsafe: Whether each motion leaves the safe set, (N,).
+        lead_s: By alarm, the lead time of each motion that leaves the safe set [s]; negative for a
+            late alarm, minus infinity for none.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     thresholds: dict[str, float]
     unsafe_score: dict[str, np.ndarray]
     is_unsafe: np.ndarray
@@ -46,12 +45,12 @@ class MonitoringStudy:
 def begun(
     motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
 ) -> list[WatchedMotion]:
-    """The motions that a robot begins: those whose plan is accepted at their first row.
+    """The motions whose plan is accepted at their first row, so that the robot begins them.
 
     Args:
         motions: Motions, pushed or not.
-        scorer: What the verdict is read from.
-        threshold: From which safety probability on a plan is accepted.
+        scorer: Scorer of the plans.
+        threshold: Lowest safety probability of an accepted plan.
     """
     if not motions:
         return []
@@ -63,24 +62,24 @@ def begun(
 def first_alarm(
     motion: WatchedMotion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
 ) -> float:
-    """When a value is first below a threshold [s]; infinite if it never is.
+    """Time of the first value below a threshold [s]; infinite if there is none.
 
     Args:
         motion: The motion.
-        value: Of each row, (N,); NaN is below every threshold.
+        value: Value of each row, (N,); NaN is below every threshold.
         threshold: The threshold.
-        since_s: From when on one looks [s].
+        since_s: Earliest time that counts [s].
     """
     is_alarm = ~(value >= threshold) & (motion.time_s >= since_s - _SLACK_S)
     return float(motion.time_s[int(np.argmax(is_alarm))]) if is_alarm.any() else math.inf
 
 
 def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
-    """The smallest value while it counts: of all rows, or from the push until it is too late.
+    """The lowest value of a motion; if it leaves the safe set, from the push until then.
 
     Args:
         motion: The motion.
-        value: Of each row, (N,); NaN is minus infinity.
+        value: Value of each row, (N,); NaN is minus infinity.
     """
     value = np.where(np.isnan(value), -math.inf, value)
     if motion.has_left:
@@ -95,11 +94,11 @@ def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
     """The highest threshold with which at most a share of motions has an alarm.
 
     Args:
-        lowest: The smallest value of each motion that stays safe, (N,).
+        lowest: Lowest value of each motion that stays safe, (N,).
         share: The share, in [0, 1).
 
     Raises:
-        ValueError: There is no motion, or no such share.
+        ValueError: There is no motion, or the share is out of range.
     """
     if not 0 <= share < 1:
         raise ValueError(f"monitoring: the share of false alarms must be in [0, 1); got {share}")
@@ -108,24 +107,24 @@ def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
     return float(np.sort(lowest)[math.floor(share * len(lowest))])
 
 
-def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Figure:
+def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
     """Events per hour, with the exact interval of a Poisson process.
 
     Args:
         count: Number of events.
-        duration_s: How long one has waited for them [s].
-        n: Number of motions in which.
-        confidence: Of the interval.
+        duration_s: Observed time [s].
+        n: Number of observed motions.
+        confidence: Confidence of the interval.
     """
     from scipy.stats import chi2
 
     if not duration_s > 0:
-        return Figure(math.nan, math.nan, math.nan, n)
+        return Estimate.exact(math.nan, n)
     tail = 0.5 * (1.0 - confidence)
     hours = duration_s / 3600.0
     low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
     high = 0.5 * chi2.ppf(1.0 - tail, 2 * count + 2)
-    return Figure(count / hours, float(low / hours), float(high / hours), n)
+    return Estimate(count / hours, float(low / hours), float(high / hours), n)
 
 
 def evaluate_alarms(
@@ -135,38 +134,37 @@ def evaluate_alarms(
     *,
     false_alarm_share: float = FALSE_ALARM_SHARE,
 ) -> MonitoringStudy:
-    """Compares who notices what, at the same share of false alarms on other motions.
+    """Compares alarms at the same share of false alarms on calibration motions.
 
-    Motions that leave the safe set before anybody pushes are left out.
+    Motions that leave the safe set before the push are left out.
 
     Args:
-        alarms: Who watches.
+        alarms: The alarms.
         calibration: Motions on which thresholds are chosen.
         test: Fresh motions.
-        false_alarm_share: Share of the calibration motions that stay safe in which there may be a
-            false alarm.
+        false_alarm_share: Allowed share of safe calibration motions with a false alarm.
 
     Raises:
-        ValueError: No calibration motion stays safe, or there is no such share.
+        ValueError: No calibration motion stays safe, or the share is out of range.
     """
     calm = [motion for motion in calibration if not motion.has_left]
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
-    figures = _motion_figures(judged, len(test))
+    estimates = _motion_estimates(judged, len(test))
     thresholds, scores, leads = {}, {}, {}
     for alarm in alarms:
         lowest = np.array([lowest_value(motion, alarm.value(motion)) for motion in calm])
         threshold = equal_share_threshold(lowest, false_alarm_share)
         values = [alarm.value(motion) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
-        found, lead_s = _alarm_figures(judged, values, threshold)
+        found, lead_s = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
-        found["threshold"] = Figure(threshold, threshold, threshold, len(calm))
-        figures |= {f"monitoring.{alarm.name}.{key}": figure for key, figure in found.items()}
+        found["threshold"] = Estimate.exact(threshold, len(calm))
+        estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
         thresholds[alarm.name], scores[alarm.name], leads[alarm.name] = threshold, score, lead_s
     return MonitoringStudy(
-        figures=figures,
+        estimates=estimates,
         thresholds=thresholds,
         unsafe_score=scores,
         is_unsafe=is_unsafe,
@@ -174,30 +172,30 @@ def evaluate_alarms(
     )
 
 
-def _motion_figures(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Figure]:
-    """What came of the motions, whoever watches."""
+def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Estimate]:
+    """Estimates of the motions themselves, the same for all alarms."""
     left = [motion for motion in judged if motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
     return {
         "monitoring.motions.left_out": proportion(num_test - len(judged), num_test),
         "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
         "monitoring.motions.fall": proportion(sum(m.has_fallen for m in left), len(judged)),
-        "monitoring.motions.safe_hours": Figure(hours, hours, hours, len(judged) - len(left)),
+        "monitoring.motions.safe_hours": Estimate.exact(hours, len(judged) - len(left)),
         "monitoring.motions.push_to_leaving_s": median(
             np.array([motion.leave_time_s - motion.push_time_s for motion in left])
         ),
     }
 
 
-def _alarm_figures(
+def _alarm_estimates(
     judged: Sequence[WatchedMotion], values: Sequence[np.ndarray], threshold: float
-) -> tuple[dict[str, Figure], np.ndarray]:
-    """What one alarm is worth, and its lead times.
+) -> tuple[dict[str, Estimate], np.ndarray]:
+    """Estimates of one alarm, and its lead times.
 
     Args:
         judged: The N motions.
-        values: Of the alarm, a row's each.
-        threshold: Of the alarm.
+        values: Values of the alarm at each row of the motions.
+        threshold: Threshold of the alarm.
     """
     watched = list(zip(judged, values, strict=True))
     safe = [(motion, value) for motion, value in watched if not motion.has_left]
@@ -209,22 +207,22 @@ def _alarm_figures(
     )
     safe_s = sum(float(motion.time_s[-1]) for motion, _ in safe)
     undisturbed_s = sum(min(motion.push_time_s, float(motion.time_s[-1])) for motion in judged)
-    cries = np.array(
+    alarm_s = np.array(
         [first_alarm(motion, v, threshold, since_s=motion.push_time_s) for motion, v in left]
     )
     leave = np.array([motion.leave_time_s for motion, _ in left])
     pushed = np.array([motion.push_time_s for motion, _ in left])
     fall = np.array([motion.fall_time_s for motion, _ in left])
     has_fallen = np.isfinite(fall)
-    lead_s = leave - cries
+    lead_s = leave - alarm_s
     return {
-        "detected": proportion(int(np.sum(cries < leave - _SLACK_S)), len(left)),
+        "detected": proportion(int(np.sum(alarm_s < leave - _SLACK_S)), len(left)),
         "lead_to_leaving_s": median(lead_s),
         "falls_detected": proportion(
-            int(np.sum(cries[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
+            int(np.sum(alarm_s[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
         ),
-        "lead_to_fall_s": median(fall[has_fallen] - cries[has_fallen]),
-        "after_push_s": median(cries - pushed),
+        "lead_to_fall_s": median(fall[has_fallen] - alarm_s[has_fallen]),
+        "after_push_s": median(alarm_s - pushed),
         "false_alarm_share": proportion(false, len(safe)),
         "false_alarms_per_hour": rate_per_hour(false, safe_s, len(safe)),
         "undisturbed_false_alarms_per_hour": rate_per_hour(early, undisturbed_s, len(judged)),

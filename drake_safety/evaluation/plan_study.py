@@ -1,4 +1,4 @@
-"""Plans with a goal, judged before anything moves: who accepts what, and what came of it."""
+"""Evaluation of verdicts on plans with a goal, at k = 0, against the simulated outcomes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Figure, proportion, segment_figures
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, segment_estimates
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
@@ -25,31 +25,30 @@ from drake_safety.simulation.capabilities import HasGoals, is_fair, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 SAFE_RECALL = 0.952
-"""Share of the safe targets that the paper's method predicts safe, of 1000 random ones."""
+"""The paper's safe recall on 1000 random targets."""
 UNSAFE_RECALL = 0.987
-"""Share of the unsafe targets that it predicts unsafe."""
+"""The paper's unsafe recall on these."""
 PROMISED_UNSAFE_RECALL = 0.992
-"""What thresholds are chosen for: half a point above the paper's, as a finite test set scatters."""
+"""Unsafe recall for which thresholds are chosen: half a point above the paper's for scatter."""
 SAFE = "safe"
-"""Outcome of an episode that stayed in the safe set; else it is the episode's cause."""
-
+"""Outcome of an episode that stayed in the safe set; otherwise the outcome is its cause."""
 
 _LOGGER = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plans:
-    """Episodes seen at k = 0, when the plan is made: what is known then, and what came of it.
+    """Plans of episodes: their inputs at k = 0 and their outcomes.
 
     Attributes:
-        first: The segment that each episode starts with, (N,); diverged episodes have none.
-        goals: Where each plan leads to, in the world, (N, 3) [m].
-        is_fair: Whether each belongs to the fair set, (N,).
-        hand: The robot's reaching frame that goes there, if it is one.
-        outcomes: Of all episodes, diverged ones too: `SAFE` or the cause, (M,).
-        is_outcome_fair: Whether each of them belongs to the fair set, (M,).
-        num_failures: Controller failures of each of them, (M,).
-        constraint_names: The n_c safety constraints.
+        first: First segment of each episode, (N,); diverged episodes have none.
+        goals: Goal of each plan in the world, (N, 3) [m].
+        is_fair: Whether each goal belongs to the fair set, (N,).
+        hand: Name of the reaching frame, if the task has one.
+        outcomes: `SAFE` or the cause of all episodes, diverged ones included, (M,).
+        is_outcome_fair: Whether each of these belongs to the fair set, (M,).
+        num_failures: Number of controller failures of each of these, (M,).
+        constraint_names: Names of the n_c safety constraints.
     """
 
     first: Segments
@@ -70,7 +69,7 @@ class Plans:
         return self.first.is_unsafe
 
     def fair(self) -> Plans:
-        """Those of the fair set."""
+        """The plans of the fair set."""
         return Plans(
             first=self.first.take(self.is_fair),
             goals=self.goals[self.is_fair],
@@ -84,16 +83,16 @@ class Plans:
 
 
 def plans_of(loop: ClosedLoop, episodes: Episodes) -> Plans:
-    """What there is to judge in episodes of a loop whose plans have a goal.
+    """The plans of episodes of a task whose plans have a goal.
 
     Args:
-        loop: The closed loop that the episodes were made with.
+        loop: The closed loop that generated the episodes.
         episodes: The episodes.
 
     Raises:
         ValueError: The task's plans have no goal.
     """
-    # A segment that starts where the episode does, however early the episode ends.
+    # Every episode has a first segment, however early it ends.
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     first = segments.take(segments.is_first)
     with_goals = require(loop, HasGoals)
@@ -112,12 +111,12 @@ def plans_of(loop: ClosedLoop, episodes: Episodes) -> Plans:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRule:
-    """Something that accepts or refuses plans.
+    """A rule that accepts or refuses plans.
 
     Attributes:
         name: Its key in tables.
-        unsafe_score: How unsafe it takes each plan to be, (N,), in [0, 1]; NaN for "don't know",
-            which refuses.
+        unsafe_score: Maps plans to unsafe scores, (N,), in [0, 1]; NaN for "don't know", which is
+            refused.
         threshold: Unsafe score above which a plan is refused; None to choose it on the calibration
             plans.
     """
@@ -128,11 +127,11 @@ class PlanRule:
 
 
 def scorer_rule(scorer: Scorer, calibration: Calibration | None = None) -> PlanRule:
-    """A scorer of x.
+    """The rule of a scorer.
 
     Args:
         scorer: The scorer.
-        calibration: Its own; without one its threshold is left open.
+        calibration: Its calibration; without one the threshold is None.
     """
     return PlanRule(
         name=scorer.name,
@@ -142,16 +141,16 @@ def scorer_rule(scorer: Scorer, calibration: Calibration | None = None) -> PlanR
 
 
 def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
-    """Accepts what inverse kinematics reaches: yes or no, nothing to choose.
+    """The rule that accepts goals within reach of inverse kinematics.
 
     Args:
-        reachability: By hand.
+        reachability: Reachability by hand.
     """
 
     def unsafe_score(plans: Plans) -> np.ndarray:
         if plans.hand is None or plans.hand not in reachability:
             raise ValueError(
-                f"reachability: no hand '{plans.hand}' is known; known are {list(reachability)}"
+                f"reachability: unknown hand '{plans.hand}'; the hands are {list(reachability)}"
             )
         return 1.0 - reachability[plans.hand].is_reachable(plans.goals)
 
@@ -160,15 +159,15 @@ def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanStudy:
-    """What :func:`evaluate_plans` found.
+    """The result of :func:`evaluate_plans`.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         thresholds: Per rule, the unsafe score above which it refuses.
         unsafe_score: Per set ("plans", "plans.other_hand") and rule, the score of each plan, (N,).
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     thresholds: dict[str, float]
     unsafe_score: dict[str, dict[str, np.ndarray]]
 
@@ -180,24 +179,24 @@ def evaluate_plans(
     sets: Mapping[str, Plans],
     twins: Sequence[str] = (),
 ) -> PlanStudy:
-    """Every rule on fresh plans, all of them and the fair ones.
+    """Evaluates rules on fresh plans, on all goals and on the fair ones.
 
-    Thresholds left open are chosen on the calibration plans, all of the target box, so that an
-    unsafe plan yet to come is refused with the probability `PROMISED_UNSAFE_RECALL`, see
-    :mod:`drake_safety.learning.calibration`; of those the one that accepts most. With too few
-    unsafe calibration plans for that promise it is the highest that can be kept, with a warning;
-    `promised_unsafe_recall` says which it was. The figures give them as Γ_thre, the safety
-    probability below which a plan is refused.
+    Thresholds that are None are chosen on the calibration plans of the whole target box: the one
+    that accepts most while a future unsafe plan is refused with probability
+    `PROMISED_UNSAFE_RECALL`, see :mod:`drake_safety.learning.calibration`. With too few unsafe
+    calibration plans the promise is reduced to what they allow, with a warning, and reported as
+    `promised_unsafe_recall`. Estimates give thresholds as Γ_thre, the safety probability below
+    which a plan is refused.
 
     Args:
-        rules: Who is judged; the assessment's own rule is the one of this name: "sharpened".
+        rules: The rules; that of the assessment is named "sharpened".
         assessment: Γ, which names causes.
-        calibration: Other fresh plans, for every choice that is to be made.
-        sets: Fresh plans by the prefix of their keys, such as "plans".
-        twins: Which of them have the targets of "plans", in the same order, for another hand.
+        calibration: Fresh plans for thresholds.
+        sets: Other fresh plans by the prefix of their keys, such as "plans".
+        twins: Prefixes of sets with the goals of "plans", in the same order, for the other hand.
 
     Raises:
-        ValueError: There is no threshold to choose: no calibration plan is unsafe.
+        ValueError: No calibration plan is unsafe, so no threshold can be chosen.
     """
     miss_rate = promised_miss_rate(calibration)
     thresholds = {
@@ -210,7 +209,7 @@ def evaluate_plans(
 
     promise = 1.0 - miss_rate
     num_unsafe = int(calibration.is_unsafe.sum())
-    figures = {"plans.promised_unsafe_recall": Figure(promise, promise, promise, num_unsafe)}
+    estimates = {"plans.promised_unsafe_recall": Estimate.exact(promise, num_unsafe)}
     scores: dict[str, dict[str, np.ndarray]] = {}
     for prefix, plans in sets.items():
         scores[prefix] = {rule.name: rule.unsafe_score(plans) for rule in rules}
@@ -220,18 +219,18 @@ def evaluate_plans(
             (f"{prefix}.fair", plans.fair(), plans.is_fair),
         ):
             for name, score in scores[prefix].items():
-                found = verdict_figures(chosen, score[rows], thresholds[name])
-                figures |= {f"{key}.{name}.{what}": figure for what, figure in found.items()}
+                found = verdict_estimates(chosen, score[rows], thresholds[name])
+                estimates |= {f"{key}.{name}.{what}": estimate for what, estimate in found.items()}
                 limit = 1.0 - thresholds[name]
-                figures[f"{key}.{name}.threshold"] = Figure(limit, limit, limit, len(calibration))
-            found = _cause_figures(
+                estimates[f"{key}.{name}.threshold"] = Estimate.exact(limit, len(calibration))
+            found = _cause_estimates(
                 chosen,
                 {name: of_all[rows] for name, of_all in causes.items()},
                 _is_refused(scores[prefix][own.name][rows], thresholds[own.name]),
             )
-            found |= outcome_figures(chosen)
-            figures |= {f"{key}.{what}": figure for what, figure in found.items()}
-        figures[f"{prefix}.share_fair"] = proportion(
+            found |= outcome_estimates(chosen)
+            estimates |= {f"{key}.{what}": estimate for what, estimate in found.items()}
+        estimates[f"{prefix}.share_fair"] = proportion(
             int(plans.is_outcome_fair.sum()), len(plans.outcomes)
         )
     for prefix in twins:
@@ -242,15 +241,15 @@ def evaluate_plans(
                 sets[prefix],
                 _is_refused(scores[prefix][name], threshold),
             )
-            figures |= {f"{prefix}.{name}.{what}": figure for what, figure in found.items()}
-    return PlanStudy(figures=figures, thresholds=thresholds, unsafe_score=scores)
+            estimates |= {f"{prefix}.{name}.{what}": estimate for what, estimate in found.items()}
+    return PlanStudy(estimates=estimates, thresholds=thresholds, unsafe_score=scores)
 
 
 def promised_miss_rate(calibration: Plans) -> float:
-    """What share of unsafe plans thresholds may accept: as promised, or more if few were seen.
+    """Miss rate that thresholds promise: as wanted, or higher with few unsafe plans.
 
     Args:
-        calibration: The plans that thresholds are chosen on.
+        calibration: The plans on which thresholds are chosen.
 
     Raises:
         ValueError: None of them is unsafe.
@@ -273,30 +272,32 @@ def promised_miss_rate(calibration: Plans) -> float:
     return max(least, wanted)
 
 
-def verdict_figures(plans: Plans, unsafe_score: np.ndarray, threshold: float) -> dict[str, Figure]:
-    """How well scores (N,) tell unsafe plans from safe ones.
+def verdict_estimates(
+    plans: Plans, unsafe_score: np.ndarray, threshold: float
+) -> dict[str, Estimate]:
+    """Estimates of verdicts by unsafe scores (N,).
 
     Returns:
-        `auc`, `safe_recall`, `unsafe_recall` and `brier`. Each plan is an episode of its own, so
-        the recalls have Clopper-Pearson's interval.
+        `auc`, `safe_recall`, `unsafe_recall` and `brier`. Each plan is one episode, so recalls have
+        Clopper-Pearson intervals.
     """
-    return segment_figures(plans.first, unsafe_score, threshold=threshold)
+    return segment_estimates(plans.first, unsafe_score, threshold=threshold)
 
 
 def recall_losses(
     plans: Plans, is_refused: np.ndarray, twins: Plans, is_twin_refused: np.ndarray
-) -> dict[str, Figure]:
-    """What recalls lose from plans to their twins: the same targets, in the same order.
+) -> dict[str, Estimate]:
+    """Differences of the recalls between plans and their twins, which have the same targets.
 
     Args:
-        plans: Plans, maybe more than there are twins.
-        is_refused: Which of them are refused, (N,).
-        twins: Their twins.
-        is_twin_refused: Which of those are refused, (M,).
+        plans: Plans; some may have no twin.
+        is_refused: Whether each is refused, (N,).
+        twins: Their twins, in the same order.
+        is_twin_refused: Whether each twin is refused, (M,).
 
     Returns:
-        `safe_recall_loss` and `unsafe_recall_loss`: the recall of the plans that have a twin, less
-        that of the twins. Intervals are found by drawing pairs again.
+        `safe_recall_loss` and `unsafe_recall_loss`: the recall of the plans that have a twin, minus
+        that of the twins. Intervals are bootstraps over pairs.
     """
     _, rows, twin_rows = np.intersect1d(
         plans.first.episode, twins.first.episode, return_indices=True
@@ -307,7 +308,7 @@ def recall_losses(
 
     def loss(
         relevant: np.ndarray, right: np.ndarray, twin_relevant: np.ndarray, twin_right: np.ndarray
-    ) -> Figure:
+    ) -> Estimate:
         def statistic(weight: np.ndarray) -> float:
             total, twin_total = weight @ relevant, weight @ twin_relevant
             if not (total and twin_total):
@@ -323,32 +324,32 @@ def recall_losses(
     }
 
 
-def outcome_figures(plans: Plans) -> dict[str, Figure]:
-    """What came of the plans: `outcomes.safe`, `outcomes.CAUSE` and the controllers' failures.
+def outcome_estimates(plans: Plans) -> dict[str, Estimate]:
+    """Outcomes of plans: `outcomes.safe`, `outcomes.CAUSE` and controller failures.
 
     Returns:
-        Shares of all episodes, diverged ones too. `episodes_with_controller_failures` is a share,
-        `controller_failures` their number.
+        Shares of all episodes, diverged ones included. `episodes_with_controller_failures` is a
+        share, `controller_failures` a count.
     """
     n = len(plans.outcomes)
-    figures = {
+    estimates = {
         f"outcomes.{name}": proportion(int(np.sum(plans.outcomes == name)), n)
         for name in (SAFE, *plans.constraint_names, DIVERGED)
     }
-    figures["episodes_with_controller_failures"] = proportion(
+    estimates["episodes_with_controller_failures"] = proportion(
         int(np.sum(plans.num_failures > 0)), n
     )
     total = float(plans.num_failures.sum())
-    figures["controller_failures"] = Figure(total, total, total, n)
-    return figures
+    estimates["controller_failures"] = Estimate.exact(total, n)
+    return estimates
 
 
 def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.ndarray]:
-    """The cause that Γ would name for each plan, as a column of the constraints, (N,).
+    """The cause that Γ names for each plan, as index of the constraint, (N,).
 
     Returns:
-        "right_cause", by the rule of :func:`~drake_safety.learning.causes.likely_causes`, and
-        to compare with "by_cause_probability", the constraint with most of the unsafe mass.
+        "right_cause", by :func:`~drake_safety.learning.causes.likely_causes`, and for comparison
+        "by_cause_probability", the constraint with the largest unsafe mass.
     """
     first = plans.first
     result = assessment.predict(
@@ -365,22 +366,22 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
     }
 
 
-def _cause_figures(
+def _cause_estimates(
     plans: Plans, named: Mapping[str, np.ndarray], is_refused: np.ndarray
-) -> dict[str, Figure]:
-    """Shares of the right causes among correctly refused plans, by either rule and by cause."""
-    figures = {}
+) -> dict[str, Estimate]:
+    """Shares of correct causes among correctly refused plans, by either rule and by cause."""
+    estimates = {}
     for name, causes in named.items():
-        figures[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
+        estimates[f"causes.{name}"], by_cause = _right_causes(plans, causes, is_refused)
         if name == "right_cause":
-            figures |= {f"causes.{cause}": figure for cause, figure in by_cause.items()}
-    return figures
+            estimates |= {f"causes.{cause}": estimate for cause, estimate in by_cause.items()}
+    return estimates
 
 
 def _right_causes(
     plans: Plans, named: np.ndarray, is_refused: np.ndarray
-) -> tuple[Figure, dict[str, Figure]]:
-    """The share whose named cause (N,) is the simulated one: of all correctly refused, by cause."""
+) -> tuple[Estimate, dict[str, Estimate]]:
+    """Share of correctly refused plans whose named cause (N,) is the simulated one; by cause."""
     rows = is_refused & plans.is_unsafe
     is_right = (named == plans.first.cause)[rows]
     cause = plans.first.cause[rows]

@@ -1,4 +1,4 @@
-"""Predicted against actual: every target where it was, coloured by verdict and outcome."""
+"""Positions of targets, coloured by verdict and outcome."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MISS_COLOUR = "#111111"
-# Verdict and outcome: name, of which class, colour, marker, and size; mistakes lie on top.
+# Verdict and outcome: name, class, colour, marker and size; errors are drawn on top.
 _KINDS = (
     ("accepted, safe", "safe", SAFE_COLOUR, "o", 13.0),
     ("refused, unsafe", "unsafe", UNSAFE_COLOUR, "o", 13.0),
     ("refused, but safe", "safe", FALSE_ALARM_COLOUR, "s", 34.0),
     ("accepted, but unsafe", "unsafe", MISS_COLOUR, "X", 60.0),
 )
-# Title, and the coordinates that go right and up.
+# Title, and the horizontal and vertical coordinate.
 _VIEWS = (("From behind the robot", 1, 2), ("From above", 1, 0))
 _LABELS = ("x [m], forwards", "y [m], to the robot's left", "z [m]")
-_WIDTH, _HEIGHT = 6.6, 2.4  # Of the picture, and of what is not panels in it [inches].
+_WIDTH, _HEIGHT = 6.6, 2.4  # Width of the figure, and height without panels [inches].
 _PANEL_WIDTH = 5.6
 
 
 def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarray) -> Figure:
-    """Targets in two views; the legend says how many there are of each kind.
+    """Plots targets in two views; the legend gives the number of each kind.
 
     Args:
         goals: Targets in the world, (N, 3) [m].
-        is_unsafe: What came of each, (N,).
-        is_refused: What was said of each beforehand, (N,).
+        is_unsafe: Outcome of each, (N,).
+        is_refused: Verdict on each, (N,).
 
     Raises:
-        ValueError: The arguments are not as many.
+        ValueError: The arguments have different lengths.
     """
     goals = np.asarray(goals, dtype=float)
     shapes = [goals.shape, np.shape(is_unsafe), np.shape(is_refused)]
@@ -55,7 +55,7 @@ def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarra
     )
     totals = {"safe": int((~is_unsafe).sum()), "unsafe": int(is_unsafe.sum())}
     with drawing_style():
-        # Both views have y to the right, and one scale.
+        # Both views share the horizontal axis y and the scale.
         span = np.ptp(goals, axis=0) if len(goals) else np.ones(3)
         heights = [max(span[up], 0.1) / max(span[right], 0.1) for _, right, up in _VIEWS]
         fig = new_figure(_WIDTH, _HEIGHT + _PANEL_WIDTH * sum(heights))

@@ -1,4 +1,4 @@
-"""The simple way to ask whether a robot can reach a point: inverse kinematics, and no more."""
+"""Reachability of points by inverse kinematics alone: a baseline for verdicts on targets."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pydrake.solvers import SnoptSolver
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot_model import RobotModel
 
-_TOLERANCE_M = 2e-3  # Well above what the solver leaves of a point it can reach.
+_TOLERANCE_M = 2e-3  # Well above the residual of the solver at a reachable point.
 
 
 class Reachability:
-    """Whether a hand gets to a point while base and feet stay as they stand, within joint limits.
+    """Tests whether a hand reaches a point within joint limits while base and feet stand still.
 
-    The method that learned verdicts are compared with: the joints between base and hand move, all
-    others are locked in the standing posture; nothing is known of balance, obstacles or motion.
+    The joints between base and hand move, all others are locked in the standing posture; balance,
+    obstacles and motion are not considered.
 
     Args:
         robot: The robot, which stands at the world's origin.
@@ -37,7 +37,7 @@ class Reachability:
         kinematics.set_positions(standing)
         middle = standing.copy()
         self.joint_names = []
-        """Joints that move: those between base and hand."""
+        """Names of the joints between base and hand, which move."""
         for index in plant.GetJointIndices(plant.GetModelInstanceByName(robot.name)):
             joint = plant.get_joint(index)
             if joint.num_velocities() == 0:
@@ -53,7 +53,7 @@ class Reachability:
         self._guesses = (standing, middle)
 
     def miss(self, p_WH: np.ndarray) -> float:
-        """How far from a point the hand ends at best [m].
+        """Distance between a point and the closest position of the hand [m].
 
         Args:
             p_WH: The point in the world, (3,) [m].
@@ -79,7 +79,7 @@ class Reachability:
         return best
 
     def is_reachable(self, p_WH: np.ndarray) -> np.ndarray:
-        """Whether the hand gets to each of the points, (N,).
+        """Whether the hand reaches each of the points, (N,).
 
         Args:
             p_WH: Points in the world, (N, 3) [m].

@@ -1,4 +1,4 @@
-"""Which points of a vertical plane a robot reaches from where it stands: Γ, kinematics, truth."""
+"""The reachable region on a vertical plane by Γ, by inverse kinematics and by simulation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_safety.evaluation.metrics import Figure, proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
@@ -20,9 +20,9 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
-_REFINEMENT = 4  # What needs no simulation is asked at so many points a simulated one, each way.
-_EDGE_STEP_M = 0.01  # Grid on which obstacles are seen.
-_SEEN_M = 0.05  # Obstacles further from a point than this do not matter.
+_REFINEMENT = 4  # Γ and kinematics have so many points per simulated one along each axis.
+_EDGE_STEP_M = 0.01  # Spacing of the grid of obstacle distances.
+_MAX_DISTANCE_M = 0.05  # Obstacle distances saturate here.
 _REPORT_EVERY = 50
 
 
@@ -31,16 +31,16 @@ class ReachableRegion:
     """The targets on a plane x = const of a robot in its standing posture.
 
     Attributes:
-        x_m: Where the plane is, in the world [m].
+        x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
         safety_probability: Normalised Γ there, (n_z, n_y).
         threshold: Γ_thre.
-        is_reachable: Whether inverse kinematics gets there, (n_z, n_y); None for a robot that it
-            does not know.
-        obstacle_y_m, obstacle_z_m: A grid that shows obstacles' edges, (o_y,), (o_z,) [m].
-        obstacle_distance_m: There, to the nearest obstacle, negative inside, at most a few
-            centimetres, (o_z, o_y) [m]; None where the diagram has no geometry.
-        simulated_y_m, simulated_z_m: The grid of what was simulated, (m_y,), (m_z,) [m].
+        is_reachable: Whether inverse kinematics reaches each point, (n_z, n_y); None for a task
+            without a hand.
+        obstacle_y_m, obstacle_z_m: The grid of obstacle distances, (o_y,), (o_z,) [m].
+        obstacle_distance_m: Signed distance to the nearest obstacle, at most 5 cm, (o_z, o_y) [m];
+            None for a diagram without geometry.
+        simulated_y_m, simulated_z_m: The grid of simulated targets, (m_y,), (m_z,) [m].
         outcomes: `SAFE` or the cause, (m_z, m_y).
     """
 
@@ -57,22 +57,22 @@ class ReachableRegion:
     simulated_z_m: np.ndarray
     outcomes: np.ndarray
 
-    def figures(self) -> dict[str, Figure]:
-        """How often verdicts on the simulated grid are right.
+    def estimates(self) -> dict[str, Estimate]:
+        """Shares of correct verdicts on the simulated grid.
 
         Returns:
-            `share_safe`, and `sharpened.right` and `reachability.right`. Points of a grid are no
-            random sample: the intervals say how many there are, not more.
+            `share_safe`, `sharpened.right` and `reachability.right`. Points of a grid are not a
+            random sample: the intervals only indicate their number.
         """
         is_safe = self.outcomes == SAFE
         verdicts = {"sharpened": self.safety_probability >= self.threshold}
         if self.is_reachable is not None:
             verdicts["reachability"] = self.is_reachable
-        figures = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
+        estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
-            figures[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
-        return figures
+            estimates[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
+        return estimates
 
 
 def reachable_region(
@@ -86,16 +86,16 @@ def reachable_region(
     num_workers: int | None = None,
     progress: StageProgress | None = None,
 ) -> ReachableRegion:
-    """Asks everyone about a plane of the target box, and simulates it.
+    """Evaluates Γ and inverse kinematics on a plane of the target box, and simulates it.
 
     Args:
         scenario: A scenario of a task whose plans have a goal.
         assessment: Γ.
         threshold: Γ_thre, on the calibrated safety probability.
-        x_m: Where the plane is [m]; the middle of the fair box by default.
-        step_m: Between two simulated targets [m].
-        variation: Which plant.
-        num_workers: Processes.
+        x_m: Position of the plane [m]; the middle of the fair box by default.
+        step_m: Spacing of the simulated targets [m].
+        variation: Variation of the plant.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Raises:
@@ -156,12 +156,12 @@ def reachable_region(
 
 
 def plane_of(loop: ClosedLoop, x_m: float | None, step_m: float) -> tuple[float, np.ndarray]:
-    """Where a plane is, and what of it belongs to the target box.
+    """Position of a plane, and its intersection with the target box.
 
     Args:
         loop: The closed loop.
-        x_m: Where it is asked for [m]; None for the middle of the fair box.
-        step_m: Between two targets on it [m].
+        x_m: Requested position [m]; None for the middle of the fair box.
+        step_m: Spacing of the targets [m].
 
     Returns:
         Its x [m], and the lowest and highest corner (y, z) of the targets on it, (2, 2) [m].
@@ -193,15 +193,15 @@ def _targets(x_m: float, y_m: np.ndarray, z_m: np.ndarray) -> np.ndarray:
 
 
 def _obstacle_distance(loop: ClosedLoop, context: Context, points: np.ndarray) -> np.ndarray | None:
-    """Signed distance of points (N, 3) to what is not the robot, at most `_SEEN_M`, (N,) [m]."""
+    """Signed distance of points (N, 3) to obstacles, at most `_MAX_DISTANCE_M`, (N,) [m]."""
     if not isinstance(loop, LeggedLoop):
         return None
     plant, robot, scene_graph = loop.plant, loop.robot_instance, loop.scene_graph
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
     inspector = query.inspector()
-    distance = np.full(len(points), _SEEN_M)
+    distance = np.full(len(points), _MAX_DISTANCE_M)
     for i, point in enumerate(points):
-        for found in query.ComputeSignedDistanceToPoint(point, _SEEN_M):
+        for found in query.ComputeSignedDistanceToPoint(point, _MAX_DISTANCE_M):
             body = plant.GetBodyFromFrameId(inspector.GetFrameId(found.id_G))
             if body.model_instance() != robot:
                 distance[i] = min(distance[i], found.distance)

@@ -1,4 +1,4 @@
-"""The reachable region of a plane: what happens there, and what Γ and kinematics say of it."""
+"""The reachable region of a plane: simulated outcomes, and the boundaries of Γ and kinematics."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _KINEMATICS_DASHES = (0, (4, 2))
 
 
 def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figure:
-    """Simulated outcomes as areas, the boundaries of Γ and of inverse kinematics as lines.
+    """Plots simulated outcomes as areas, the boundaries of Γ and of inverse kinematics as lines.
 
-    Seen as the robot sees it: its left is on the left.
+    The view is that of the robot: its left is on the left.
 
     Args:
-        region: What was found.
-        constraint_names: Of the safe set, for causes to keep their colours.
+        region: The reachable region.
+        constraint_names: Constraints of the safe set, which decide the colours of causes.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -56,7 +56,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 alpha=0.28,
             )
             handles.append(Patch(color=INK, alpha=0.28, label="inside an obstacle"))
-        # A white edge keeps the line apart from whatever lies below.
+        # A white edge separates the line from the areas below.
         for colour, width in (("white", 5.0), (UNSAFE_COLOUR, 2.4)):
             axes.contour(
                 *_closed(region.y_m, region.z_m, region.safety_probability),
@@ -99,7 +99,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
 def _closed(
     y: np.ndarray, z: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A grid with a rim of zeros, so that contours end where the targets do."""
+    """A grid with a rim of zeros, so that contours close at the edge of the targets."""
     rim = 1e-6
     return (
         np.concatenate([[y[0] - rim], y, [y[-1] + rim]]),
@@ -109,7 +109,7 @@ def _closed(
 
 
 def _draw_outcomes(axes: Axes, region: ReachableRegion, constraint_names: list[str]) -> list:
-    """Areas of the simulated outcomes, and their entries in the legend."""
+    """Draws areas of the simulated outcomes; returns their legend entries."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""The reliability diagram: is what Γ expects what happens?"""
+"""Reliability diagram of Γ."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
-    """Share of episodes that ended unsafely over the share that was expected to.
+    """Plots the observed share of unsafe episodes over the predicted probability.
 
     Args:
-        curves: By name.
+        curves: Reliability by name.
     """
     with drawing_style():
         fig = new_figure(5.4, 5.4)
@@ -46,8 +46,8 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
             )
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
         axes.set_aspect("equal")
-        axes.set_xlabel("expected: 1 - Γ")
-        axes.set_ylabel("ended unsafely, with 95 % intervals")
+        axes.set_xlabel("predicted probability 1 - Γ")
+        axes.set_ylabel("share of unsafe episodes, 95 % intervals")
         axes.grid(color="#eceef0", linewidth=0.7)
         axes.set_title("Reliability")
         axes.legend(loc="upper left", title="expected calibration error", alignment="left")

@@ -1,4 +1,4 @@
-"""The receiver operating characteristic of scorers, whole and where it matters."""
+"""Receiver operating characteristic of scorers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def roc_figure(
     thresholds: Mapping[str, float] | None = None,
     corner: float = 0.3,
 ) -> Figure:
-    """How many unsafe ends each scorer sees, against how many safe ones it takes for unsafe.
+    """Plots the unsafe recall of scorers against the share of safe samples classified unsafe.
 
     Args:
-        curves: Per scorer its unsafe scores (N,) and the labels (N,); NaN is the most unsafe.
-        thresholds: Per scorer, the threshold whose point on the curve is marked.
+        curves: Per scorer, unsafe scores (N,) and labels (N,); NaN is the most unsafe.
+        thresholds: Per scorer, the threshold to mark on the curve.
         corner: Share of either axis that the right panel magnifies.
     """
     thresholds = thresholds or {}
@@ -49,17 +49,17 @@ def roc_figure(
         whole.plot(*frame, color=FAINT_INK, linewidth=0.8)
         for axes in (whole, magnified):
             axes.set_aspect("equal")
-            axes.set_xlabel("safe, judged unsafe")
+            axes.set_xlabel("false-alarm rate")
             axes.grid(color="#eceef0", linewidth=0.7)
-        whole.set_ylabel("unsafe, judged unsafe")
+        whole.set_ylabel("unsafe recall")
         whole.set_title("Receiver operating characteristic")
-        magnified.set_title("The corner, magnified")
+        magnified.set_title("Upper left corner")
         whole.legend(loc="lower right", title="area under the curve", alignment="left")
     return fig
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """How a curve is drawn among others; beyond as many as there are colours dashes change."""
+    """Style of a curve among others; dashes vary when colours repeat."""
     num_colours = len(SERIES_COLOURS)
     dashes = SERIES_DASHES[(number + number // num_colours) % len(SERIES_DASHES)]
     return {"color": SERIES_COLOURS[number % num_colours], "linestyle": dashes, "linewidth": 1.8}
@@ -73,15 +73,15 @@ def draw_roc(
     threshold: float | None,
     **style: Any,
 ) -> None:
-    """One scorer's curve, and the point of its threshold.
+    """Draws the curve of one scorer and the point of its threshold.
 
     Args:
-        axes: Where to.
+        axes: The axes.
         score: Unsafe scores, (N,).
         label: Whether each is unsafe, (N,).
-        words: In the legend.
-        threshold: Whose point is marked, if any.
-        **style: Of the curve.
+        words: Legend entry.
+        threshold: Threshold to mark, if any.
+        **style: Style of the curve.
     """
     axes.plot(*operating_points(score, label), label=words, **style)
     if threshold is not None and label.any() and not label.all():
@@ -99,14 +99,14 @@ def draw_roc(
 
 
 def operating_points(score: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Share of false alarms and unsafe recall of every threshold, from (0, 0) to (1, 1).
+    """False-alarm rate and unsafe recall of every threshold, from (0, 0) to (1, 1).
 
     Args:
         score: Unsafe scores, (N,).
         label: Whether each is unsafe, (N,).
 
     Returns:
-        The two shares, one more than there are distinct scores.
+        The two rates, one more than the number of distinct scores.
     """
     rank = np.unique(-score, return_inverse=True)[1]
     shares = []

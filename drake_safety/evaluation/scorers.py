@@ -1,4 +1,4 @@
-"""Scorers: whatever says how probable safety is, the assessment and its rivals alike."""
+"""Scorers: safety probabilities of assessments and baseline classifiers behind one interface."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
 
 StageProgress = Callable[[str, int, int], None]
-"""Called with what is under way, the number done and the number wanted."""
+"""Called with the name of a stage, the number done and the number wanted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """Something that says how probable safety is.
+    """A source of safety probabilities.
 
     Attributes:
         name: Its key in tables.
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
-            (N, n_f); NaN where it does not know.
-        uses_true_state: Whether nominal episodes show it the state without noise.
-        used: The episodes that it was learned, calibrated or adapted with.
+            (N, n_f); NaN for "don't know".
+        uses_true_state: Whether it takes the state without noise in nominal episodes.
+        used: Episodes used to train, calibrate or adapt it.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Scorer:
     used: Sequence[UsedEpisodes] = ()
 
     def unsafe_score(self, segments: Segments) -> np.ndarray:
-        """How unsafe it takes each segment to be, as the metrics expect it, (N,)."""
+        """Unsafe score of each segment, one minus its safety probability, (N,)."""
         state = segments.true_state if self.uses_true_state else segments.state
         return 1.0 - self.probability(state, segments.desired_preview, segments.features)
 
@@ -46,9 +46,9 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
     Args:
         name: Its key in tables.
         assessment: A fitted assessment.
-        published: Which of Γ's forms it scores by: "safety_probability", literally b_safe;
-            "normalized", b_safe / (1 - μ); or "calibrated", what the maps' heads say, 0 where the
-            belief is "don't know".
+        published: The form of Γ: "safety_probability", literally b_safe; "normalized",
+            b_safe / (1 - μ); or "calibrated", from the maps' heads and 0 where the belief is
+            "don't know".
     """
 
     def probability(
@@ -74,22 +74,22 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
 def classifier_scorers(
     episodes: Episodes, progress: StageProgress | None = None, *, shortest: int | None = None
 ) -> list[Scorer]:
-    """The direct classifiers, trained on the assessment's own training episodes.
+    """The baseline classifiers, trained on the training episodes of the assessment.
 
     Args:
-        episodes: The episodes.
+        episodes: Training episodes.
         progress: Called with a stage, the number done and the number wanted.
-        shortest: Steps that a safe episode's segment has at least; the horizon by default.
+        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
     """
     scorers = []
     for i, kind in enumerate(KINDS):
         if progress is not None:
-            progress("direct classifiers", i, len(KINDS))
+            progress("baseline classifiers", i, len(KINDS))
         classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
         used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
         scorers.append(_classifier_scorer(classifier, used))
     if progress is not None:
-        progress("direct classifiers", len(KINDS), len(KINDS))
+        progress("baseline classifiers", len(KINDS), len(KINDS))
     return scorers
 
 

@@ -1,7 +1,7 @@
-"""Pictures of a closed loop's plant: what a camera that follows the robot would have seen.
+"""Stills of the plant of a closed loop by a camera that follows the robot.
 
-They are rendered offscreen from the loop's own geometry, so whatever a task put into its plant is
-seen, and nothing is added to its diagram: the renderer lives in a Context of its own.
+They are rendered offscreen from the geometry of the loop, with everything that the task put into
+its plant. The diagram is not changed: the renderer belongs to a separate Context.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
-_PBR_BRIGHTNESS = 2.2  # One glTF mesh, and all is shaded physically, which is darker.
-_BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and what it did.
+_PBR_BRIGHTNESS = 2.2  # With a glTF mesh all shading is physically based, which is darker.
+_BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and its effect.
 _AFTER_TRIGGER_S = 0.3  # Feet in the air.
-_LEAST_GAP_S = 0.3  # Between two pictures that no event asks for.
+_LEAST_GAP_S = 0.3  # Between a still at an event and others.
 
 
 class StillCamera:
@@ -47,11 +47,11 @@ class StillCamera:
 
     Args:
         loop: A closed loop that has its MultibodyPlant as ``plant``.
-        positions: Positions of the plant that decide the distance and the light, e.g. the first of
-            a log, (n_q,).
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
-        view: Where the camera stands; the task's own view by default.
+        positions: Positions of the plant from which distance and lights are set, such as the first
+            of a log, (n_q,).
+        width: Width of the stills [pixels].
+        height: Height of the stills [pixels].
+        view: View of the camera; that of the task by default.
 
     Raises:
         ValueError: The positions have another size, or are not finite.
@@ -76,7 +76,7 @@ class StillCamera:
 
         centre, radius = self._extent()
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
-        # Only the base's motion over the ground is followed, so that a fall is seen as one.
+        # Only the horizontal motion of the base is followed, so that a fall remains visible.
         self._look_at_height = centre[2]
         view = loop.view if view is None else view
         self._offset = (centre - base)[:2]
@@ -107,10 +107,10 @@ class StillCamera:
         self._world = scene_graph.world_frame_id()
 
     def render(self, positions: np.ndarray) -> np.ndarray:
-        """A picture of the plant at given positions.
+        """Renders the plant at given positions.
 
         Args:
-            positions: All of the plant's positions, a ball's among them, (n_q,).
+            positions: All positions of the plant, including those of a ball, (n_q,).
 
         Returns:
             RGB, (height, width, 3), uint8.
@@ -143,14 +143,14 @@ class StillCamera:
         self._plant.SetPositions(self._plant_context, positions)
 
     def _has_gltf(self) -> bool:
-        """Whether a glTF mesh is among what is to be seen."""
+        """Whether the scene has a glTF mesh."""
         query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
         inspector = query.inspector()
         shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
         return any(isinstance(one, Mesh) and one.extension() == ".gltf" for one in shapes)
 
     def _extent(self) -> tuple[np.ndarray, float]:
-        """Centre of the robot's visible geometry in the world (3,) and its radius about it [m]."""
+        """Centre of the visible geometry of the robot in the world (3,) and its radius [m]."""
         plant, context = self._plant, self._plant_context
         query = plant.get_geometry_query_input_port().Eval(context)
         inspector = query.inspector()
@@ -174,17 +174,17 @@ class StillCamera:
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """All of a plant's positions from the logged states of its model instances.
+    """All positions of a plant from the logged states of its model instances.
 
     Args:
         loop: A closed loop that has its MultibodyPlant as ``plant``.
-        states: Per model instance by name its positions, or positions and velocities, (N, n).
+        states: Positions, or positions and velocities, by name of the model instance, (N, n).
 
     Returns:
         Positions, (N, n_q).
 
     Raises:
-        ValueError: A model instance that moves is missing, or has another number of positions.
+        ValueError: A model instance with positions is missing, or has another number of them.
     """
     plant = loop.plant
     instances = [ModelInstanceIndex(i) for i in range(plant.num_model_instances())]
@@ -210,12 +210,12 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 def still_times(
     time_s: np.ndarray, touch_times_s: Iterable[float], trigger_times_s: Sequence[float]
 ) -> list[float]:
-    """Instants worth a picture: calm, each throw, the first recovery step at work, the end.
+    """Times of stills of a run with balls: start, each impact, first recovery step, and end.
 
     Args:
         time_s: Instants of the log [s], (N,), increasing.
-        touch_times_s: When a ball touches [s].
-        trigger_times_s: When a recovery was triggered [s].
+        touch_times_s: Times of impact [s].
+        trigger_times_s: Trigger times of recovery [s].
 
     Returns:
         Logged instants [s], increasing.
@@ -229,12 +229,12 @@ def still_times(
 
 
 def spread_times(time_s: np.ndarray, events_s: Iterable[float], *, num_stills: int) -> list[float]:
-    """Instants of a motion worth a picture: those that are given, and others spread between them.
+    """Times of stills of a motion: those of events, and others spread between them.
 
     Args:
         time_s: Instants of the log [s], (N,), increasing.
-        events_s: What must be seen [s].
-        num_stills: How many are spread evenly from start to end; those close to an event give way.
+        events_s: Times of events [s].
+        num_stills: Number of evenly spread times, of which those close to an event are dropped.
 
     Returns:
         Logged instants [s], increasing.
@@ -256,21 +256,21 @@ def render_stills(
     width: int = 720,
     height: int = 540,
 ) -> list[tuple[float, np.ndarray]]:
-    """Pictures of a logged simulation at chosen instants.
+    """Renders stills of a logged simulation at given times.
 
     Args:
         loop: The closed loop that was simulated, or one with the same plant.
         time_s: Instants of the log [s], (N,), increasing.
-        positions: All of the plant's positions at these instants, (N, n_q).
-        still_times_s: When to take pictures [s]; the nearest logged instant is shown.
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
+        positions: All positions of the plant at these instants, (N, n_q).
+        still_times_s: Times of the stills [s]; the nearest logged instant is shown.
+        width: Width of the stills [pixels].
+        height: Height of the stills [pixels].
 
     Returns:
-        (time [s] of the logged instant, RGB image (height, width, 3)), one a still.
+        (time [s] of the logged instant, RGB image (height, width, 3)) of each still.
 
     Raises:
-        ValueError: Times and positions are not as many, or a still is outside the log.
+        ValueError: Times and positions have different lengths, or a still is outside the log.
     """
     time_s, positions = np.asarray(time_s, dtype=float), np.asarray(positions, dtype=float)
     if time_s.ndim != 1 or time_s.size == 0 or len(positions) != time_s.size:
@@ -299,7 +299,7 @@ def _scene_graph(loop: LeggedLoop) -> SceneGraph:
 
 
 def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:
-    """Pose of a camera at C that looks at T, its picture upright."""
+    """Pose of an upright camera at C that looks at T."""
     forward = (p_WT - p_WC) / np.linalg.norm(p_WT - p_WC)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -308,7 +308,7 @@ def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:
 
 
 def _lighting(centre: np.ndarray, radius: float, *, brightness: float) -> RenderEngineVtkParams:
-    """One lamp that casts shadows and soft fill from all sides, in proportion to the robot."""
+    """A light that casts shadows and soft fill lights, scaled to the robot."""
 
     def lamp(x: float, y: float, z: float, intensity: float, kind: str = "point") -> LightParameter:
         offset = np.array([x, y, z]) * radius

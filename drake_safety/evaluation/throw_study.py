@@ -1,4 +1,4 @@
-"""Balls at the actual plant: when each scorer would have the robot step, and what becomes of it."""
+"""Balls thrown at the actual plant: when each rule triggers recovery, and the outcome."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Figure, median, proportion
+from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.scenario import Scenario
@@ -21,11 +21,11 @@ PAPER_THRESHOLD = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class TriggerRule:
-    """A scorer with a threshold: when would it have the robot step.
+    """A scorer with a threshold that triggers recovery.
 
     Attributes:
         name: Its key in tables.
-        scorer: Who scores.
+        scorer: The scorer.
         threshold: Γ_thre; None to choose it on the calibration throws.
     """
 
@@ -42,17 +42,17 @@ def trigger_rules(
     threshold: float,
     is_normalized: bool,
 ) -> list[TriggerRule]:
-    """Those compared: Γ as the scenario triggers on it, Γ as the paper does, and the classifiers.
+    """The rules that are compared: the scenario's, the paper's and the baseline classifiers.
 
     Args:
         sharpened: An assessment in the sharpened mode.
-        paper: One in the paper's mode.
-        classifiers: Direct classifiers; their thresholds are left open.
+        paper: An assessment in the paper's mode.
+        classifiers: Baseline classifiers, whose thresholds are chosen on calibration throws.
         threshold: The scenario's Γ_thre.
-        is_normalized: Whether that is on b_safe / (1 - μ) or, literally, on b_safe.
+        is_normalized: Whether it applies to b_safe / (1 - μ) rather than to literal b_safe.
 
     Returns:
-        The rules, the scenario's own first, named "sharpened".
+        The rules; the scenario's own is the first, named "sharpened".
     """
     own = assessment_scorer(
         "sharpened", sharpened, "normalized" if is_normalized else "safety_probability"
@@ -75,18 +75,18 @@ def trigger_rules(
 
 @dataclass(frozen=True, kw_only=True)
 class ThrowStudy:
-    """What :func:`evaluate_throws` found.
+    """The result of :func:`evaluate_throws`.
 
     Attributes:
-        figures: By dotted key.
+        estimates: By dotted key.
         logs: The throws without recovery.
-        trigger_times_s: Per rule, when it triggered in each throw [s], (N,); NaN for never.
-        recovered: Per rule, the logs with recovery by index of the throw, triggered ones only.
+        trigger_times_s: Per rule, the trigger time of each throw [s], (N,); NaN for never.
+        recovered: Per rule, the logs with recovery of the triggered throws, by index.
         thresholds: Per rule.
-        calibration_logs: The other throws, on which thresholds were chosen, if any were left open.
+        calibration_logs: The throws on which thresholds were chosen; empty if all were given.
     """
 
-    figures: dict[str, Figure]
+    estimates: dict[str, Estimate]
     logs: list[ThrowLog]
     trigger_times_s: dict[str, np.ndarray]
     recovered: dict[str, dict[int, ThrowLog]]
@@ -94,10 +94,10 @@ class ThrowStudy:
     calibration_logs: list[ThrowLog] = field(default_factory=list)
 
     def outcomes(self, rule: str | None = None) -> list[str]:
-        """What became of each throw, in the words of the throws figure.
+        """The outcome of each throw, a key of `throws_figure.OUTCOMES`.
 
         Args:
-            rule: Who triggers recovery; nobody by default.
+            rule: The rule that triggers recovery; none by default.
         """
         recovered = {} if rule is None else self.recovered[rule]
         outcomes = []
@@ -113,7 +113,7 @@ class ThrowStudy:
 
 
 def log_probability(log: ThrowLog, scorer: Scorer) -> np.ndarray:
-    """The scorer's safety probability at every row of a log, (N,)."""
+    """Safety probability of a scorer at every row of a log, (N,)."""
     return scorer.probability(log.state, log.desired_preview, log.features)
 
 
@@ -125,18 +125,18 @@ def choose_threshold(
 ) -> float:
     """The highest threshold whose share of false triggers stays within a bound.
 
-    A high threshold triggers early and misses nothing; false triggers are what limits it.
+    A higher threshold triggers earlier and misses fewer falls, but has more false triggers.
 
     Args:
         logs: Calibration throws without recovery.
-        probabilities: Of each log's rows.
-        max_false_share: Bound on the share of false triggers among the throws that balancing
-            survives inside the safe set.
+        probabilities: Safety probability of each log's rows.
+        max_false_share: Bound on the share of false triggers among the throws that stay in the
+            safe set without recovery.
 
     Returns:
         Γ_thre.
     """
-    # A calm throw triggers falsely below its lowest probability.
+    # A throw that stays safe has a false trigger if its lowest probability is below Γ_thre.
     lowest = np.array(
         [
             np.nan_to_num(p, nan=0.0).min()
@@ -164,26 +164,26 @@ def evaluate_throws(
     num_workers: int | None = None,
     progress: StageProgress | None = None,
 ) -> ThrowStudy:
-    """Throws balls at the actual plant and compares when rules trigger, and what becomes of it.
+    """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     Args:
         scenario: The scenario.
-        rules: Who triggers.
-        num_throws: Fresh throws that are reported.
-        num_calibration: Other throws, on which thresholds left open are chosen.
-        seed: Of the reported throws.
-        calibration_seed: Of the others.
-        variation: Which plant.
-        num_workers: Processes.
+        rules: The rules.
+        num_throws: Number of test throws.
+        num_calibration: Number of calibration throws, for thresholds that are None.
+        seed: Seed of the test throws.
+        calibration_seed: Seed of the calibration throws.
+        variation: Variation of the plant.
+        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Raises:
-        ValueError: Both seeds are the same, or there is no threshold to choose: every calibration
+        ValueError: The seeds are equal, or no threshold can be chosen because every calibration
             throw leaves the safe set.
     """
     if seed == calibration_seed:
         raise ValueError(f"throws: seed and calibration seed are both {seed}; they must differ")
-    report = progress or _report_to_nobody
+    report = progress or (lambda stage, done, total: None)
     throw = partial(run_throws, scenario, variation=variation, num_workers=num_workers)
     thresholds = {rule.name: rule.threshold for rule in rules if rule.threshold is not None}
     calibration: list[ThrowLog] = []
@@ -217,31 +217,27 @@ def evaluate_throws(
         }
         for name, times in triggers.items()
     }
-    # Rules often agree on the instant: each distinct recovery is simulated once.
+    # Rules often trigger at the same instant: each distinct recovery is simulated once.
     wanted = {pair for times in triggered.values() for pair in times.items()}
     simulated = _simulate_recoveries(partial(throw, seed=seed), wanted, report)
     recovered = {
         name: {index: simulated[index, time] for index, time in times.items()}
         for name, times in triggered.items()
     }
-    figures = _balancing_figures(logs)
+    estimates = _balancing_estimates(logs)
     for rule in rules:
-        found = _rule_figures(logs, triggers[rule.name], recovered[rule.name])
+        found = _rule_estimates(logs, triggers[rule.name], recovered[rule.name])
         threshold = thresholds[rule.name]
-        found["threshold"] = Figure(threshold, threshold, threshold, len(logs))
-        figures |= {f"throws.{rule.name}.{key}": figure for key, figure in found.items()}
+        found["threshold"] = Estimate.exact(threshold, len(logs))
+        estimates |= {f"throws.{rule.name}.{key}": estimate for key, estimate in found.items()}
     return ThrowStudy(
-        figures=figures,
+        estimates=estimates,
         logs=logs,
         trigger_times_s=triggers,
         recovered=recovered,
         thresholds=thresholds,
         calibration_logs=calibration,
     )
-
-
-def _report_to_nobody(stage: str, done: int, total: int) -> None:
-    """Stands in for a progress that was not asked for."""
 
 
 def _simulate_recoveries(
@@ -252,9 +248,9 @@ def _simulate_recoveries(
     """Simulates throws with recovery.
 
     Args:
-        throw: `run_throws` but for indices, trigger times and progress.
+        throw: `run_throws` without indices, trigger times and progress.
         wanted: Pairs of index and trigger time [s].
-        report: Progress.
+        report: Called with a stage, the number done and the number wanted.
 
     Returns:
         The log of each pair.
@@ -275,7 +271,7 @@ def _simulate_recoveries(
 
 
 def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
-    """Shares pairs of index and trigger time out among rounds in which no index stands twice."""
+    """Splits pairs of index and trigger time into rounds in which each index occurs once."""
     rounds: list[dict[int, float]] = []
     for index, time_s in sorted(wanted):
         free = next((one for one in rounds if index not in one), None)
@@ -285,8 +281,8 @@ def _rounds(wanted: Iterable[tuple[int, float]]) -> list[dict[int, float]]:
     return rounds
 
 
-def _balancing_figures(logs: Sequence[ThrowLog]) -> dict[str, Figure]:
-    """What becomes of the throws when the robot never steps."""
+def _balancing_estimates(logs: Sequence[ThrowLog]) -> dict[str, Estimate]:
+    """Estimates of the throws without recovery."""
     n = len(logs)
     left = [log for log in logs if log.has_left]
     fell = [log for log in logs if log.has_fallen]
@@ -302,15 +298,15 @@ def _balancing_figures(logs: Sequence[ThrowLog]) -> dict[str, Figure]:
     }
 
 
-def _rule_figures(
+def _rule_estimates(
     logs: Sequence[ThrowLog], times: np.ndarray, recovered: Mapping[int, ThrowLog]
-) -> dict[str, Figure]:
-    """What becomes of the throws when a rule has the robot step.
+) -> dict[str, Estimate]:
+    """Estimates of the throws with the recovery that a rule triggers.
 
     Args:
         logs: The N throws without recovery.
-        times: When the rule triggered in each [s], (N,); NaN for never.
-        recovered: By index of the throw, the logs with recovery of those it triggered in.
+        times: Trigger times of the rule [s], (N,); NaN for never.
+        recovered: By index of the throw, the logs with recovery of triggered throws.
     """
     n = len(logs)
     calm = [i for i, log in enumerate(logs) if not log.has_left]
@@ -318,7 +314,6 @@ def _rule_figures(
     touch = np.array([log.throw.time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
     is_triggered = ~np.isnan(times)
-    # Without a trigger the log itself says how the throw ends; with one, the recovery does.
     falls = sum(
         recovered[log.index].has_fallen if log.index in recovered else log.has_fallen
         for log in logs
@@ -326,7 +321,7 @@ def _rule_figures(
     in_time = [i for i in fell if is_triggered[i] and times[i] < fall[i]]
     after_touch = [i for i in in_time if times[i] >= touch[i] - 1e-9]
     successes = [log for log in recovered.values() if not log.has_fallen]
-    figures = {
+    estimates = {
         "falls_with_recovery": proportion(falls, n),
         "false_triggers": proportion(int(is_triggered[calm].sum()), len(calm)),
         "triggers_before_impact": proportion(
@@ -345,7 +340,7 @@ def _rule_figures(
     }
     kinds = sorted({kind for log in recovered.values() for kind in log.violations})
     for kind in kinds:
-        figures[f"recoveries_with_{kind}"] = proportion(
+        estimates[f"recoveries_with_{kind}"] = proportion(
             sum(log.violations[kind] > 0 for log in successes), len(successes)
         )
-    return figures
+    return estimates

@@ -1,4 +1,4 @@
-"""What came of every throw, seen from above the robot."""
+"""The outcome of every throw in a polar plot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OUTCOMES: dict[str, tuple[str, str]] = {
     "false trigger": (FALSE_ALARM_COLOUR, "s"),
     "fell": (UNSAFE_COLOUR, "X"),
 }
-"""What can come of a throw, with colour and marker."""
+"""Colour and marker of each outcome of a throw."""
 
 _FAILURES = ("fell", "false trigger")
 
@@ -39,17 +39,16 @@ def throws_figure(
     *,
     mass_kg: np.ndarray | None = None,
 ) -> Figure:
-    """What came of every throw, seen from above the robot: speed outwards, where the ball flies to.
+    """Plots the outcome of every throw over the direction and speed of the ball, seen from above.
 
     Args:
         speed_m_s: Speeds [m/s], (N,).
-        direction_rad: Where each ball flies to, from the robot's forward axis to its left [rad],
-            (N,).
-        outcomes: One panel each: its title and the outcome of every throw, a key of `OUTCOMES`.
-        mass_kg: Masses [kg], (N,); heavier ones are drawn larger.
+        direction_rad: Directions of flight, from the robot's forward axis to its left [rad], (N,).
+        outcomes: Per panel, its title and the outcome of every throw, a key of `OUTCOMES`.
+        mass_kg: Masses [kg], (N,); heavier balls have larger marks.
 
     Raises:
-        ValueError: An unknown outcome, or not one for every throw.
+        ValueError: An unknown outcome, or the number of outcomes differs from that of throws.
     """
     speed, direction = np.asarray(speed_m_s), np.asarray(direction_rad)
     for title, found in outcomes.items():
@@ -78,7 +77,7 @@ def throws_figure(
                 columnspacing=1.2,
             )
         fig.supxlabel(
-            "direction: where the ball flies to, from above the robot; outwards: its speed",
+            "angle: direction of flight, seen from above; radius: speed of the ball",
             fontsize=9,
             color=FAINT_INK,
         )
@@ -88,11 +87,11 @@ def throws_figure(
 def _draw_outcomes(
     axes: Axes, speed: np.ndarray, direction: np.ndarray, size: np.ndarray, found: np.ndarray
 ) -> None:
-    """Marks of all throws; their speeds, directions, sizes and outcomes are (N,) each."""
+    """Draws the marks of all throws; all arrays are (N,)."""
     for outcome, (colour, marker) in OUTCOMES.items():
         rows = found == outcome
         if rows.any():
-            # Failures are few and must not drown: larger, and on top.
+            # Failures are few: larger marks, drawn on top.
             is_failure = outcome in _FAILURES
             axes.scatter(
                 direction[rows],

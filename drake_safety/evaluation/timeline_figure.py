@@ -1,4 +1,4 @@
-"""Gamma over the time of one run, with pictures of the robot at the moments that matter."""
+"""Γ over the time of a run, with stills of the robot."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _WIDTH = 12.0  # All sizes are in inches.
 _GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT = 2.6, 0.35
 _AXIS_LABEL_HEIGHT = 0.6
-_BALL_HEIGHT = 0.3  # At which a ball is drawn, on the axis of Gamma.
+_BALL_HEIGHT = 0.3  # Position of a ball on the axis of Γ.
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
@@ -57,27 +57,27 @@ def timeline_figure(
     constraint_names: Sequence[str] = (),
     angular_constraints: Sequence[str] = (),
 ) -> Figure:
-    """Gamma over time, with pictures of the robot at the moments that matter.
+    """Plots Γ over time, with stills of the robot.
 
     Args:
         time_s: Instants [s], (N,).
         gamma: Safety probability, held until the next instant, (N,).
-        threshold: Below it something is done: a recovery triggered, a goal given up.
-        throws: Balls, each marked at the instant it touches.
-        pushes: Pushes, each marked for as long as it lasts.
-        trigger_times_s: When that happened [s].
-        trigger_label: What it is called.
-        leave_time_s: When the robot left its safe set [s]; infinite for never.
+        threshold: Threshold on Γ of triggers or alarms.
+        throws: Balls, marked at the time of impact.
+        pushes: Pushes, marked for their duration.
+        trigger_times_s: Times of triggers or alarms [s].
+        trigger_label: Label of these.
+        leave_time_s: Time at which the robot leaves the safe set [s]; infinite for never.
         recovery_intervals_s: (start, end) of each recovery [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
         constraint_names: Names of the columns of `margins`.
-        angular_constraints: Those whose margins are angles.
+        angular_constraints: Constraints whose margins are angles.
 
     Raises:
-        ValueError: Arrays of different lengths, margins without as many names, or a still outside
-            the time shown.
+        ValueError: Arrays have different lengths, the number of names is not that of margins, or
+            a still is outside the time range.
     """
     time_s, gamma = np.asarray(time_s, dtype=float), np.asarray(gamma, dtype=float)
     for name, values in (("gamma", gamma), ("belief", belief), ("margins", margins)):
@@ -137,14 +137,14 @@ def timeline_figure(
 def _lay_out(
     heights: Sequence[float], images: Sequence[np.ndarray]
 ) -> tuple[Figure, list[Axes], list[Axes]]:
-    """A strip of pictures, if there are any, over panels that share their axis of time.
+    """Lays out a strip of images, if any, above panels with a common time axis.
 
     Args:
-        heights: Of the panels [inches], top down.
-        images: The pictures, (height, width, 3) each.
+        heights: Heights of the panels [inches], from the top.
+        images: The images, (height, width, 3) each.
 
     Returns:
-        The figure, the pictures' axes, and the panels' axes.
+        The figure, the axes of the images, and the axes of the panels.
     """
     pictures: list[Axes] = []
     if images:
@@ -193,7 +193,7 @@ def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
     for name, lower, upper, colour in layers:
         axes.fill_between(time_s, lower, upper, step="post", color=colour, linewidth=0, label=name)
     axes.set(ylim=(0.0, 1.0), yticks=[0.0, 1.0], ylabel="belief")
-    # The legend lists the layers as they lie: top down.
+    # The legend lists the layers from the top.
     handles, labels = axes.get_legend_handles_labels()
     _add_legend_on_the_right(axes, handles[::-1], labels[::-1])
 
@@ -211,7 +211,7 @@ def _draw_margins(
         axes.plot(
             time_s,
             np.degrees(margins[:, i]) if is_angle else 100.0 * margins[:, i],
-            # From the third on: the first two are the colours of safe and unsafe.
+            # The first two colours are those of safe and unsafe.
             color=SERIES_COLOURS[(2 + i) % len(SERIES_COLOURS)],
             linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
             linewidth=1.5,
@@ -285,7 +285,7 @@ def _annotate_push(axes: Axes, time_s: np.ndarray, push: Push) -> None:
 
 
 def _write_before(axes: Axes, time_s: np.ndarray, instant_s: float, words: str) -> None:
-    # They stand left of the instant, unless it comes so early that they would not fit.
+    # Left of the instant, if there is room.
     is_early = instant_s - time_s[0] < 0.15 * (time_s[-1] - time_s[0])
     axes.annotate(
         words,
@@ -312,7 +312,7 @@ def _annotate_leaving(axes: Axes, time_s: np.ndarray, instant_s: float) -> None:
 def _write_after(
     axes: Axes, time_s: np.ndarray, place: tuple[float, float], words: str, colour: str
 ) -> None:
-    # They stand right of the instant, unless it comes so late that they would not fit.
+    # Right of the instant, if there is room.
     is_late = time_s[-1] - place[0] < 0.15 * (time_s[-1] - time_s[0])
     axes.annotate(
         words,
@@ -333,7 +333,7 @@ def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
 
 
 def _join(fig: Figure, picture: Axes, gamma_axes: Axes, point: tuple[float, float]) -> None:
-    """A line from a picture's lower edge to its point on the curve of Gamma."""
+    """Draws a line from the lower edge of an image to its point on the curve of Γ."""
     from matplotlib.patches import ConnectionPatch
 
     line = ConnectionPatch(

@@ -1,1 +1,1 @@
-"""The report of a run: one HTML page for somebody who has not read the paper, tables, README."""
+"""The report of a run: an HTML page, and tables as CSV, JSON and Markdown."""

@@ -1,4 +1,4 @@
-"""The map of an assessment, cell by cell: belief, count, causes, and an episode typical of it."""
+"""The map of an assessment by cell: belief, count, causes and a typical episode."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def map_cells(
     *,
     angular_constraints: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """What there is to say about each cell of an assessment's first map, as JSON types.
+    """Describes each cell of the first map of an assessment, as JSON types.
 
     Args:
         assessment: A fitted assessment.
-        episodes: Those it has learned from; without them no cell has a typical episode.
+        episodes: Its training episodes; without them cells have no typical episode.
         angular_constraints: Constraints whose margins are angles.
 
     Returns:
@@ -100,15 +100,14 @@ def _typical_episodes(
 
 
 def most_typical(segments: Segments, points: np.ndarray, rows: np.ndarray) -> int:
-    """The segment that stands for those of a cell.
+    """Index of the most typical segment of a cell.
 
-    It ends as most of them do, for the cause that most of these have, and lies nearest to the
-    mean place of those.
+    Among the segments with the most frequent end and cause it is the nearest to their mean.
 
     Args:
         segments: All segments.
-        points: Their places in the embedding, (N, 2).
-        rows: Those in the cell, at least one.
+        points: Their positions in the embedding, (N, 2).
+        rows: Indices of those in the cell, at least one.
     """
     is_unsafe = segments.is_unsafe[rows]
     rows = rows[is_unsafe == (is_unsafe.mean() >= 0.5)]
@@ -122,15 +121,15 @@ def most_typical(segments: Segments, points: np.ndarray, rows: np.ndarray) -> in
 def map_views(
     assessment: SafetyAssessment, cells: list[dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """The ways to colour the map: a fill a cell, and what the colours mean.
+    """The colourings of the map: fills of the cells and a legend.
 
     Args:
         assessment: The assessment.
-        cells: Of `map_cells`.
+        cells: The result of `map_cells`.
 
     Returns:
-        By name: ``title``, ``meaning``, ``fills`` (None where a cell is empty), and either
-        ``stops`` with ``ends`` (words for the first and the last) or ``swatches``.
+        By name: ``title``, ``meaning``, ``fills`` (None for an empty cell), and either ``stops``
+        with ``ends`` (labels of the first and the last) or ``swatches``.
     """
     from matplotlib.colors import to_hex, to_rgb
 
@@ -138,10 +137,10 @@ def map_views(
     palette = cause_colours(len(names))
     most = max((cell["count"] for cell in cells), default=1)
 
-    def fills(values: list[float], stops: tuple[str, ...], *, keeps_empty: bool) -> list[Any]:
+    def fills(values: list[float], stops: tuple[str, ...]) -> list[Any]:
         shades = _ramp(stops)
         return [
-            to_hex(shades(value)) if keeps_empty or not _is_empty(cell) else None
+            to_hex(shades(value)) if not _is_empty(cell) else None
             for value, cell in zip(values, cells, strict=True)
         ]
 
@@ -149,39 +148,38 @@ def map_views(
         if _is_empty(cell):
             return None
         colour = np.array(to_rgb(palette[int(np.argmax(cell["causes"]))]))
-        # White where nothing is unsafe, the cause's own colour where all that is known is.
+        # From white, nothing unsafe, to the colour of the cause, all that is known unsafe.
         red, green, blue = 0.97 * (1.0 - (1.0 - safe_share(cell)) * (1.0 - colour))
         return to_hex((red, green, blue))
 
     return {
         "safe": {
             "title": "safe share",
-            "meaning": "Of what is known about a cell, the share that says safe: "
-            "b_safe / (1 − μ). Hatched cells are empty: the answer there is “don't know”.",
-            "fills": fills([safe_share(c) for c in cells], SAFETY_STOPS, keeps_empty=False),
+            "meaning": "The normalised belief in safety, b_safe / (1 − μ). Hatched cells are "
+            "empty: the answer there is “don't know”.",
+            "fills": fills([safe_share(c) for c in cells], SAFETY_STOPS),
             "stops": SAFETY_STOPS,
             "ends": ["0: all unsafe", "1: all safe"],
         },
         "unknown": {
             "title": "don't know",
-            "meaning": "The share of each cell's belief that commits to nothing: μ.",
-            "fills": fills([c["belief"][2] for c in cells], _UNKNOWN_STOPS, keeps_empty=False),
+            "meaning": "The uncertainty of each cell's belief, μ.",
+            "fills": fills([c["belief"][2] for c in cells], _UNKNOWN_STOPS),
             "stops": _UNKNOWN_STOPS,
             "ends": ["0: certain", "1: nothing known"],
         },
         "cause": {
             "title": "likely cause",
-            "meaning": "The constraint that is most likely to be violated; pale: hardly likely.",
+            "meaning": "The constraint that is most likely to be violated; pale: unlikely.",
             "fills": [cause_fill(cell) for cell in cells],
             "swatches": [[spoken(n), c] for n, c in zip(names, palette, strict=True)],
         },
         "count": {
             "title": "number of segments",
-            "meaning": "From how many pieces of simulated motion each cell has learned.",
+            "meaning": "Number of training segments in each cell.",
             "fills": fills(
                 [float(np.log1p(c["count"]) / np.log1p(max(most, 1))) for c in cells],
                 _COUNT_STOPS,
-                keeps_empty=False,
             ),
             "stops": _COUNT_STOPS,
             "ends": ["few", f"{most}"],
@@ -190,11 +188,11 @@ def map_views(
 
 
 def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Figure:
-    """The map as a picture to print: the safe share of each cell, and its count.
+    """Plots the safe share and the number of segments of each cell.
 
     Args:
         assessment: The assessment.
-        cells: Of `map_cells`.
+        cells: The result of `map_cells`.
     """
     with drawing_style():
         fig = new_figure(7.0, 6.0)
@@ -215,7 +213,7 @@ def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Fig
 
 
 def safe_share(cell: dict[str, Any]) -> float:
-    """Of what is known about a cell, the share that says safe; 0 where nothing is."""
+    """Normalised belief in safety of a cell, b_safe / (1 - μ); 0 for an empty cell."""
     safe, unsafe = cell["belief"][SAFE], cell["belief"][UNSAFE]
     return float(safe / (safe + unsafe)) if safe + unsafe else 0.0
 

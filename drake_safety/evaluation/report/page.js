@@ -61,9 +61,9 @@
     const [safe, unsafe, unknown] = cell.belief;
     const isEmpty = unknown >= 1;
     const known = safe / (safe + unsafe);
-    let verdict = "Empty: too little was seen here, the answer is “don't know”.";
+    let verdict = "Empty: too few segments, the answer is “don't know”.";
     if (!isEmpty) {
-      verdict = known > 0.8 ? "Motions that come by here mostly stay safe." : known < 0.2 ? "Motions that come by here mostly end badly." : "Motions that come by here may end either way.";
+      verdict = known > 0.8 ? "Motions through this cell mostly stay safe." : known < 0.2 ? "Motions through this cell mostly end unsafely." : "Motions through this cell end either way.";
     }
     detail.replaceChildren(
       make("h4", {}, `Cell ${cell.column + 1}, ${cell.row + 1}`),
@@ -78,7 +78,7 @@
     }
     detail.append(stack, shares);
     if (!isEmpty) {
-      detail.append(make("h5", {}, "What is expected to go wrong, if anything"));
+      detail.append(make("h5", {}, "Expected violations, if any"));
       cell.causes.forEach((mass, i) => {
         detail.append(make("div", { class: "cause" }, make("span", {}, map.causes[i]), make("span", {}, make("i", { style: `width:${100 * mass}%;background:${map.colours[i]}` })), make("span", {}, percent(mass))));
       });
@@ -88,12 +88,12 @@
       const units = [...new Set(map.units)].join(", ");
       const came = typical.cause === "" ? "stayed safe" : `left the safe set: ${typical.cause.replaceAll("_", " ")}`;
       detail.append(
-        make("h5", {}, `A typical episode: distance to each limit [${units}]`),
+        make("h5", {}, `A typical episode: margins [${units}]`),
         plotMargins(map, typical),
       );
       const legend = make("div", { class: "shares" });
       map.causes.forEach((name, i) => legend.append(make("span", {}, make("i", { style: `background:${map.colours[i]}` }), name)));
-      detail.append(legend, make("p", { class: "note" }, `Episode ${typical.episode}; it ${came}. Shaded: the piece that lies in this cell. Below zero a limit is violated.`));
+      detail.append(legend, make("p", { class: "note" }, `Episode ${typical.episode}; it ${came}. Shaded: the segment in this cell. Below zero a constraint is violated.`));
     }
   }
 

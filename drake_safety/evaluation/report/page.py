@@ -1,4 +1,4 @@
-"""The page: puts what a run holds into one self-contained HTML file, with its parts beside it."""
+"""Writes the report of a run: one self-contained HTML file, with figures and tables beside it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from drake_safety.evaluation.report.cell_map import (
 )
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
 from drake_safety.evaluation.report.tables import Column, Table
-from drake_safety.evaluation.report.verdicts import other_figures, verdict_tables
+from drake_safety.evaluation.report.verdicts import other_tables, verdict_tables
 from drake_safety.learning.assessment import SafetyAssessment
 
-_MAX_SVG_BYTES = 1_500_000  # A larger picture is embedded as PNG, which is then the smaller one.
+_MAX_SVG_BYTES = 1_500_000  # Larger figures are embedded as PNG.
 _KNOWN_PREFIXES = ("segments", "episodes", "throws", "plans", "monitoring")
 _SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
 
@@ -39,22 +39,22 @@ def write_report(
     """Writes RUN/report: the page, every figure as SVG and PNG, every table as CSV and JSON.
 
     Args:
-        run: What the run holds. What turns out to be missing on the way is added to it.
-        versions: Of the packages that write the report.
+        run: Contents of the run; parts found missing are added to `run.missing`.
+        versions: Versions of the packages that write the report.
         angular_constraints: Constraints whose margins are angles.
 
     Returns:
-        The page.
+        Path of the page.
     """
     folder = run.folder / REPORT_FOLDER
     for name in ("figures", "tables"):
-        # What an earlier report left: a figure that is gone must not seem to be of this one.
+        # Figures of an earlier report must not be taken for those of this one.
         shutil.rmtree(folder / name, ignore_errors=True)
         (folder / name).mkdir(parents=True)
     tables = verdict_tables(run.results)
-    prefixes = dict.fromkeys(key.partition(".")[0] for key in run.results.figures)
+    prefixes = dict.fromkeys(key.partition(".")[0] for key in run.results.estimates)
     others = {
-        prefix: other_figures(run.results, prefix)
+        prefix: other_tables(run.results, prefix)
         for prefix in prefixes
         if prefix not in _KNOWN_PREFIXES
     }
@@ -86,9 +86,9 @@ def write_report(
             pictures=pictures,
             motions=_motions(run, pictures),
             maps=maps,
-            all_figures=[
-                (key, Column(key="", title="", meaning="", digits=4), figure)
-                for key, figure in run.results.figures.items()
+            all_estimates=[
+                (key, Column(key="", title="", meaning="", digits=4), estimate)
+                for key, estimate in run.results.estimates.items()
             ],
             entries=run.results.entries,
             versions=versions,
@@ -136,7 +136,7 @@ def _save_table(table: Table, folder: Path) -> None:
 
 
 def _counts(run: Run) -> list[dict[str, Any]]:
-    """How the training episodes ended, safe ones first, with the share of each."""
+    """Numbers and shares of the ends of training episodes, safe ones first."""
     causes = run.causes
     total = sum(causes.values())
     order = sorted(causes, key=lambda cause: (cause != "safe", -causes[cause]))
@@ -154,40 +154,40 @@ def _counts(run: Run) -> list[dict[str, Any]]:
 
 
 def _tiles(run: Run) -> list[dict[str, str]]:
-    """The few figures that say most."""
-    figures = run.results.figures
+    """The most important estimates."""
+    estimates = run.results.estimates
     tiles = []
 
     def add(key: str, title: str, remark: str, column: Column) -> None:
-        figure = figures.get(key)
-        if figure is not None:
+        estimate = estimates.get(key)
+        if estimate is not None:
             tiles.append(
                 {
                     "title": title,
-                    "value": column.value_text(figure),
-                    "interval": column.interval_text(figure),
-                    "remark": f"{remark} ({figure.n})",
+                    "value": column.value_text(estimate),
+                    "interval": column.interval_text(estimate),
+                    "remark": f"{remark} ({estimate.n})",
                 }
             )
 
     recall = Column(key="", title="", meaning="")
-    add("throws.falls_without_recovery", "falls, balancing alone", "of fresh throws", _SHARE)
-    add("throws.sharpened.falls_with_recovery", "falls, Γ may step", "of the same throws", _SHARE)
+    add("throws.falls_without_recovery", "falls without recovery", "of fresh throws", _SHARE)
+    add("throws.sharpened.falls_with_recovery", "falls with recovery", "of these throws", _SHARE)
     add("throws.sharpened.false_triggers", "false triggers", "of harmless throws", _SHARE)
-    add("plans.sharpened.safe_recall", "safe targets accepted", "of fresh, safe targets", recall)
+    add("plans.sharpened.safe_recall", "safe recall", "of fresh, safe targets", recall)
     add(
         "plans.sharpened.unsafe_recall",
-        "unsafe targets refused",
+        "unsafe recall",
         "of fresh, unsafe targets",
         recall,
     )
-    add("plans.causes.right_cause", "right cause named", "of rightly refused targets", _SHARE)
-    add("segments.sharpened.auc", "AUC at every moment", "fresh motions; 1 is perfect", recall)
+    add("plans.causes.right_cause", "correct cause named", "of correctly refused targets", _SHARE)
+    add("segments.sharpened.auc", "AUC of every segment", "fresh episodes; 1 is perfect", recall)
     return tiles[:4]
 
 
 def _beside_the_paper(run: Run, pictures: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """What the paper printed and what of ours stands beside it."""
+    """Results of the paper and the corresponding results of the run."""
     words = _words("paper.yaml")
     task = str(run.scenario.get("task", "")).rpartition(":")[2]
     chosen = [
@@ -201,11 +201,11 @@ def _beside_the_paper(run: Run, pictures: dict[str, dict[str, Any]]) -> dict[str
             {
                 "name": name,
                 "paper": printed,
-                "ours": column.value_text(run.results.figures[key]),
-                "interval": column.interval_text(run.results.figures[key]),
+                "ours": column.value_text(run.results.estimates[key]),
+                "interval": column.interval_text(run.results.estimates[key]),
             }
             for name, printed, key, unit in one.get("values", [])
-            if key in run.results.figures
+            if key in run.results.estimates
             for column in [Column(key="", title="", meaning="", unit=unit, digits=_digits(unit))]
         ]
         found = [p for name, p in pictures.items() if Path(name).name == one["picture"]]
@@ -225,10 +225,10 @@ def _digits(unit: str) -> int:
 
 
 def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
-    """Copies every picture, and gives what the page shows of each, by name."""
+    """Copies every picture; returns what the page shows of each, by name."""
     known = _words("words.yaml")["pictures"]
     shown = {}
-    # Those with words of their own in the order of the words, all others after them.
+    # In the order of words.yaml, all others after them.
     order = {stem: i for i, stem in enumerate(known)}
     names = sorted(run.pictures, key=lambda name: (order.get(Path(name).name, len(order)), name))
     for name in names:
@@ -240,7 +240,7 @@ def _pictures(run: Run, folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def _shown(name: str, paths: Mapping[str, Path]) -> dict[str, Any]:
-    """What the page shows of a picture, whose files by suffix lie among the report's figures."""
+    """What the page shows of a picture, given its files by suffix."""
     stem, flat = Path(name).name, name.replace("/", "_")
     svg, png = paths.get(".svg"), paths.get(".png")
     is_light = svg is not None and (png is None or svg.stat().st_size <= _MAX_SVG_BYTES)
@@ -266,7 +266,7 @@ def _motions(run: Run, pictures: dict[str, dict[str, Any]]) -> list[dict[str, An
             "name": motion.name,
             "events": motion.events,
             "timeline": pictures.get(f"{motion.name}/timeline"),
-            # Unpacked by the page when it is asked for: a recording is a few megabytes.
+            # A few megabytes, unpacked by the page on demand.
             "recording": None
             if motion.recording is None
             else base64.b64encode(gzip.compress(motion.recording.read_bytes(), mtime=0)).decode(),
@@ -309,7 +309,7 @@ def _map(
 
 
 def _cell_label(cell: dict[str, Any], names: list[str]) -> str:
-    """A cell in one sentence, for those who hear the page."""
+    """Text of a cell for screen readers."""
     place = f"Cell {cell['column'] + 1}, {cell['row'] + 1}"
     if cell["belief"][2] >= 1.0:
         return f"{place}: empty, {cell['count']} segments, don't know"

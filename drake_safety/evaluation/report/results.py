@@ -1,4 +1,4 @@
-"""What an evaluation found, read from ``evaluation.json``."""
+"""Results of an evaluation, read from ``evaluation.json``."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What an evaluation found.
+    """Results of an evaluation.
 
     Attributes:
-        figures: By dotted key.
-        entries: All else, such as the command, the seeds and the versions.
+        estimates: By dotted key.
+        entries: Other entries, such as the command, the seeds and the versions.
     """
 
-    figures: dict[str, Figure] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
     entries: dict[str, Any] = field(default_factory=dict)
 
     def has(self, prefix: str) -> bool:
-        """Whether any figure's key begins so."""
-        return any(key.startswith(prefix) for key in self.figures)
+        """Whether the key of any estimate has this prefix."""
+        return any(key.startswith(prefix) for key in self.estimates)
 
 
 def read_evaluation(path: Path) -> Results:
     """Reads an ``evaluation.json``.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The file holds no evaluation.
     """
     content = read_object(path)
-    figures = {key: as_figure(value) for key, value in content.items() if is_figure(value)}
-    if not figures:
-        raise ValueError(f"{path} is no evaluation: no key of it holds a figure")
+    estimates = {key: as_estimate(value) for key, value in content.items() if is_estimate(value)}
+    if not estimates:
+        raise ValueError(f"{path} is no evaluation: it holds no estimate")
     return Results(
-        figures=figures,
-        entries={key: value for key, value in content.items() if key not in figures},
+        estimates=estimates,
+        entries={key: value for key, value in content.items() if key not in estimates},
     )
 
 
@@ -49,7 +49,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """Reads a file that holds one JSON object.
 
     Raises:
-        ValueError: It holds something else.
+        ValueError: The file holds something else.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -60,15 +60,15 @@ def read_object(path: Path) -> dict[str, Any]:
     return content
 
 
-def is_figure(value: Any) -> bool:
-    """Whether it is what :meth:`Figure.to_json` makes of a figure."""
+def is_estimate(value: Any) -> bool:
+    """Whether a value has the form that :meth:`Estimate.to_json` returns."""
     return isinstance(value, Mapping) and set(value) == {"value", "low", "high", "n"}
 
 
-def as_figure(fields: Mapping[str, Any]) -> Figure:
-    """A figure from what :meth:`Figure.to_json` made of it."""
+def as_estimate(fields: Mapping[str, Any]) -> Estimate:
+    """The inverse of :meth:`Estimate.to_json`."""
     value, low, high = (
         math.nan if fields[name] is None else float(fields[name])
         for name in ("value", "low", "high")
     )
-    return Figure(value, low, high, int(fields["n"]))
+    return Estimate(value, low, high, int(fields["n"]))

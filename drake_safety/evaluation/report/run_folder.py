@@ -1,4 +1,4 @@
-"""What lies in the folder of a run: what is there is read, what is not there is named."""
+"""Contents of the folder of a run, and a list of the missing ones."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ REPORT_FOLDER = "report"
 
 @dataclass(frozen=True, kw_only=True)
 class Missing:
-    """Something that the page would show.
+    """A missing or inconsistent part of a run.
 
     Attributes:
-        what: What is missing, or amiss.
-        why: What is known about it.
-        command: What would make it, or "".
+        what: The part.
+        why: The reason.
+        command: The command that generates it, or "".
     """
 
     what: str
@@ -42,7 +42,7 @@ class Motion:
     Attributes:
         name: Its folder within the run.
         recording: The 3-D recording, if it is there.
-        events: What happened when, as ``run`` wrote it: command, columns, rows; or empty.
+        events: Events as written by ``run``: command, columns and rows; or empty.
     """
 
     name: str
@@ -52,18 +52,18 @@ class Motion:
 
 @dataclass(kw_only=True)
 class Run:
-    """Everything of a run that could be read.
+    """The readable contents of a run.
 
     Attributes:
         folder: The run's folder.
-        info: What all training episodes share.
-        extra: What was stored with them: command and scenario.
+        info: Metadata of the training episodes.
+        extra: Command and scenario stored with them.
         episodes: The training episodes.
         assessments: By mode.
-        results: What the evaluation found.
+        results: Results of the evaluation.
         motions: Recorded simulations.
         pictures: By path within the run without suffix, the files by suffix.
-        missing: What is not there, or amiss.
+        missing: Missing or inconsistent parts.
     """
 
     folder: Path
@@ -78,7 +78,7 @@ class Run:
 
     @property
     def scenario(self) -> dict[str, Any]:
-        """The scenario as it was when the episodes were simulated; empty if that is unknown."""
+        """The scenario that the episodes were simulated with; empty if unknown."""
         try:
             read = yaml.safe_load(str(self.extra.get("scenario_yaml", "")))
         except yaml.YAMLError:
@@ -87,27 +87,27 @@ class Run:
 
     @property
     def scenario_name(self) -> str:
-        """Its name, from wherever it stands."""
+        """Name of the scenario, from the episodes or else the evaluation."""
         if self.info is not None:
             return self.info.scenario
         return str(self.results.entries.get("scenario", "of an unknown scenario"))
 
     @property
     def causes(self) -> Counter[str]:
-        """How many training episodes ended how: "safe", or the violated constraint."""
+        """Number of training episodes by end: "safe" or the violated constraint."""
         return Counter(episode.cause or "safe" for episode in self.episodes or ())
 
 
 def read_run(folder: Path, *, episodes: Path, assessments: Mapping[str, Path]) -> Run:
-    """Reads whatever a run's folder holds.
+    """Reads the contents of the folder of a run.
 
     Args:
-        folder: The folder that `train` and `evaluate` wrote into.
-        episodes: Where the training episodes are in it.
-        assessments: Where the assessments are in it, by mode.
+        folder: The folder written by `train` and `evaluate`.
+        episodes: Folder of the training episodes in it.
+        assessments: Files of the assessments in it, by mode.
 
     Raises:
-        ValueError: The folder does not exist, or nothing in it is of a run.
+        ValueError: The folder does not exist, or holds no part of a run.
     """
     if not folder.is_dir():
         raise ValueError(f"report: there is no folder '{folder}'")
@@ -148,8 +148,8 @@ def _read_episodes(run: Run, path: Path) -> None:
         run.missing.append(
             Missing(
                 what="Part of the training episodes",
-                why=f"{len(run.episodes)} are here, {asked[1]} were asked for: the training was "
-                "stopped, or is still under way.",
+                why=f"{len(run.episodes)} of {asked[1]} are here: the training was stopped or is "
+                "still running.",
                 command=f"{again} --episodes {asked[1]}",
             )
         )
@@ -187,7 +187,7 @@ def _read_results(run: Run, path: Path) -> None:
         run.missing.append(
             Missing(
                 what="The evaluation: verdict tables and their pictures",
-                why="There is no evaluation.json: it was not evaluated yet.",
+                why="There is no evaluation.json: the run was not evaluated.",
                 command=command,
             )
         )
@@ -204,7 +204,7 @@ def _read_results(run: Run, path: Path) -> None:
                 what="An evaluation of this training",
                 why=f"{path.name} is of scenario '{run.results.entries.get('scenario')}' with hash "
                 f"{str(stored)[:12]}, the training of '{run.info.scenario}' with hash "
-                f"{run.info.scenario_hash[:12]}: its figures below are of something else.",
+                f"{run.info.scenario_hash[:12]}: its results below are of another scenario.",
                 command=command,
             )
         )
@@ -214,7 +214,7 @@ def _find_pictures(run: Run) -> None:
     for suffix in (".svg", ".png"):
         for path in sorted(run.folder.glob(f"**/*{suffix}")):
             name = path.relative_to(run.folder).with_suffix("")
-            # The report's own are written anew; those of episodes or hidden folders are no figures.
+            # The figures of the report itself are written anew; hidden folders hold none.
             if name.parts[0] != REPORT_FOLDER and not any(p.startswith(".") for p in name.parts):
                 run.pictures.setdefault(name.as_posix(), {})[suffix] = path
 
@@ -241,7 +241,7 @@ def _find_motions(run: Run) -> None:
         scenario = "SCENARIO" if run.info is None else run.info.scenario
         run.missing.append(
             Missing(
-                what="A recorded motion: its timeline, and the robot to look at in 3-D",
+                what="A recorded motion: its timeline and the 3-D recording",
                 why="No folder here holds a recording.html.",
                 command=f"drake-safety run {scenario} --assessment {run.folder}",
             )

@@ -1,4 +1,4 @@
-"""Tables of figures: what page, README, CSV and JSON all show, each in its own way."""
+"""Tables of estimates, written as HTML, Markdown, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from drake_safety.evaluation.metrics import Figure
+from drake_safety.evaluation.metrics import Estimate
 
 OURS = "sharpened"
-"""Key of the row that the others are compared with."""
+"""Key of the row that baselines are compared with."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """What one column of a table shows.
+    """A column of a table.
 
     Attributes:
-        key: The last part of a figure's key.
+        key: Last part of the keys of its estimates.
         title: Its heading.
-        meaning: A sentence for somebody who has not read the paper.
+        meaning: Its definition, in a sentence.
         unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
-            rate, or "=" and "=%" for what has no interval.
-        better: 1 where more is better, -1 where less is, 0 where neither.
-        digits: After the decimal point.
+            rate, or "=" and "=%" for values without interval.
+        better: 1 if larger is better, -1 if smaller is, 0 otherwise.
+        digits: Digits after the decimal point.
     """
 
     key: str
@@ -40,36 +40,42 @@ class Column:
 
     @property
     def is_share(self) -> bool:
-        """Whether it is a number between 0 and 1, which can be drawn as a bar."""
+        """Whether values lie between 0 and 1 and can be drawn as a bar."""
         return self.unit in ("", "%")
 
-    def value_text(self, figure: Figure | None) -> str:
-        """The figure itself; a dash where there was nothing to see."""
-        if figure is None or (math.isnan(figure.value) and self.unit != "of"):
+    def value_text(self, estimate: Estimate | None) -> str:
+        """The value of an estimate; a dash if it has none."""
+        if estimate is None or (math.isnan(estimate.value) and self.unit != "of"):
             return "–"
         if self.unit == "of":
-            count = round(figure.value * figure.n) if figure.n else 0
-            return f"{count} of {figure.n}"
-        if math.isinf(figure.value):
+            count = round(estimate.value * estimate.n) if estimate.n else 0
+            return f"{count} of {estimate.n}"
+        if math.isinf(estimate.value):
             return "never"
         if self.unit == "n":
-            return f"{figure.value:.0f}"
+            return f"{estimate.value:.0f}"
         unit = self.unit.removeprefix("=")
         space = "" if unit in ("", "/h") else f" {unit}"
-        return f"{self._scale * figure.value:.{self.digits}f}{space}"
+        return f"{self._scale * estimate.value:.{self.digits}f}{space}"
 
-    def interval_text(self, figure: Figure | None) -> str:
-        """Its interval in brackets, or nothing."""
-        if figure is None or self.unit not in ("", "%", "/h") or not math.isfinite(figure.value):
+    def interval_text(self, estimate: Estimate | None) -> str:
+        """The interval of an estimate in brackets, if any."""
+        if (
+            estimate is None
+            or self.unit not in ("", "%", "/h")
+            or not math.isfinite(estimate.value)
+        ):
             return ""
-        if not (math.isfinite(figure.low) and math.isfinite(figure.high)):
+        if not (math.isfinite(estimate.low) and math.isfinite(estimate.high)):
             return ""
-        low, high = (f"{self._scale * end:.{self.digits}f}" for end in (figure.low, figure.high))
+        low, high = (
+            f"{self._scale * end:.{self.digits}f}" for end in (estimate.low, estimate.high)
+        )
         return f"({low}–{high})"
 
-    def text(self, figure: Figure | None) -> str:
-        """The figure and its interval."""
-        return f"{self.value_text(figure)} {self.interval_text(figure)}".strip()
+    def text(self, estimate: Estimate | None) -> str:
+        """The value and interval of an estimate."""
+        return f"{self.value_text(estimate)} {self.interval_text(estimate)}".strip()
 
     @property
     def _scale(self) -> float:
@@ -78,30 +84,30 @@ class Column:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Who or what is judged.
+    """A row of a table, such as a method.
 
     Attributes:
-        key: Its part of the figures' keys.
-        label: How it is called.
-        figures: One a column; None where there is none.
-        is_quoted: Whether somebody else printed them: they take no part in comparisons.
+        key: Its part of the keys of its estimates.
+        label: Its label.
+        estimates: One a column; None if missing.
+        is_quoted: Whether they are quoted from a publication and excluded from comparisons.
     """
 
     key: str
     label: str
-    figures: Sequence[Figure | None]
+    estimates: Sequence[Estimate | None]
     is_quoted: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Figures of a few judges, side by side.
+    """A table of estimates.
 
     Attributes:
-        key: Its name among files.
+        key: Name of its files.
         title: Its heading.
-        meaning: What it is about, for somebody who has not read the paper.
-        corner: What the rows are.
+        meaning: Its explanation.
+        corner: Heading of the row labels.
         columns: The columns.
         rows: The rows.
     """
@@ -114,30 +120,30 @@ class Table:
     rows: Sequence[Row] = field(default_factory=list)
 
     def best(self, column: int) -> set[int]:
-        """Rows whose figure is the best of a column; none where there is nothing to compare."""
+        """Indices of the best rows of a column; empty if there is nothing to compare."""
         sign = self.columns[column].better
         values = {
-            i: sign * row.figures[column].value  # type: ignore[union-attr]
+            i: sign * row.estimates[column].value  # type: ignore[union-attr]
             for i, row in enumerate(self.rows)
-            if not row.is_quoted and _is_known(row.figures[column])
+            if not row.is_quoted and _is_known(row.estimates[column])
         }
         if not sign or len(values) < 2 or len(set(values.values())) == 1:
             return set()
         return {i for i, value in values.items() if value == max(values.values())}
 
-    def rivals_ahead(self) -> list[str]:
-        """In words, each figure in which another row is ahead of ours."""
+    def better_baselines(self) -> list[str]:
+        """Describes each column in which another row is better than `OURS`."""
         ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
         found: list[str] = []
         if ours is None:
             return found
         for number, column in enumerate(self.columns):
             best = self.best(number)
-            mine = self.rows[ours].figures[number]
+            mine = self.rows[ours].estimates[number]
             if not best or ours in best or mine is None:
                 continue
             first = self.rows[min(best)]
-            other = first.figures[number]
+            other = first.estimates[number]
             if other is None:
                 continue
             is_clear = (other.low > mine.high) if column.better > 0 else (other.high < mine.low)
@@ -149,15 +155,15 @@ class Table:
         return found
 
     def to_csv(self) -> str:
-        """The table as CSV: value, ends of the interval and n of every figure."""
+        """The table as CSV: value, ends of the interval and n of every estimate."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         names = ("", ".low", ".high", ".n")
         writer.writerow([self.corner, *(f"{c.key}{end}" for c in self.columns for end in names)])
         for row in self.rows:
             cells: list[Any] = [row.key]
-            for figure in row.figures:
-                fields = {} if figure is None else figure.to_json()
+            for estimate in row.estimates:
+                fields = {} if estimate is None else estimate.to_json()
                 cells += [fields.get(name) for name in ("value", "low", "high", "n")]
             writer.writerow(["" if cell is None else cell for cell in cells])
         return out.getvalue()
@@ -175,8 +181,8 @@ class Table:
                     "key": row.key,
                     "label": row.label,
                     "figures": {
-                        column.key: None if figure is None else figure.to_json()
-                        for column, figure in zip(self.columns, row.figures, strict=True)
+                        column.key: None if estimate is None else estimate.to_json()
+                        for column, estimate in zip(self.columns, row.estimates, strict=True)
                     },
                 }
                 for row in self.rows
@@ -184,20 +190,20 @@ class Table:
         }
 
     def to_markdown(self) -> str:
-        """The table as Markdown, figures with their intervals."""
+        """The table as Markdown, estimates with their intervals."""
         lines = [
             "| " + " | ".join([self.corner, *(c.title for c in self.columns)]) + " |",
             "|" + "---|" * (1 + len(self.columns)),
         ]
         for row in self.rows:
             cells = [row.label if row.is_quoted else _MODES.sub(r"`\1`", row.label)]
-            for column, figure in zip(self.columns, row.figures, strict=True):
-                cells.append("" if figure is None else column.text(figure))
+            for column, estimate in zip(self.columns, row.estimates, strict=True):
+                cells.append("" if estimate is None else column.text(estimate))
             if row.is_quoted:
                 cells = [f"*{cell}*" if cell else "" for cell in cells]
             lines.append("| " + " | ".join(cells).replace("|  |", "| |") + " |")
         return "\n".join(lines).replace("|  |", "| |")
 
 
-def _is_known(figure: Figure | None) -> bool:
-    return figure is not None and math.isfinite(figure.value)
+def _is_known(estimate: Estimate | None) -> bool:
+    return estimate is not None and math.isfinite(estimate.value)

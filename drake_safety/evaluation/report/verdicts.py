@@ -1,4 +1,4 @@
-"""The tables of an evaluation: who judges how well, and what becomes of it."""
+"""The tables of an evaluation."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ LABELS = {
     "sharpened_literal_0.6": "sharpened, literal Γ",
     "paper_literal_0.6": "paper, literal Γ",
     "sharpened_literal": "sharpened, literal Γ",
-    "sharpened_calibrated": "sharpened, by its heads",
+    "sharpened_calibrated": "sharpened, calibrated Γ",
     "paper_literal": "paper, literal Γ",
-    "capture_point_margin": "capture point's margin",
-    "support_margin": "support polygon's margin",
+    "capture_point_margin": "capture-point margin",
+    "support_margin": "support-polygon margin",
     "smallest_margin": "smallest margin (true state)",
-    "by_cause_probability": "all, by mass alone",
+    "by_cause_probability": "all, by unsafe mass alone",
     "right_cause": "all",
     **{
         f"{mode}.{kind}": f"{mode}, {row}"
@@ -34,10 +34,10 @@ LABELS = {
     },
 }
 INPUTS = (
-    "Inputs differ: sharpened and the direct classifiers see the plan to its end, through its "
-    "features; paper sees the next H steps of it and no features."
+    "Inputs differ: sharpened and the baseline classifiers use the whole plan, through its "
+    "features; paper uses its next H steps and no features."
 )
-"""What is said beside every table that compares them."""
+"""Note beside every table that compares them."""
 _SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
 _SET_TITLES = {
     "plans": "all targets",
@@ -56,57 +56,57 @@ def columns_of(table: str) -> tuple[Column, ...]:
 
 
 def label_of(key: str) -> str:
-    """How a judge is called in tables."""
+    """Label of a method in tables."""
     return LABELS.get(key, spoken(key))
 
 
 def verdict_tables(results: Results) -> list[Table]:
-    """Every table that the results have figures for, in the order in which one reads them."""
+    """All tables for which the results have estimates, in the order of the report."""
     judged = columns_of("judged")
     tables = [
-        _by_judge(
+        _by_method(
             results,
             "segments",
-            "Every moment of the motion",
-            "Each moment of fresh motions is judged by what follows it: does this motion stay "
-            f"safe to its end? {INPUTS}",
+            "Every segment of the motion",
+            "Each segment of fresh motions is classified: does the motion stay safe to its end? "
+            f"{INPUTS}",
             judged,
         ),
-        _by_judge(
+        _by_method(
             results,
             "episodes",
             "Before the motion starts",
-            "The same question, asked once a motion, at its very first moment (k = 0).",
+            "The same for the first segment of each motion (k = 0).",
             judged,
         ),
         _triggers(results),
         alarm_table(results),
         *(
-            _by_judge(
+            _by_method(
                 results,
                 prefix,
-                f"Targets judged before anything moves: {set_title(prefix)}",
-                "Each target is judged at k = 0, then the motion towards it is simulated to see "
-                f"who was right. {INPUTS}",
+                f"Targets before the motion starts: {set_title(prefix)}",
+                "Each target is classified at k = 0; the simulated motion towards it is the "
+                f"reference. {INPUTS}",
                 columns_of("targets"),
             )
             for prefix in plan_sets(results)
         ),
-        _by_judge(
+        _by_method(
             results,
             _OTHER_HAND,
-            "Lost from the trained hand to the other [points]",
+            "Loss from the trained hand to the other [points]",
             "The same targets, mirrored.",
             columns_of("losses"),
             key="losses",
         ),
         _outcomes(results),
         _causes(results),
-        _by_judge(
+        _by_method(
             results,
             "calibration",
             "Stored calibrations on fresh motions",
-            "Thresholds that were calibrated beforehand: is the promise kept, and at what price?",
+            "Promised and observed rates of calibrated thresholds.",
             columns_of("calibrations"),
             key="calibrations",
         ),
@@ -115,44 +115,44 @@ def verdict_tables(results: Results) -> list[Table]:
 
 
 def plan_sets(results: Results) -> list[str]:
-    """Prefixes of the sets of targets that were judged, all of them first."""
+    """Prefixes of the evaluated sets of targets, the set of all targets first."""
     found = [
         key.removesuffix(".outcomes.safe")
-        for key, figure in results.figures.items()
-        if key.endswith(".outcomes.safe") and figure.n
+        for key, estimate in results.estimates.items()
+        if key.endswith(".outcomes.safe") and estimate.n
     ]
     return sorted(found, key=lambda prefix: (prefix.count("."), prefix))
 
 
 def set_title(prefix: str) -> str:
-    """How a set of targets is called."""
+    """Label of a set of targets."""
     return _SET_TITLES.get(prefix, spoken(prefix.partition(".")[2] or prefix).replace(".", ", "))
 
 
-def other_figures(results: Results, prefix: str) -> list[Table]:
-    """Figures of a kind that no other table knows, each in a row of its own.
+def other_tables(results: Results, prefix: str) -> list[Table]:
+    """Tables of the estimates that no other table shows, one a row.
 
     Args:
         results: The results.
-        prefix: First part of the keys; what follows it groups them.
+        prefix: First part of the keys; the second part groups them.
     """
-    column = Column(key="value", title="value", meaning="As the evaluation wrote it.")
+    column = Column(key="value", title="value", meaning="As in evaluation.json.")
     groups: dict[str, list[Row]] = {}
-    for key, figure in results.figures.items():
+    for key, estimate in results.estimates.items():
         first, *rest = key.split(".")
         if first != prefix or not rest:
             continue
         group = rest[0] if len(rest) > 1 else ""
         name = ".".join(rest[1:] if len(rest) > 1 else rest)
         groups.setdefault(group, []).append(
-            Row(key=key, label=spoken(name).replace(".", " · "), figures=[figure])
+            Row(key=key, label=spoken(name).replace(".", " · "), estimates=[estimate])
         )
     return [
         Table(
             key=f"{prefix}_{group}" if group else prefix,
             title=spoken(group or prefix),
             meaning="",
-            corner="figure",
+            corner="estimate",
             columns=[column],
             rows=rows,
         )
@@ -160,28 +160,28 @@ def other_figures(results: Results, prefix: str) -> list[Table]:
     ]
 
 
-def figure_rows(
+def estimate_rows(
     results: Results, prefixes: Mapping[str, str], columns: Sequence[Column]
 ) -> list[Row]:
-    """A row a prefix of figures' keys; those without any figure are left out.
+    """Rows of the estimates with given prefixes; rows without any estimate are left out.
 
     Args:
         results: The results.
-        prefixes: By prefix, what the row is called.
-        columns: Which figures.
+        prefixes: Label of the row by prefix.
+        columns: The columns.
     """
     rows = [
         Row(
             key=prefix,
             label=label,
-            figures=[results.figures.get(f"{prefix}.{column.key}") for column in columns],
+            estimates=[results.estimates.get(f"{prefix}.{column.key}") for column in columns],
         )
         for prefix, label in prefixes.items()
     ]
-    return [row for row in rows if any(row.figures)]
+    return [row for row in rows if any(row.estimates)]
 
 
-def _by_judge(
+def _by_method(
     results: Results,
     prefix: str,
     title: str,
@@ -189,18 +189,18 @@ def _by_judge(
     columns: Sequence[Column],
     *,
     key: str | None = None,
-    corner: str = "who judges",
+    corner: str = "method",
 ) -> Table:
-    """A row for each who has a figure of the second column."""
+    """A table with a row for each method that has an estimate of the second column."""
     pattern = re.compile(rf"{re.escape(prefix)}\.(.+)\.{columns[1].key}")
-    names = [match[1] for name in results.figures if (match := pattern.fullmatch(name))]
+    names = [match[1] for name in results.estimates if (match := pattern.fullmatch(name))]
     if prefix in plan_sets(results):
-        # The names of sets go on from one another's; those of judges have no dots.
+        # Names of sets extend one another with dots; those of methods have none.
         names = [name for name in names if "." not in name]
-        meaning += f" Judged on {results.figures[f'{prefix}.outcomes.safe'].n} fresh motions."
-    elif first := results.figures.get(f"{prefix}.{names[0]}.auc" if names else ""):
-        meaning += f" Judged on {first.n} fresh motions."
-    rows = figure_rows(results, {f"{prefix}.{name}": label_of(name) for name in names}, columns)
+        meaning += f" Evaluated on {results.estimates[f'{prefix}.outcomes.safe'].n} fresh motions."
+    elif first := results.estimates.get(f"{prefix}.{names[0]}.auc" if names else ""):
+        meaning += f" Evaluated on {first.n} fresh motions."
+    rows = estimate_rows(results, {f"{prefix}.{name}": label_of(name) for name in names}, columns)
     return Table(
         key=key or prefix.replace(".", "_"),
         title=title,
@@ -212,51 +212,43 @@ def _by_judge(
 
 
 def _triggers(results: Results) -> Table:
-    alone = results.figures.get("throws.falls_without_recovery")
-    meaning = "Balls are thrown at the robot; whoever judges may trigger a recovery step."
+    alone = results.estimates.get("throws.falls_without_recovery")
+    meaning = "Balls are thrown at the robot; each method triggers recovery steps."
     if alone is not None:
         meaning += (
-            f" Of {alone.n} fresh throws, {_SHARE.text(alone)} end in a fall if the robot only "
-            "balances."
+            f" Of {alone.n} fresh throws, {_SHARE.text(alone)} end in a fall without recovery."
         )
-    title = "As an alarm: balls at the robot"
-    return _by_judge(
-        results, "throws", title, meaning, columns_of("triggers"), corner="who triggers"
-    )
+    title = "Triggers of recovery: balls thrown at the robot"
+    return _by_method(results, "throws", title, meaning, columns_of("triggers"), corner="trigger")
 
 
 def alarm_table(results: Results) -> Table:
-    """Who notices a push, how long before, and how often for nothing."""
-    meaning = (
-        "Everyone may give as many false alarms on other motions: thresholds are chosen for that."
-    )
-    refused = results.figures.get("monitoring.motions.refused")
+    """Detection rate, lead time and false-alarm rate of alarms on pushed motions."""
+    meaning = "Thresholds are chosen for the same share of false alarms on calibration motions."
+    refused = results.estimates.get("monitoring.motions.refused")
     if refused is not None and refused.n:
         meaning += (
-            f" Of {refused.n} motions that would be safe if nobody pushed, "
-            f"{_SHARE.value_text(refused)} lead to goals that sharpened refuses beforehand: they "
-            "are not begun, whoever watches."
+            f" Of {refused.n} motions that are safe without a push, "
+            f"{_SHARE.value_text(refused)} are left out because sharpened refuses their goals."
         )
-    left = results.figures.get("monitoring.motions.leave_safe_set")
-    hours = results.figures.get("monitoring.motions.safe_hours")
+    left = results.estimates.get("monitoring.motions.leave_safe_set")
+    hours = results.estimates.get("monitoring.motions.safe_hours")
     if left is not None and hours is not None:
         meaning += (
             f" Of {left.n} fresh motions {_SHARE.value_text(left)} leave the safe set; the others "
-            f"make {hours.value:.2f} hours."
+            f"last {hours.value:.2f} hours."
         )
-    title = "Watching while it moves: pushes"
-    return _by_judge(
-        results, "monitoring", title, meaning, columns_of("alarms"), corner="who watches"
-    )
+    title = "Alarms on pushed motions"
+    return _by_method(results, "monitoring", title, meaning, columns_of("alarms"), corner="alarm")
 
 
 def _outcomes(results: Results) -> Table:
     table = _by_set(
         results,
         "outcomes",
-        "What came of the motions",
-        "Every target's motion is simulated; this is how they end.",
-        "Share of the motions that end so: safe, or why not.",
+        "Outcomes of the motions",
+        "Simulated outcomes of the motions to all targets.",
+        "Share of the motions with this outcome: safe, or the violated constraint.",
     )
     columns = [*table.columns, *columns_of("failures")]
     return replace(table, columns=columns, rows=_set_rows(results, columns))
@@ -266,22 +258,22 @@ def _causes(results: Results) -> Table:
     return _by_set(
         results,
         "causes",
-        "Was the right cause named?",
+        "Correct causes",
         "A refusal names the constraint that it expects to be violated.",
-        "Of the rightly refused targets (of this true cause), those for which the cause that was "
-        "named is the one that came true.",
+        "Of the correctly refused targets (with this simulated cause), the share whose named cause "
+        "is the simulated one.",
     )
 
 
 def _by_set(results: Results, infix: str, title: str, meaning: str, of_columns: str) -> Table:
-    """A row a set of targets, a column a figure below `infix`."""
+    """A row a set of targets, a column an estimate below `infix`."""
     names = dict.fromkeys(
-        match[1] for key in results.figures if (match := re.search(rf"\.{infix}\.([^.]+)$", key))
+        match[1] for key in results.estimates if (match := re.search(rf"\.{infix}\.([^.]+)$", key))
     )
     columns = [
         Column(key=f"{infix}.{name}", title=label_of(name), meaning=of_columns, unit="%", digits=1)
         for name in names
-        if any(results.figures.get(f"{key}.{infix}.{name}") for key in plan_sets(results))
+        if any(results.estimates.get(f"{key}.{infix}.{name}") for key in plan_sets(results))
     ]
     return Table(
         key=infix,
@@ -294,4 +286,4 @@ def _by_set(results: Results, infix: str, title: str, meaning: str, of_columns: 
 
 
 def _set_rows(results: Results, columns: Sequence[Column]) -> list[Row]:
-    return figure_rows(results, {key: set_title(key) for key in plan_sets(results)}, columns)
+    return estimate_rows(results, {key: set_title(key) for key in plan_sets(results)}, columns)
