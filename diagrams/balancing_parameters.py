@@ -1,13 +1,17 @@
 """What a scenario file says of balancing, and defaults that fit the robot's size."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from drake_safety.control.kinematics import RobotKinematics
+import numpy as np
+
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.robot_size import RobotSize, overlaid, scaled_defaults
 from drake_safety.control.safe_sets import BalanceLimits
 from drake_safety.plants.balls import Throw
+from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 
@@ -39,6 +43,8 @@ class BalancingParameters:
     """The balls of ``drake-safety run --push ball``."""
 
 
+_GRAVITY = 9.81
+_LEAST_TWIST_RAD = 0.2  # Feet that slip under less cannot hold the heading.
 _DEFAULT_SIZE = RobotSize(height_m=0.4245, half_length_m=0.2194, half_width_m=0.1245, mass_kg=25.43)
 """Of a robot that the parameters' defaults fit."""
 _QUANTITIES: dict[str, Any] = {
@@ -64,7 +70,6 @@ _QUANTITIES: dict[str, Any] = {
             "step_duration_s": "duration",
             "lift_m": "height",
             "velocity_gain_s": "duration",
-            "yaw_damping_s": "duration",
             "max_reach_m": "height",
             "min_lateral_m": "width",
             "settle_margin_m": "width",
@@ -84,4 +89,28 @@ def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict
         kinematics: The robot.
     """
     factors = RobotSize.of(kinematics).factors(_DEFAULT_SIZE)
-    return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)
+    defaults = scaled_defaults(BalancingParameters(), _QUANTITIES, factors)
+    if largest_twist(kinematics) < _LEAST_TWIST_RAD:
+        # Legs that stiff make their feet slip, and a foot that slips does not catch the robot.
+        defaults["recovery"]["step"]["max_twist_rad"] = 0.0
+    return overlaid(defaults, stated)
+
+
+def largest_twist(kinematics: RobotKinematics) -> float:
+    """How far half of the legs can twist the standing base before their feet slip [rad].
+
+    Args:
+        kinematics: The robot; the stiffness of its servos and the friction of its feet are those
+            of its model.
+    """
+    robot = kinematics.robot
+    stiffness = [
+        getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)
+        for name in kinematics.joint_names
+    ]
+    J = kinematics.contact_jacobian(kinematics.standing_positions())
+    joints_per_yaw = np.linalg.lstsq(J[:, NUM_BASE_VELOCITIES:], J[:, 2], rcond=None)[0]
+    torque_per_yaw = 0.5 * float(np.square(joints_per_yaw) @ stiffness)
+    radius_m = float(np.linalg.norm(kinematics.nominal_contacts, axis=1).mean())
+    torque = robot.foot_friction * kinematics.total_mass * _GRAVITY * radius_m
+    return torque / torque_per_yaw if torque_per_yaw > 0 else math.inf

@@ -23,16 +23,15 @@ class RecoveryStepParameters:
     min_lateral_m: float = 0.11
     """A foothold is at least this far from the base's midline, on its own side [m]."""
     max_twist_rad: float = 0.3
-    """Stance legs are told a base yaw that is at most this far from the measured one [rad]."""
-    yaw_damping_s: float = 0.1
-    """How far it lies on the other side of the heading to be held, per yaw rate [s]."""
+    """Legs are told a base yaw at most this far from that of their feet, towards the heading held;
+    0 where it is not to be held [rad]."""
     min_steps: int = 2
     """Swings before the robot may stop."""
     max_steps: int = 20
     """Swings after which it stops in any case."""
     settle_heading_rad: float = 0.35
-    """Angle between the base's yaw and the heading under which it may stop [rad]."""
-    settle_margin_m: float = 0.08
+    """Angle between the base's yaw and the heading that is held under which it may stop [rad]."""
+    settle_margin_m: float = 0.05
     """Distance of the capture point inside the support polygon at which it may stop [m]."""
     resume_margin_m: float = 0.02
     """Distance under which it steps again, after it has stopped [m]."""
@@ -45,6 +44,10 @@ class RecoveryStepParameters:
                 raise ValueError(
                     f"recovery step: {name} must be positive; got {getattr(self, name)}"
                 )
+        if not self.max_twist_rad >= 0:
+            raise ValueError(
+                f"recovery step: max_twist_rad must not be negative; got {self.max_twist_rad}"
+            )
         if not self.resume_margin_m <= self.settle_margin_m:
             raise ValueError(
                 f"recovery step: resume_margin_m must not exceed settle_margin_m; got "

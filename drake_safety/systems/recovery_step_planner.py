@@ -49,13 +49,14 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
     ``recovery_active`` rises, the group of feet whose partners' line is nearest the capture
     point swings to Raibert footholds that follow the base at every tick; the base set point
     follows the measured base at the standing height, so the stance legs carry the weight without
-    pulling it back. The heading of the stance that the recovery began in is held: the stance legs
-    twist the base towards it and against its yaw rate, and the footholds follow the base. Groups
-    alternate until the robot can stand: its capture point is well inside the support polygon, and
-    it is about at the heading. The base then comes to rest as an inverted pendulum does over its
-    capture point, and is led to the nominal planner's set point, which stands in the stance pose of
-    the new footholds; should the capture point come near the polygon's edge meanwhile, the robot
-    steps on. After that ``recovery_done`` is 1 until ``recovery_active`` has fallen.
+    pulling it back. Its yaw is held at that of the feet, which resists a turn with the stiffness of
+    the stance legs, and twisted from there, as far as ``max_twist_rad``, towards the heading of the
+    stance that the recovery began in; the footholds follow the base. Groups alternate until the
+    robot can stand: its capture point is well inside the support polygon, and it is about at the
+    heading, if that is held at all. The base then comes to rest as an inverted pendulum does over
+    its capture point, and is led to the nominal planner's set point, which stands in the stance
+    pose of the new footholds; should the capture point come near the polygon's edge meanwhile, the
+    robot steps on. After that ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
     Preview and outlook are the base set point, held, in the frame of the stance as it is to be
     now. No output has direct feedthrough.
@@ -206,11 +207,11 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         num_steps = discrete_state.get_value(self._num_steps)[0]
         if num_steps < parameters.min_steps or num_steps >= parameters.max_steps:
             return num_steps >= parameters.max_steps
-        yaw = yaw_of(RotationMatrix(quaternion_of(q)))
-        return (
-            abs(self._heading_error(discrete_state, yaw)) <= parameters.settle_heading_rad
-            and self._margin(discrete_state, q, v) >= parameters.settle_margin_m
-        )
+        if parameters.max_twist_rad > 0:
+            yaw = yaw_of(RotationMatrix(quaternion_of(q)))
+            if abs(self._heading_error(discrete_state, yaw)) > parameters.settle_heading_rad:
+                return False
+        return self._margin(discrete_state, q, v) >= parameters.settle_margin_m
 
     def _stays_standing(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> bool:
         parameters = self._parameters
@@ -247,23 +248,14 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         kinematics, parameters = self._kinematics, self._parameters
         R_WB = RotationMatrix(quaternion_of(q))
         yaw, p_WB, v_WB = yaw_of(R_WB), q[4:7], v[3:6]
-        error = self._heading_error(discrete_state, yaw)
-        twist = error - parameters.yaw_damping_s * v[2]
-        twist = min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         base = np.array([p_WB[0], p_WB[1], kinematics.standing_height])
-        # The controller solves for a level base at the set point; a swinging foot must reach its
-        # place from the base as it is.
-        X_adjust = (
-            RigidTransform(RotationMatrix.MakeZRotation(yaw + twist), base)
-            @ RigidTransform(R_WB, p_WB).inverse()
-        )
         elapsed_s = time - discrete_state.get_value(self._start_s)[0]
         phase = elapsed_s / parameters.step_duration_s
         remaining_s = parameters.step_duration_s - elapsed_s
         R_WF = RotationMatrix.MakeZRotation(yaw).matrix()[:2, :2]
         feet = self._contacts(discrete_state)
-        told = feet.copy()
         group = int(discrete_state.get_value(self._swinging_group)[0])
+        swinging = []
         for foot in self._groups[group]:
             rows = kinematics.foot_slices[foot]
             hip = self._nominal_feet[foot] - kinematics.nominal_base_offset
@@ -272,11 +264,24 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
             for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
                 target = np.append(centre + R_WF @ offset, kinematics.foot_radii[i])
                 feet[i] = swing_position(feet[i], target, phase, parameters.lift_m)
-                told[i] = X_adjust @ feet[i]
+                swinging.append(i)
+        stance = fit_stance(feet, kinematics.nominal_contacts)
+        # Held at their feet, stance legs resist a turn by their own stiffness, without a delay.
+        twist = self._heading_error(discrete_state, stance[2])
+        told_yaw = stance[2] + min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
+        # The controller solves for a level base at the set point; a swinging foot must reach its
+        # place from the base as it is.
+        X_adjust = (
+            RigidTransform(RotationMatrix.MakeZRotation(told_yaw), base)
+            @ RigidTransform(R_WB, p_WB).inverse()
+        )
+        told = feet.copy()
+        for i in swinging:
+            told[i] = X_adjust @ feet[i]
         discrete_state.set_value(self._set_point, base)
         discrete_state.set_value(self._feet, told.ravel())
-        discrete_state.set_value(self._yaw, [yaw + twist])
-        discrete_state.set_value(self._stance, fit_stance(feet, kinematics.nominal_contacts))
+        discrete_state.set_value(self._yaw, [told_yaw])
+        discrete_state.set_value(self._stance, stance)
 
     def _set_point_in_stance(self, context: Context) -> np.ndarray:
         x, y, yaw = context.get_discrete_state(self._stance).get_value()
