@@ -31,7 +31,7 @@ class RecoveryStepParameters:
     """Swings after which it stops in any case."""
     settle_heading_rad: float = 0.35
     """Angle between the base's yaw and the heading that is held under which it may stop [rad]."""
-    settle_margin_m: float = 0.05
+    settle_margin_m: float = 0.08
     """Distance of the capture point inside the support polygon at which it may stop [m]."""
     resume_margin_m: float = 0.02
     """Distance under which it steps again, after it has stopped [m]."""

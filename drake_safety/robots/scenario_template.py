@@ -116,7 +116,7 @@ robot: robot.yaml
       max_twist_rad: 0  # towards the heading held, as far as the feet do not slip: try 0.3 [rad]
       max_reach_m: {0.18 * tall:.3g}  # of a foothold from its hip [m]
       min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]
-      settle_margin_m: {0.05 * width:.3g}
+      settle_margin_m: {0.08 * width:.3g}
       resume_margin_m: {0.02 * width:.3g}
 """
 
