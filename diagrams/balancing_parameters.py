@@ -70,6 +70,7 @@ _QUANTITIES: dict[str, Any] = {
             "step_duration_s": "duration",
             "lift_m": "height",
             "velocity_gain_s": "duration",
+            "yaw_damping_s": "duration",
             "max_reach_m": "height",
             "min_lateral_m": "width",
             "settle_margin_m": "width",

@@ -23,8 +23,10 @@ class RecoveryStepParameters:
     min_lateral_m: float = 0.11
     """A foothold is at least this far from the base's midline, on its own side [m]."""
     max_twist_rad: float = 0.3
-    """Legs are told a base yaw at most this far from that of their feet, towards the heading held;
-    0 where it is not to be held [rad]."""
+    """Stance legs are told a base yaw that is at most this far from the measured one; 0 where no
+    heading is to be held, and the base follows the yaw of its feet [rad]."""
+    yaw_damping_s: float = 0.1
+    """How far it lies on the other side of the heading to be held, per yaw rate [s]."""
     min_steps: int = 2
     """Swings before the robot may stop."""
     max_steps: int = 20

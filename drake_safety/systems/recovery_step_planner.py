@@ -49,9 +49,9 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
     ``recovery_active`` rises, the group of feet whose partners' line is nearest the capture
     point swings to Raibert footholds that follow the base at every tick; the base set point
     follows the measured base at the standing height, so the stance legs carry the weight without
-    pulling it back. Its yaw is held at that of the feet, which resists a turn with the stiffness of
-    the stance legs, and twisted from there, as far as ``max_twist_rad``, towards the heading of the
-    stance that the recovery began in; the footholds follow the base. Groups alternate until the
+    pulling it back. The heading of the stance that the recovery began in is held: the stance legs
+    twist the base towards it and against its yaw rate, and the footholds follow the base. Where
+    ``max_twist_rad`` is 0, the base follows the yaw of its feet instead. Groups alternate until the
     robot can stand: its capture point is well inside the support polygon, and it is about at the
     heading, if that is held at all. The base then comes to rest as an inverted pendulum does over
     its capture point, and is led to the nominal planner's set point, which stands in the stance
@@ -266,9 +266,11 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
                 feet[i] = swing_position(feet[i], target, phase, parameters.lift_m)
                 swinging.append(i)
         stance = fit_stance(feet, kinematics.nominal_contacts)
-        # Held at their feet, stance legs resist a turn by their own stiffness, without a delay.
-        twist = self._heading_error(discrete_state, stance[2])
-        told_yaw = stance[2] + min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
+        # Held at its feet's yaw, a base resists a turn by the stiffness of the stance legs alone.
+        told_yaw = stance[2]
+        if parameters.max_twist_rad > 0:
+            twist = self._heading_error(discrete_state, yaw) - parameters.yaw_damping_s * v[2]
+            told_yaw = yaw + min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         # The controller solves for a level base at the set point; a swinging foot must reach its
         # place from the base as it is.
         X_adjust = (
