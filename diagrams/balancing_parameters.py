@@ -1,14 +1,16 @@
 """Parameters of the balancing task, with defaults that scale with the robot's size."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
 from drake_safety.plants.balls import Throw
+from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (
     BALANCING_REFERENCE,
     RobotSize,
@@ -46,6 +48,8 @@ class BalancingParameters:
     """Balls of ``drake-safety run --push ball``."""
 
 
+_GRAVITY = 9.81
+_LEAST_TWIST_RAD = 0.2  # Feet that slip at a smaller twist cannot hold the heading.
 _QUANTITIES: dict[str, Any] = {
     "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
     "start": {
@@ -96,4 +100,27 @@ def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict
         mass_kg=kinematics.total_mass,
     )
     factors = size.factors(BALANCING_REFERENCE)
-    return overlaid(scaled_defaults(BalancingParameters(), _QUANTITIES, factors), stated)
+    defaults = scaled_defaults(BalancingParameters(), _QUANTITIES, factors)
+    if largest_twist(kinematics) < _LEAST_TWIST_RAD:
+        # Such stiff legs make their feet slip, and a slipping foot does not catch the robot.
+        defaults["recovery"]["step"]["max_twist_rad"] = 0.0
+    return overlaid(defaults, stated)
+
+
+def largest_twist(kinematics: RobotKinematics) -> float:
+    """Largest yaw twist of the standing base by half of its legs before their feet slip [rad].
+
+    Args:
+        kinematics: The robot, with its servo stiffness and foot friction.
+    """
+    robot = kinematics.robot
+    stiffness = [
+        getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)
+        for name in kinematics.joint_names
+    ]
+    J = kinematics.contact_jacobian(kinematics.standing_positions())
+    joints_per_yaw = np.linalg.lstsq(J[:, NUM_BASE_VELOCITIES:], J[:, 2], rcond=None)[0]
+    torque_per_yaw = 0.5 * float(np.square(joints_per_yaw) @ stiffness)
+    radius_m = float(np.linalg.norm(kinematics.nominal_contacts, axis=1).mean())
+    torque = robot.foot_friction * kinematics.total_mass * _GRAVITY * radius_m
+    return torque / torque_per_yaw if torque_per_yaw > 0 else math.inf

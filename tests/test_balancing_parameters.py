@@ -1,11 +1,18 @@
 """Defaults of balancing fit the robot that they were chosen on, and grow with another one."""
 
+import copy
 import math
 from dataclasses import asdict
 
 import pytest
 
-from drake_safety.diagrams.balancing_parameters import BalancingParameters, fitted_to_robot
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.diagrams.balancing_parameters import (
+    BalancingParameters,
+    fitted_to_robot,
+    largest_twist,
+)
+from drake_safety.models import load_robot
 from legged_robots import ROBOT_NAMES, robot_kinematics
 
 
@@ -47,3 +54,27 @@ def test_what_the_file_states_stands():
     assert fitted["push"]["share"] == 0.5
     assert fitted["scale_to_robot"]
     assert "height_m" in fitted["push"]
+
+
+def with_stiffness(factor):
+    robot = copy.deepcopy(load_robot("laikago"))
+    for gains in robot.joint_gains.values():
+        gains.stiffness *= factor
+    return RobotKinematics(robot)
+
+
+def test_a_twist_slips_the_sooner_the_stiffer_the_legs_and_the_more_slippery_the_ground():
+    soft, stiff = with_stiffness(1.0), with_stiffness(4.0)
+    assert largest_twist(stiff) == pytest.approx(0.25 * largest_twist(soft))
+    stiff.robot.foot_friction *= 4.0
+    assert largest_twist(stiff) == pytest.approx(largest_twist(soft))
+    assert largest_twist(with_stiffness(0.0)) == math.inf
+
+
+@pytest.mark.parametrize(("factor", "is_held"), [(1.0, True), (4.0, False)])
+def test_a_recovery_holds_its_heading_where_the_feet_can_bear_the_twist(factor, is_held):
+    fitted = fitted_to_robot({}, with_stiffness(factor))
+    assert ("max_twist_rad" not in fitted["recovery"]["step"]) == is_held
+    stated = {"recovery": {"step": {"max_twist_rad": 0.1}}}
+    fitted = fitted_to_robot(stated, with_stiffness(factor))
+    assert fitted["recovery"]["step"]["max_twist_rad"] == 0.1

@@ -173,3 +173,8 @@ def test_contradictory_numbers_of_steps_are_refused():
 def test_a_robot_that_would_step_on_as_soon_as_it_stands_is_refused():
     with pytest.raises(ValueError, match="resume_margin_m must not exceed settle_margin_m"):
         RecoveryStepParameters(resume_margin_m=0.06, settle_margin_m=0.05)
+
+
+def test_a_twist_away_from_the_heading_is_refused():
+    with pytest.raises(ValueError, match="max_twist_rad must not be negative; got -0"):
+        RecoveryStepParameters(max_twist_rad=-0.1)

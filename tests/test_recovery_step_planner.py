@@ -190,6 +190,23 @@ def test_the_yaw_that_it_is_told_is_never_further_than_it_can_twist():
     assert bench.get("desired_yaw")[0] == pytest.approx(0.8)
 
 
+def test_a_base_turned_by_a_blow_is_told_the_yaw_of_feet_that_have_not():
+    bench = Bench(speed=(1.0, 0.0), max_twist_rad=0.0)
+    bench.fix("recovery_active", [1.0])
+    bench.see(bench.base, turned=0.5, yaw_rate=3.0)
+    bench.advance(2 * PERIOD_S)
+    assert abs(bench.get("desired_yaw")[0]) < 0.1
+
+
+def test_a_robot_that_holds_no_heading_stops_wherever_it_has_turned_to():
+    bench = Bench(max_twist_rad=0.0)
+    bench.fix("recovery_active", [1.0])
+    bench.see(bench.base, turned=1.5)
+    settled(bench)
+    assert bench.get("recovery_done")[0] == 1
+    assert bench.get("stance_pose")[2] == pytest.approx(1.5, abs=0.05)
+
+
 def test_a_robot_far_from_its_heading_steps_on():
     bench = Bench(settle_heading_rad=0.35, max_steps=20)
     bench.fix("recovery_active", [1.0])

@@ -23,7 +23,8 @@ class RecoveryStepParameters:
     min_lateral_m: float = 0.11
     """Smallest distance of a foothold from the base's midline, on its own side [m]."""
     max_twist_rad: float = 0.3
-    """Largest difference of the desired base yaw of stance legs from the measured yaw [rad]."""
+    """Largest difference of the desired base yaw of stance legs from the measured yaw [rad]; with 0
+    no heading is held, and the base follows the yaw of its feet."""
     yaw_damping_s: float = 0.1
     """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: int = 2
@@ -45,6 +46,10 @@ class RecoveryStepParameters:
                 raise ValueError(
                     f"recovery step: {name} must be positive; got {getattr(self, name)}"
                 )
+        if not self.max_twist_rad >= 0:
+            raise ValueError(
+                f"recovery step: max_twist_rad must not be negative; got {self.max_twist_rad}"
+            )
         if not self.resume_margin_m <= self.settle_margin_m:
             raise ValueError(
                 f"recovery step: resume_margin_m must not exceed settle_margin_m; got "

@@ -102,6 +102,7 @@ robot: robot.yaml
       step_duration_s: {0.09 * slow:.3g}  # [s]
       lift_m: {0.06 * tall:.3g}
       velocity_gain_s: {0.07 * slow:.3g}
+      max_twist_rad: 0  # holds no heading; 0.3 does, if the feet do not slip under it [rad]
       yaw_damping_s: {0.1 * slow:.3g}
       max_reach_m: {0.18 * tall:.3g}  # of a foothold from its hip [m]
       min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]

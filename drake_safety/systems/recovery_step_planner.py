@@ -50,7 +50,8 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
     footholds, which follow the base at every update; the base set point follows the measured base
     at the standing height, so that the stance legs carry the weight without pulling the base back.
     The heading of the initial stance is held: the stance legs twist the base towards it and damp
-    its yaw rate, and the footholds follow the base. Groups alternate until the capture point is
+    its yaw rate, and the footholds follow the base. With a ``max_twist_rad`` of 0 the base follows
+    the yaw of its feet instead. Groups alternate until the capture point is
     well inside the support polygon and the heading error is small. The base then comes to rest
     like an inverted pendulum over its capture point, and moves to the nominal planner's set point
     in the stance frame of the new footholds; if the capture point comes near the polygon's edge
@@ -206,11 +207,11 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         num_steps = discrete_state.get_value(self._num_steps)[0]
         if num_steps < parameters.min_steps or num_steps >= parameters.max_steps:
             return num_steps >= parameters.max_steps
-        yaw = yaw_of(RotationMatrix(quaternion_of(q)))
-        return (
-            abs(self._heading_error(discrete_state, yaw)) <= parameters.settle_heading_rad
-            and self._margin(discrete_state, q, v) >= parameters.settle_margin_m
-        )
+        if parameters.max_twist_rad > 0:
+            yaw = yaw_of(RotationMatrix(quaternion_of(q)))
+            if abs(self._heading_error(discrete_state, yaw)) > parameters.settle_heading_rad:
+                return False
+        return self._margin(discrete_state, q, v) >= parameters.settle_margin_m
 
     def _stays_standing(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> bool:
         parameters = self._parameters
@@ -247,23 +248,14 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
         kinematics, parameters = self._kinematics, self._parameters
         R_WB = RotationMatrix(quaternion_of(q))
         yaw, p_WB, v_WB = yaw_of(R_WB), q[4:7], v[3:6]
-        error = self._heading_error(discrete_state, yaw)
-        twist = error - parameters.yaw_damping_s * v[2]
-        twist = min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         base = np.array([p_WB[0], p_WB[1], kinematics.standing_height])
-        # The controller solves for a level base at the set point; a swinging foot is given relative
-        # to the measured base.
-        X_adjust = (
-            RigidTransform(RotationMatrix.MakeZRotation(yaw + twist), base)
-            @ RigidTransform(R_WB, p_WB).inverse()
-        )
         elapsed_s = time - discrete_state.get_value(self._start_s)[0]
         phase = elapsed_s / parameters.step_duration_s
         remaining_s = parameters.step_duration_s - elapsed_s
         R_WF = RotationMatrix.MakeZRotation(yaw).matrix()[:2, :2]
         feet = self._contacts(discrete_state)
-        set_points = feet.copy()
         group = int(discrete_state.get_value(self._swinging_group)[0])
+        swinging = []
         for foot in self._groups[group]:
             rows = kinematics.foot_slices[foot]
             hip = self._nominal_feet[foot] - kinematics.nominal_base_offset
@@ -272,11 +264,26 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
             for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
                 target = np.append(centre + R_WF @ offset, kinematics.foot_radii[i])
                 feet[i] = swing_position(feet[i], target, phase, parameters.lift_m)
-                set_points[i] = X_adjust @ feet[i]
+                swinging.append(i)
+        stance = fit_stance(feet, kinematics.nominal_contacts)
+        # At its feet's yaw the base resists a turn by the stiffness of the stance legs alone.
+        desired_yaw = stance[2]
+        if parameters.max_twist_rad > 0:
+            twist = self._heading_error(discrete_state, yaw) - parameters.yaw_damping_s * v[2]
+            desired_yaw = yaw + min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
+        # The controller solves for a level base at the set point; a swinging foot is given relative
+        # to the measured base.
+        X_adjust = (
+            RigidTransform(RotationMatrix.MakeZRotation(desired_yaw), base)
+            @ RigidTransform(R_WB, p_WB).inverse()
+        )
+        set_points = feet.copy()
+        for i in swinging:
+            set_points[i] = X_adjust @ feet[i]
         discrete_state.set_value(self._set_point, base)
         discrete_state.set_value(self._feet, set_points.ravel())
-        discrete_state.set_value(self._yaw, [yaw + twist])
-        discrete_state.set_value(self._stance, fit_stance(feet, kinematics.nominal_contacts))
+        discrete_state.set_value(self._yaw, [desired_yaw])
+        discrete_state.set_value(self._stance, stance)
 
     def _set_point_in_stance(self, context: Context) -> np.ndarray:
         x, y, yaw = context.get_discrete_state(self._stance).get_value()
