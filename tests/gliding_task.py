@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
-from drake_safety.plants.mujoco_dynamics import DivergenceError
+from drake_safety.learning.segments import DivergenceError
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import parse_scenario
 

@@ -20,7 +20,7 @@ ALLOWED = {
     "robots": set(),
     "assessments": {"learning"},
     "models": {"robots"},
-    "plants": {"robots"},
+    "plants": {"learning", "robots"},
     "control": {"plants", "robots"},
     "systems": {"learning", "control", "plants", "robots"},
 }

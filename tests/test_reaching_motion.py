@@ -7,8 +7,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.kinematic_preview import chain_joints
 from drake_safety.control.whole_body_qp import solve_qp
-from drake_safety.learning.segments import DIVERGED, EpisodeError
-from drake_safety.plants.mujoco_dynamics import DivergenceError
+from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.reaching_sampling import PostureSampling

@@ -13,8 +13,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
 import quadrotor_file
 from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, record_episodes
-from drake_safety.learning.segments import DIVERGED, EpisodeError
-from drake_safety.plants.mujoco_dynamics import DivergenceError
+from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 
 STEP_S = 0.1

@@ -23,6 +23,10 @@ DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; it has no safety label."""
 
 
+class DivergenceError(RuntimeError):
+    """A simulation that diverged; raised by a plant."""
+
+
 class EpisodeError(RuntimeError):
     """An error raised by a diagram during an episode, other than a diverged simulation."""
 

@@ -9,16 +9,13 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 
+from drake_safety.learning.segments import DivergenceError
 from drake_safety.plants.mujoco_model import build_model, import_mujoco
 from drake_safety.robots.robot import PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel
 
 _LOGGER = logging.getLogger("drake_safety")
 _NUM_BASE_POSITIONS, _NUM_BASE_VELOCITIES = 7, 6
-
-
-class DivergenceError(RuntimeError):
-    """A simulation is unstable or not finite."""
 
 
 class MujocoDynamics:

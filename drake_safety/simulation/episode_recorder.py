@@ -13,8 +13,13 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from drake_safety.learning.segments import DIVERGED, RECORDED, Episode, EpisodeError
-from drake_safety.plants.mujoco_dynamics import DivergenceError
+from drake_safety.learning.segments import (
+    DIVERGED,
+    RECORDED,
+    DivergenceError,
+    Episode,
+    EpisodeError,
+)
 
 _LOGGER = logging.getLogger("drake_safety")
 
