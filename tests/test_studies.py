@@ -67,7 +67,7 @@ def test_an_ablation_writes_a_row_a_variant_and_goes_on_where_it_was_stopped(
     again = json.loads((folder / "ablation_quick.json").read_text())
     assert again["rows"] == report["rows"]
     assert call(monkeypatch, "ablate", file, "--assessment", folder, "--seed", 0) == 2
-    assert "begin as the" in " ".join(capsys.readouterr().out.split())
+    assert "start as the" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(monkeypatch, capsys,
     assert all(again[key] == report[key] for key in report if key.startswith("planning."))
     monkeypatch.undo()
     assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
-    assert "begin as the" in capsys.readouterr().out
+    assert "start as the" in capsys.readouterr().out
 
 
 @pytest.mark.slow
