@@ -275,5 +275,5 @@ def test_which_variants_win_is_what_the_intervals_of_their_gains_say():
     assert "1 of 3 variants beat the baseline's AUC: resolution = 7 (+0.020)" in words
     assert "it beats 1: perplexity = 10 (-0.050)" in words
     assert "for 1 the interval of the difference includes zero" in words
-    assert ablation_verdict(rows[:1]) == "There is nothing yet to compare the baseline with."
+    assert ablation_verdict(rows[:1]) == "There is no variant to compare with the baseline."
     assert ablation_verdict(rows[:2]).startswith("No variant beats the baseline's AUC")
