@@ -25,10 +25,10 @@ class GoalTask:
         return {}
 
     def reset(self, context, rng, goal=None):
-        raise NotImplementedError
+        raise AssertionError("a verdict begins from the standing posture")
 
     def goal_of(self, episode):
-        raise NotImplementedError
+        raise AssertionError("a verdict needs no episode")
 
     def reset_standing(self, context, goal, rng=None):
         self.num_resets += 1

@@ -200,7 +200,7 @@ class LeggedLoop(PlannedLoop):
 
     def _output_of(self, q: np.ndarray) -> np.ndarray:
         """The planned output at positions (n_q,), in the world, (n_z,) [m]."""
-        raise NotImplementedError
+        raise TypeError(f"task '{type(self).__name__}' must override _output_of")
 
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:
         return start.stance_pose(self.kinematics)

@@ -224,7 +224,7 @@ class PlannedLoop(ClosedLoop):
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         """Sets the states of plant and controller to a start."""
-        raise NotImplementedError
+        raise TypeError(f"task '{type(self).__name__}' must override _set_state")
 
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:
         """Pose of the frame of a start's plan, [x, y, yaw] in the world (3,) [m, rad]."""
