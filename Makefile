@@ -12,10 +12,10 @@ DEVELOPED := .venv/.developed
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED) ## Train on 512 episodes, evaluate, and throw balls at the robot
-	$(BIN)/drake-safety train laikago_balancing --episodes 512 --out runs/demo --resume
+demo: $(INSTALLED) ## Train on 400 episodes, evaluate, and throw balls at the robot
+	$(BIN)/drake-safety train laikago_balancing --episodes 400 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
-		--episodes 160 --calibration-episodes 60 --throws 40 --no-baselines
+		--episodes 128 --calibration-episodes 60 --throws 30 --no-baselines
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
 test: $(DEVELOPED) ## Run the tests, a process a core
