@@ -1,6 +1,7 @@
 """Balancing: a legged robot moves its base over its feet along a plan, with recovery steps."""
 
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ class Balancing(LeggedLoop):
     """
 
     Parameters = BalancingParameters
+    # "We also add a random offset to the initial state to simulate the disturbances": no ball.
+    paper_options = MappingProxyType({"ball": False})
     online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 

@@ -56,6 +56,9 @@ class Reaching(LeggedLoop):
 
     Parameters = ReachingParameters
     judging_options = MappingProxyType({"exploring": False})
+    # "We do not sample an offset and do not add it to the initial state since we do not consider
+    # disturbances here."
+    paper_options = judging_options
     online_parameters = (
         "decorations",
         "fair",
@@ -208,7 +211,7 @@ class Reaching(LeggedLoop):
         # The preview has no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        shape = self._reflected(plan_shape(preview, self.scenario.step_s, duration_s))
+        shape = self._reflected(plan_shape(preview, self.scenario.preview_step_s, duration_s))
         # An episode begins on the feet of the standing posture.
         shape[:2, :2] -= self.kinematics.nominal_base_offset
         return shape

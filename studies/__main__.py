@@ -7,9 +7,11 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
+from studies.converged import converged
 from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
 from studies.publish import readme, ship, store
+from studies.readings import readings
 from studies.truth import truth
 
 app = typer.Typer(
@@ -23,6 +25,8 @@ app.command()(ablate)
 app.command()(plan_study)
 app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
+app.command()(readings)
+app.command()(converged)
 app.command()(truth)
 app.command()(store)
 app.command()(readme)

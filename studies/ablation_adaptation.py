@@ -1,4 +1,4 @@
-"""Definitions of n_f in the paper's adaptation: samples of the cell, or all feedback."""
+"""Definitions of n_f in the paper's adaptation: segments of the cell, or all."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def counting_estimates(
     """
     bootstrap = bootstrap or Bootstrap()
     judged = {BEFORE: prior}
-    for name, counts_per_cell in ((PER_CELL, True), (TOTAL, False)):
+    for name, count in ((PER_CELL, "cell"), (TOTAL, "segments")):
         one = copy.copy(prior)
-        settings = replace(prior.parameters.adaptation, counts_per_cell=counts_per_cell)
+        settings = replace(prior.parameters.adaptation, count=count)
         one.parameters = replace(prior.parameters, adaptation=settings)
         judged[name] = one.adapt(feedback, method="paper")
     segments = test.segments

@@ -14,7 +14,9 @@ from drake_safety.cli.training_folder import MODES, assessment_file, episodes_fo
 from drake_safety.evaluation.report.results import Results, read_evaluation
 from drake_safety.simulation.dataset import read_info
 from drake_safety.simulation.scenario import load_scenario
+from studies.converged import CONVERGED_FILE
 from studies.learning_curve import CURVE_FILE
+from studies.readings import READINGS_FILE
 from studies.readme import rewrite_readme
 from studies.shipping import ship as ship_assessments
 from studies.stored_results import store_results
@@ -24,7 +26,7 @@ def store(
     assessment: TrainingOption,
     out: Annotated[Path, typer.Option(help="File to write: docs/results/NAME.json.")],
 ) -> None:
-    """Store the evaluation in ASSESSMENT compactly, with its learning curve if there is one."""
+    """Store the evaluation in ASSESSMENT compactly, with its studies if there are any."""
     results, extra = _evaluated(assessment)
     store_results(results, out, train_command=extra.get("command"))
     print_path("stored", out)
@@ -33,11 +35,11 @@ def store(
 def readme(
     paths: Annotated[list[Path] | None, typer.Argument(help="Markdown files.", exists=True)] = None,
 ) -> None:
-    """Rewrite the tables of README.md and docs/results.md from docs/results/NAME.json.
+    """Rewrite the tables of README.md and docs from docs/results/NAME.json.
 
-    They stand between <!-- results: NAME -->, or <!-- summary: NAME -->, and <!-- end -->.
+    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->.
     """
-    for path in paths or [Path("README.md"), Path("docs/results.md")]:
+    for path in paths or [Path("README.md"), Path("docs/results.md"), Path("docs/paper.md")]:
         for name in rewrite_readme(path):
             print_path(f"results of {name} in", path)
 
@@ -90,4 +92,13 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
             estimates=results.estimates | drawn.estimates,
             entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
         )
+    for name in (READINGS_FILE, CONVERGED_FILE):
+        if (folder / name).is_file():
+            studied = read_evaluation(folder / name)
+            key = Path(name).stem
+            results = replace(
+                results,
+                estimates=results.estimates | studied.estimates,
+                entries=results.entries | {key: studied.entries},
+            )
     return results, extra

@@ -28,10 +28,11 @@ from studies.stored_results import read_results
 
 RESULTS_FOLDER = Path("docs/results")
 _BLOCK = re.compile(
-    r"(?P<start><!-- (?P<kind>results|summary): (?P<name>[\w-]+) -->\n).*?(?P<end><!-- end -->)",
+    r"(?P<start><!-- (?P<kind>results|summary|readings|converged): (?P<name>[\w-]+) -->\n).*?"
+    r"(?P<end><!-- end -->)",
     re.DOTALL,
 )
-_OPEN = re.compile(r"<!-- (?:results|summary): ([\w-]+) -->")
+_OPEN = re.compile(r"<!-- (?:results|summary|readings|converged): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
@@ -88,8 +89,7 @@ def generate(text: str, folder: Path) -> str:
                 f"README: there are no results '{match['name']}' in {folder}; there are {there}: "
                 "`python -m studies store RUN` writes them"
             )
-        make = results_text if match["kind"] == "results" else summary_text
-        return f"{match['start']}{make(read_results(file))}\n{match['end']}"
+        return f"{match['start']}{_MAKE[match['kind']](read_results(file))}\n{match['end']}"
 
     return _BLOCK.sub(block, text)
 
@@ -141,6 +141,83 @@ def summary_text(results: Results) -> str:
         alone = results.estimates["throws.falls_without_recovery"]
         parts.insert(1, f"Of {alone.n} fresh throws {_PERCENT.text(alone)} fall without recovery.")
     return "\n\n".join(parts)
+
+
+def readings_text(results: Results) -> str:
+    """Table of the readings of the paper, as Markdown."""
+    entries = results.entries["readings"]
+    columns = {
+        "every segment, AUC": ("segments.normalized.auc", _SHARE),
+        "k = 0, AUC": ("first.normalized.auc", _SHARE),
+        "safe recall": ("first.normalized.safe_recall", _SHARE),
+        "unsafe recall": ("first.normalized.unsafe_recall", _SHARE),
+        "at 0.6, safe": ("first.converged.safe_recall", _SHARE),
+        "at 0.6, unsafe": ("first.converged.unsafe_recall", _SHARE),
+    }
+    lines = [f"| reading | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    for position, name in enumerate(entries["names"]):
+        cells = [
+            column.text(results.estimates[f"readings.{position}.{key}"])
+            for key, column in columns.values()
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    n = results.estimates["readings.0.first.normalized.auc"].n
+    counts = (
+        f"Each is learned from {entries['training_episodes']} episodes and judged on {n} fresh "
+        f"ones of seed {entries['seed']}."
+    )
+    return "\n\n".join([f"```sh\n{entries['command']}\n```", counts, "\n".join(lines)])
+
+
+def converged_text(results: Results) -> str:
+    """Tables of the paper's mode before and after its adaptation, as Markdown."""
+    entries, estimates = results.entries["converged"], results.estimates
+    rules = {
+        "literal": "Γ < 0.6, before adaptation",
+        "converged": "Γ < 0.6, after adaptation",
+        "normalized": "b_safe / (1 − μ), balanced threshold",
+        "conformal": "b_safe / (1 − μ), promised miss rate 1 %",
+    }
+    sets = {"segments": "every segment", "first": "k = 0", "fair": "k = 0, fair targets"}
+    lines = ["| | threshold | safe recall | unsafe recall | AUC |", "|---|---|---|---|---|"]
+    for kind, place in sets.items():
+        for rule, name in rules.items():
+            prefix = f"converged.{kind}.{rule}"
+            if f"{prefix}.auc" in estimates:
+                cells = [f"{estimates[f'{prefix}.threshold'].value:.2f}"]
+                cells += [
+                    _SHARE.text(estimates[f"{prefix}.{key}"])
+                    for key in ("safe_recall", "unsafe_recall", "auc")
+                ]
+                lines.append(f"| {place}: {name} | {' | '.join(cells)} |")
+    parts = [
+        f"```sh\n{entries['command']}\n```",
+        f"Learned from {entries['training_episodes']} episodes; {entries['feedback_episodes']} "
+        "other nominal episodes are the feedback and choose the thresholds.",
+        "\n".join(lines),
+    ]
+    if results.has("converged.throws."):
+        columns = {"falls with recovery": "falls_with_recovery", "false triggers": "false_triggers"}
+        lines = [f"| throws, Γ < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
+        for rule, name in {"before": "before adaptation", "converged": "after adaptation"}.items():
+            found = (estimates[f"converged.throws.{rule}.{key}"] for key in columns.values())
+            lines.append(f"| {name} | {' | '.join(map(_PERCENT.text, found))} |")
+        alone = estimates["converged.throws.falls_without_recovery"]
+        parts.append(
+            f"{alone.n} throws at the actual plant, after {entries['feedback_pairs']} pairs of it; "
+            f"{_PERCENT.text(alone)} fall without recovery."
+        )
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+_MAKE = {
+    "results": results_text,
+    "summary": summary_text,
+    "readings": readings_text,
+    "converged": converged_text,
+}
+"""Text of each kind of block."""
 
 
 def _named(method: str) -> str:

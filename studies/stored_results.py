@@ -55,9 +55,11 @@ def store_results(results: Results, path: Path, *, train_command: str | None = N
     entries = dict(results.entries)
     if train_command is not None:
         entries["train_command"] = train_command
-    for key in ("command", "train_command"):
-        if key in entries:
-            entries[key] = _portable(entries[key])
+    for key, value in entries.items():
+        if key in ("command", "train_command"):
+            entries[key] = _portable(value)
+        elif isinstance(value, dict) and "command" in value:
+            entries[key] = value | {"command": _portable(value["command"])}
     rows = ",\n".join(
         f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (f.value, f.low, f.high)), f.n])}"
         for key, f in results.estimates.items()

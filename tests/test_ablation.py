@@ -255,7 +255,7 @@ def test_counting_all_feedback_in_every_cell_is_not_the_same_as_counting_its_own
     )
     error = np.mean((1.0 - adapted.normalized - segments.is_unsafe) ** 2)
     assert found[PER_CELL]["brier"].value == pytest.approx(error)
-    assert prior.parameters.adaptation.counts_per_cell
+    assert prior.parameters.adaptation.count == "cell"
 
 
 def test_which_variants_win_is_what_the_intervals_of_their_gains_say():

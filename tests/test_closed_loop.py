@@ -63,6 +63,7 @@ def assessment_for(loop, **changes):
         "variation": "nominal",
         "horizon": scenario.assessment.horizon,
         "step_s": scenario.step_s,
+        "preview_stride": scenario.assessment.preview_stride,
     }
     return SimpleNamespace(info_=SimpleNamespace(**info | names_of(loop) | changes))
 
@@ -72,6 +73,7 @@ def assessment_for(loop, **changes):
     [
         ({"scenario": "falling"}, "differ in scenario: .* with falling, the diagram has gliding"),
         ({"horizon": 7}, "differ in horizon: .* with 7, the diagram has 10"),
+        ({"preview_stride": 3}, "differ in preview_stride: .* with 3, the diagram has 1"),
         ({"step_s": 0.05}, "differ in step_s: .* with 0.05, the diagram has 0.04"),
         ({"state_names": ["x"]}, r"differ in state: .* with \['x'\], the diagram has \['x', 'v'\]"),
         ({"output_names": ["x"]}, r"differ in output: .* with \['x'\]"),

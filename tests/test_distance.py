@@ -19,11 +19,11 @@ def segments():
 def dtw_matrix(error, length, backend="dtaidistance"):
     """DTW of every pair, which a graph of neighbours never holds."""
     every = slice(0, len(error))
-    return distance._dtw_block(distance._series(error, length), every, every, backend)
+    return distance._dtw_block(distance._series(error, length), every, every, backend=backend)
 
 
 def graph_of(segments, **changes):
-    options = {"score_weight": 0.05, "num_neighbours": 15} | changes
+    options = {"score_weight": 0.05, "num_neighbours": 15, "cost": "rooted"} | changes
     return neighbour_graph(segments.error, segments.length, segments.score, **options)
 
 
@@ -59,6 +59,44 @@ def test_the_graph_holds_exactly_the_nearest_neighbours(segments, block, score_w
     np.testing.assert_allclose(found, graph.distances, atol=1e-12)
 
 
+@pytest.mark.parametrize("cost", distance.WARPING_COSTS)
+def test_every_cost_of_a_warping_path_gives_its_exact_neighbours(segments, cost):
+    every = slice(0, len(segments))
+    matrix = distance._dtw_block(
+        distance._series(segments.error, segments.length),
+        every,
+        every,
+        is_absolute=cost == "absolute",
+    )
+    if cost == "squared":
+        matrix = matrix**2
+    graph = graph_of(segments, cost=cost)
+    assert graph.max_dtw == pytest.approx(matrix.max(), rel=1e-12)
+    score = segments.score
+    omega = matrix / matrix.max() + 0.05 * np.abs(score[:, None] - score)
+    np.fill_diagonal(omega, np.inf)
+    nearest = np.sort(omega, axis=1)[:, : graph.distances.shape[1]]
+    np.testing.assert_allclose(graph.distances, nearest, atol=1e-12)
+
+
+def test_the_costs_of_a_path_are_the_values_worked_by_hand():
+    # (0, 3) against (1, 1): 0-1 at 1, 3-1 at 2.
+    error = np.array([[[0.0], [3.0]], [[1.0], [1.0]], [[9.0], [9.0]]])
+    found = {}
+    for cost in distance.WARPING_COSTS:
+        graph = neighbour_graph(
+            error, np.full(3, 2), np.zeros(3), score_weight=0.0, num_neighbours=1, cost=cost
+        )
+        found[cost] = float(graph.distances[0, 0] * graph.max_dtw)
+    expected = {"squared": 5.0, "rooted": 5.0**0.5, "absolute": 3.0}
+    assert found == pytest.approx(expected)
+
+
+def test_tslearn_has_no_absolute_cost(segments):
+    with pytest.raises(ValueError, match="'tslearn' has no cost 'absolute'"):
+        graph_of(segments, backend="tslearn", cost="absolute")
+
+
 def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
     episodes, learned, asked = make_episodes(40), {}, []
     cdist = tslearn.metrics.cdist_dtw
@@ -70,7 +108,7 @@ def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
         segments, has_target = segments_for(episodes, parameters)
         x = segments.state
         grid = Grid(resolution=14, cell_length=10.0)
-        learned[backend], _ = learned_maps(segments, has_target, x, grid, parameters, None)
+        learned[backend], _, _ = learned_maps(segments, has_target, x, grid, parameters, None)
         assert bool(asked) == (backend == "tslearn")
     assert learned["tslearn"].is_same(learned["dtaidistance"])
     with pytest.raises(ValueError, match=r"distance_backend is fast, expected one of .*tslearn"):
@@ -90,7 +128,7 @@ def test_the_largest_dtw_is_found_though_the_euclidean_bound_misleads():
     error = np.vstack([pulses, np.full((1, 12), 0.4), np.zeros((200, 12))])[:, :, None]
     length = np.full(len(error), 12)
     score = np.zeros(len(error))
-    graph = neighbour_graph(error, length, score, score_weight=0.0, num_neighbours=3)
+    graph = neighbour_graph(error, length, score, score_weight=0.0, num_neighbours=3, cost="rooted")
     assert graph.max_dtw == pytest.approx(dtw_matrix(error, length).max(), rel=1e-12)
 
 

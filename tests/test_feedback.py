@@ -20,6 +20,7 @@ from drake_safety.systems.feedback_recorder import RecordedWindow
 def quick():
     scenario = load_scenario("laikago_balancing")
     scenario.episode_duration_s = 0.4
+    scenario.assessment.preview_stride = 1
     scenario.parameters.push.share = 0.0
     return scenario
 

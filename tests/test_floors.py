@@ -21,7 +21,7 @@ ALLOWED = {
     "assessments": {"learning"},
     "models": {"robots"},
     "plants": {"learning", "robots"},
-    "control": {"plants", "robots"},
+    "control": {"learning", "plants", "robots"},
     "systems": {"learning", "control", "plants", "robots"},
 }
 ALLOWED["simulation"] = {*ALLOWED["systems"], "systems", "models"}

@@ -149,5 +149,36 @@ def test_episodes_too_short_for_any_segment_are_refused_with_the_length_wanted(e
     }
     short = Episodes(episodes.info, [dataclasses.replace(safe, **arrays)])
     assert len(split(short, stride=1, discount=0.99, shortest=3)) == 1
-    with pytest.raises(ValueError, match=r"none of the 1 episodes .* a segment of 5 steps"):
+    with pytest.raises(ValueError, match=r"none of the 1 episodes .* a segment of 5 samples"):
         split(short, stride=1, discount=0.99, shortest=5)
+
+
+def test_samples_of_a_segment_are_a_preview_stride_apart_and_so_are_the_steps_of_its_score():
+    episodes = make_episodes(20)
+    stride, horizon = 2, episodes.info.horizon // 2
+    info = dataclasses.replace(episodes.info, horizon=horizon, preview_stride=stride)
+    num_outputs = len(info.output_names)
+    wide = [
+        dataclasses.replace(
+            one,
+            desired_preview=one.desired_preview.reshape(len(one.time_s), -1, num_outputs)[
+                :, ::stride
+            ][:, :horizon].reshape(len(one.time_s), -1),
+        )
+        for one in episodes
+    ]
+    assert info.preview_step_s == 2 * episodes.info.step_s
+    segments = split(Episodes(info, wide), stride=1, discount=0.9)
+    for i in range(len(segments)):
+        one = episodes[segments.episode[i]]
+        row, count = segments.start_row[i], segments.length[i]
+        rows = row + stride * np.arange(count)
+        assert rows[-1] <= one.num_steps < rows[-1] + stride or count == horizon
+        error = (one.desired_output - one.output)[rows]
+        np.testing.assert_array_equal(segments.error[i, :count], error)
+        assert row <= episodes.info.num_steps - stride * horizon
+        if not one.is_safe:
+            expected = 0.9 ** ((one.num_steps - row) / stride)
+            assert segments.score[i] == pytest.approx(expected)
+    with pytest.raises(ValueError, match="preview_stride is 0, expected >= 1"):
+        dataclasses.replace(info, preview_stride=0)

@@ -162,6 +162,8 @@ def test_every_study_says_in_a_sentence_what_it_does():
         "plan-study",
         "learning-curve",
         "adaptation",
+        "readings",
+        "converged",
         "truth",
         "store",
         "readme",

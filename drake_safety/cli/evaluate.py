@@ -143,7 +143,9 @@ def evaluate(
     )
     folder = out or assessment
     sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
-    train_set = load_episodes(episodes_folder(assessment))
+    # Without baselines, the training episodes need not be there.
+    train_set = load_episodes(episodes_folder(assessment)) if baselines else None
+    trained = next(one for one in sharpened.used_ if one.purpose == "training")
     seeds = EVALUATION.seeds(seed)
     for gamma in (sharpened, paper):
         check_fresh(gamma, loaded, seeds.values())
@@ -170,10 +172,9 @@ def evaluate(
             sharpened=sharpened,
             paper=paper,
             classifiers=classifier_scorers(train_set, stages, shortest=shortest)
-            if baselines
+            if train_set is not None
             else [],
             run_folder=assessment,
-            train_set=train_set,
             calibration_set=calibration_set,
             test_set=test_set,
             folder=folder,
@@ -207,10 +208,10 @@ def evaluate(
     report = {
         "command": command_line(),
         "scenario": loaded.name,
-        "scenario_hash": train_set.info.scenario_hash,
+        "scenario_hash": sharpened.info_.scenario_hash,
         "seed": seed,
-        "training_seed": train_set.info.seed,
-        "training_episodes": len(train_set),
+        "training_seed": trained.seed,
+        "training_episodes": trained.num_episodes,
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
         **findings.entries,

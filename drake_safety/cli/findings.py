@@ -26,7 +26,6 @@ class Judged:
         paper: Γ in the paper's form.
         classifiers: Baseline classifiers.
         run_folder: Folder written by `train`.
-        train_set: Training episodes.
         calibration_set: Fresh episodes for thresholds.
         test_set: Other fresh episodes.
         folder: Folder of the figures.
@@ -39,7 +38,6 @@ class Judged:
     paper: SafetyAssessment
     classifiers: Sequence[Scorer]
     run_folder: Path
-    train_set: Episodes
     calibration_set: Episodes
     test_set: Episodes
     folder: Path

@@ -24,7 +24,7 @@ def scenarios() -> None:
         except MissingExtraError:
             table.add_row(name, *4 * ["–"], "drake_safety[robots]")
             continue
-        horizon_s = scenario.assessment.horizon * scenario.step_s
+        horizon_s = scenario.assessment.horizon * scenario.preview_step_s
         table.add_row(
             name,
             scenario.task.rpartition(":")[2],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,11 +22,15 @@ from drake_safety.cli.console import (
     open_stages,
     print_path,
 )
-from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.cli.training_folder import (
+    MODES,
+    assessment_file,
+    episodes_folder,
+    training_options,
+)
 from drake_safety.learning.seeds import TRAINING
 
 if TYPE_CHECKING:
-    from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.scenario import Scenario
 
 
@@ -61,37 +66,44 @@ def train(
         raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
     modes = MODES if mode == "both" else (mode,)
     loaded = load_scenario(scenario)
-    folder = episodes_folder(out)
-    if folder.exists() and completed(folder) and not resume:
-        raise ValueError(
-            f"{folder} already holds {len(completed(folder))} episodes: pass --resume to continue "
-            "with them, or choose another --out"
-        )
+    # Folders of episodes and the options of their diagram; modes may share one.
+    sets = {}
+    for name in modes:
+        options = training_options(loaded, name)
+        sets[out / (f"episodes_{name}" if options else "episodes")] = options
+    for folder in sets:
+        if folder.exists() and completed(folder) and not resume:
+            raise ValueError(
+                f"{folder} already holds {len(completed(folder))} episodes: pass --resume to "
+                "continue with them, or choose another --out"
+            )
     with open_stages() as stages:
-        data = run_episodes(
-            loaded,
-            episodes,
-            seed=seed,
-            num_workers=workers,
-            path=folder,
-            progress=partial(stages, "nominal episodes"),
-            extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
-            accept_code_change=accept_code_change,
-        )
+        for folder, options in sets.items():
+            run_episodes(
+                loaded,
+                episodes,
+                seed=seed,
+                num_workers=workers,
+                path=folder,
+                progress=partial(stages, f"nominal {folder.name.replace('_', ', ')}"),
+                extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
+                accept_code_change=accept_code_change,
+                **options,
+            )
         # The modes are independent: the first is trained here, the others in worker processes.
         with _worker_processes(len(modes) - 1) as submit:
             beside = {name: submit(_learn, loaded, name, out) for name in modes[1:]}
-            learned = [_learn(loaded, modes[0], out, data, stages)]
+            learned = [_learn(loaded, modes[0], out, stages)]
             for name, result in beside.items():
                 stages(name, 0, 1)
                 learned.append(result.result())
                 stages(name, 1, 1)
     table = new_table("mode", "segments", "unsafe episodes", "CPU time")
-    unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    for name, (num_segments, cpu_s) in zip(modes, learned, strict=True):
+    for name, (num_segments, unsafe, cpu_s) in zip(modes, learned, strict=True):
         table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
     console.print(table)
-    print_path("episodes  ", folder)
+    for folder in sets:
+        print_path("episodes  ", folder)
     for name in modes:
         print_path("assessment", assessment_file(out, name))
 
@@ -114,20 +126,18 @@ def _learn(
     scenario: Scenario,
     mode: str,
     out: Path,
-    data: Episodes | None = None,
     stages: Stages | None = None,
-) -> tuple[int, float]:
+) -> tuple[int, str, float]:
     """Trains and saves one mode.
 
     Args:
         scenario: The scenario.
         mode: The mode.
         out: Folder of the training.
-        data: The episodes; read from the folder by default, as in a worker process.
         stages: Progress bars.
 
     Returns:
-        The number of segments and the CPU time [s].
+        The number of segments, the share of unsafe episodes, and the CPU time [s].
     """
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.dataset import load_episodes
@@ -138,7 +148,10 @@ def _learn(
 
     started = time.process_time()
     scenario.assessment.mode = mode
-    data = load_episodes(episodes_folder(out)) if data is None else data
+    data = load_episodes(episodes_folder(out, mode))
+    # Γ is that of the scenario's diagram, whatever the options of its training episodes.
+    data.info = replace(data.info, scenario_hash=scenario.simulation_hash())
     assessment = SafetyAssessment(scenario.assessment).fit(data, report)
     assessment.save(assessment_file(out, mode))
-    return assessment.training_points_.shape[1], time.process_time() - started
+    unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
+    return assessment.training_points_.shape[1], unsafe, time.process_time() - started

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -51,9 +51,21 @@ DEFAULT_THRESHOLD = 0.5
 """Lowest Γ of an accepted goal without calibrated threshold."""
 
 
-def episodes_folder(folder: Path) -> Path:
-    """Folder of the training episodes."""
-    return folder / "episodes"
+def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
+    """Folder of the training episodes of a mode.
+
+    The paper's mode has a folder of its own if its task has other episodes for it, see
+    `training_options`.
+    """
+    own = folder / f"episodes_{mode}"
+    return own if own.is_dir() else folder / "episodes"
+
+
+def training_options(scenario: Scenario, mode: str) -> dict[str, Any]:
+    """Options of the diagram for a mode's training episodes, besides the defaults."""
+    from drake_safety.simulation.capabilities import paper_options
+
+    return {} if mode == MODES[0] else paper_options(scenario.task_class())
 
 
 def fresh_episodes_folder(

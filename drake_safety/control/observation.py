@@ -35,11 +35,6 @@ def state_names(kinematics: RobotKinematics) -> list[str]:
     return names + [f"{name}_rate" for name in kinematics.joint_names]
 
 
-def is_rate(name: str) -> bool:
-    """Whether the name of an entry of :func:`stance_state` is that of a velocity."""
-    return name.endswith("_rate") or "velocity" in name
-
-
 def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Returns the state s_k: base pose and velocity in the stance frame S, joints and their rates.
 

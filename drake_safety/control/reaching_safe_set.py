@@ -12,7 +12,6 @@ from drake_safety.control.kinematics import (
     NUM_BASE_VELOCITIES,
     planar_pose,
 )
-from drake_safety.control.observation import is_rate
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
     DIRECTIONS,
@@ -22,6 +21,7 @@ from drake_safety.control.safe_sets import (
     support_margin,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance
 
 _NUM_PREVIEWED = 8  # Samples of the plan in the whole-body preview.

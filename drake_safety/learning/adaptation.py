@@ -40,6 +40,7 @@ class TrainingScores:
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
         heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
         nearest: Column of the constraint with the smallest predicted margin, (N,).
+        target: Points in t-SNE, (N, 2); None if not used.
     """
 
     points: np.ndarray
@@ -47,6 +48,7 @@ class TrainingScores:
     cause: np.ndarray
     heads: np.ndarray | None
     nearest: np.ndarray | None
+    target: np.ndarray | None = None
 
 
 def prior_beliefs(
@@ -104,7 +106,8 @@ def paper_beliefs(
     uncertainty = []
     for member_points, training_points in zip(points, training.points, strict=True):
         discrepancy = DiscrepancyFunction().fit(member_points, difference)
-        mean, deviation = discrepancy.predict(training_points)
+        places = training_points if training.target is None else training.target
+        mean, deviation = discrepancy.predict(places)
         uncertainty.append(
             updated_uncertainty(
                 mean,
@@ -116,12 +119,13 @@ def paper_beliefs(
         )
     prior = prior_beliefs(training, grid, parameters, num_causes, np.stack(uncertainty))
     certain = belief_masses.from_scores(feedback.score, 0.0, feedback.cause, num_causes)
-    num_sets = len(np.unique(feedback.set_index))
     return np.stack(
         [
             combined(
                 member_prior,
-                feedback_beliefs(certain, grid.locate(member_points), grid, settings, num_sets),
+                feedback_beliefs(
+                    certain, grid.locate(member_points), grid, settings, feedback.set_index
+                ),
             )
             for member_prior, member_points in zip(prior, points, strict=True)
         ]
@@ -133,22 +137,25 @@ def feedback_beliefs(
     cells: np.ndarray,
     grid: Grid,
     settings: AdaptationParameters,
-    num_sets: int,
+    set_index: np.ndarray,
 ) -> np.ndarray:
     """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 
-    Departure: n_f is by default the number of samples in the cell. Read literally, as the number of
-    all sets, 40 sets leave an uncertainty of 5e-8, and a single sample replaces its cell's prior.
+    Departure: n_f is by default the number of segments in the cell. Read literally, as the number
+    of all feedback, 40 leave an uncertainty of 5e-8, and one segment replaces its cell's prior.
 
     Args:
         certain: Beliefs of the feedback segments, mu = 0, (M, 3 + n_c).
         cells: Cell of each, -1 for outside, (M,).
         grid: The grid.
         settings: beta, alpha and the definition of n_f.
-        num_sets: Number of feedback sets.
+        set_index: Pair of each, (M,).
     """
-    count = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
-    num_feedback = count if settings.counts_per_cell else np.full(len(count), num_sets)
+    num_feedback = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
+    if settings.count == "segments":
+        num_feedback = np.full(grid.num_cells, len(certain))
+    elif settings.count == "pairs":
+        num_feedback = np.full(grid.num_cells, len(np.unique(set_index)))
     # mu_v = beta exp(-alpha (n_f - 1))
     uncertainty = settings.first_uncertainty * np.exp(-settings.decay_rate * (num_feedback - 1.0))
     return belief_masses.average_cells(certain, cells, np.minimum(uncertainty, 1.0))

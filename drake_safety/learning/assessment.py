@@ -57,7 +57,8 @@ class SafetyAssessment:
       predictions take other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
       training segments, (K, N, 2), (N,), (N,), from which adaptation starts; for maps with heads
-      also `training_heads_` and `training_nearest_`, see `TrainingScores`, (N, 2), (N,).
+      also `training_heads_` and `training_nearest_`, and `training_target_` if the discrepancy is
+      predicted there, see `TrainingScores`, (N, 2), (N,), (N, 2).
     - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
     - `adaptation_`: the `Adaptation` to feedback; initially None.
@@ -104,28 +105,32 @@ class SafetyAssessment:
         """
         parameters = self.parameters
         info = episodes.info
-        if info.horizon != parameters.horizon:
-            raise ValueError(
-                f"SafetyAssessment: horizon is {parameters.horizon}, but that of the episodes of "
-                f"'{info.scenario}' is {info.horizon}"
-            )
+        for name in ("horizon", "preview_stride"):
+            here, there = getattr(parameters, name), getattr(info, name)
+            if here != there:
+                raise ValueError(
+                    f"SafetyAssessment: {name} is {here}, but that of the episodes of "
+                    f"'{info.scenario}' is {there}"
+                )
         segments, has_target = segments_for(episodes, parameters)
+        self.info_ = info
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
         x = self._inputs(
             segments.state if parameters.is_sharpened else segments.true_state,
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, base_logit = learned_maps(
+        self.embedding_, base_logit, target = learned_maps(
             segments, has_target, x, self.grid_, parameters, progress
         )
-        self.info_ = info
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
         self.training_score_ = assessment_file.single(segments.score)
         self.training_cause_ = segments.cause
         self.base_logit_: BaseLogit | None = base_logit
-        self.training_heads_ = self.training_nearest_ = None
+        self.training_heads_ = self.training_nearest_ = self.training_target_ = None
+        if not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne":
+            self.training_target_ = target.astype(np.float32)
         if base_logit is not None:
             margins = output.margins.mean(axis=0)
             self.training_heads_ = assessment_file.single(base_logit.heads(output))
@@ -160,6 +165,7 @@ class SafetyAssessment:
             cause=self.training_cause_,
             heads=self.training_heads_,
             nearest=self.training_nearest_,
+            target=self.training_target_,
         )
 
     def adapt(
@@ -287,7 +293,7 @@ class SafetyAssessment:
     def _inputs(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        return inputs(state, desired_preview, features, self.parameters)
+        return inputs(state, desired_preview, features, self.info_, self.parameters)
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "beliefs_"):

@@ -14,7 +14,11 @@ from typing import Any
 import numpy as np
 
 from drake_safety.learning.adaptation import Adaptation
-from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
+from drake_safety.learning.assessment_parameters import (
+    AdaptationParameters,
+    AssessmentParameters,
+    PaperReading,
+)
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import num_inputs
@@ -24,7 +28,7 @@ from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 _MAPS, _CORRECTION = "embedding.", "correction."
 _TRAINING: dict[str, tuple[type, type]] = {
@@ -33,9 +37,10 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "training_cause": (np.int16, np.int64),
     "training_heads": (np.float32, float),
     "training_nearest": (np.int16, np.int64),
+    "training_target": (np.float32, np.float32),
 }
 """Arrays of the training segments: the type on disk and in memory."""
-_OF_HEADS = ("training_heads", "training_nearest")
+_OPTIONAL = ("training_heads", "training_nearest", "training_target")
 
 
 def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
@@ -112,7 +117,10 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             for name in ("parameters", "info", "adaptation", "numbers")
         }
         adaptation = AdaptationParameters(**entries["parameters"].pop("adaptation"))
-        parameters = AssessmentParameters(**entries["parameters"], adaptation=adaptation)
+        paper = PaperReading(**entries["parameters"].pop("paper"))
+        parameters = AssessmentParameters(
+            **entries["parameters"], paper=paper, adaptation=adaptation
+        )
         return parameters, _learned(parameters, entries, tensors)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
@@ -150,8 +158,10 @@ def _learned(
         "adaptation_": None if adaptation is None else Adaptation(**adaptation),
     }
     for name, (_, used) in _TRAINING.items():
-        is_optional = name in _OF_HEADS and base_logit is None
-        learned[f"{name}_"] = None if is_optional else tensors[name].astype(used)
+        is_absent = name in _OPTIONAL and name not in tensors
+        learned[f"{name}_"] = None if is_absent else tensors[name].astype(used)
+    if base_logit is not None and learned["training_heads_"] is None:
+        raise KeyError("training_heads")
     cells = (embedding.num_members, grid.num_cells)
     expected = {
         "beliefs": (*cells, 3 + len(info.constraint_names)),

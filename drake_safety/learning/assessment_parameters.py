@@ -2,15 +2,25 @@
 
 from dataclasses import dataclass, field
 
-from drake_safety.learning.distance import BACKENDS
+from drake_safety.learning.distance import BACKENDS, WARPING_COSTS
 
 MODES = ("paper", "sharpened")
+INITIALIZATIONS = ("spectral", "random")
+LOSSES = ("squared", "norm")
+PLACES = ("map", "tsne")
+COUNTS = ("cell", "segments", "pairs")
 
 
 def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
     if not holds:
         who, value = type(parameters).__name__, getattr(parameters, name)
         raise ValueError(f"{who}: {name} is {value}, expected {expected}")
+
+
+def _expect_sizes(parameters: object) -> None:
+    sizes: list[int] = getattr(parameters, "hidden_sizes")  # noqa: B009
+    is_valid = bool(sizes) and all(size >= 1 for size in sizes)
+    _expect(parameters, "hidden_sizes", is_valid, "one width >= 1 per layer")
 
 
 @dataclass(kw_only=True)
@@ -24,9 +34,14 @@ class AdaptationParameters:
         least_uncertainty: mu_min of nominal beliefs without discrepancy (paper).
         decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
-        update_interval: k_u, number of feedback sets between two updates.
-        counts_per_cell: Whether n_f in a feedback belief's uncertainty is the number of samples in
-            its cell, or literally the number of all feedback sets (paper).
+        update_interval: k_u, feedback between two updates: "The online adaptation process is
+            performed once every 40 feedback data".
+        update_unit: Unit of k_u: "segments", the paper's sets, or "pairs" of episodes.
+        count: n_f in a feedback belief's uncertainty (paper): segments in its "cell", or all
+            feedback ("a collection of feedback data with n_f sets") in "segments" or in "pairs".
+        discrepancy_at: Where the discrepancy of a training segment is predicted (paper): "map" at
+            Psi(x), or "tsne" at its point in t-SNE: "the predicted mean and standard deviation of
+            y^i". The function is learned at Psi(x) of the feedback.
         offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
         slope_std: The same for each of its slopes (sharpened).
         hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
@@ -38,7 +53,9 @@ class AdaptationParameters:
     decay_rate: float = 0.4
     first_uncertainty: float = 0.3
     update_interval: int = 40
-    counts_per_cell: bool = True
+    update_unit: str = "pairs"
+    count: str = "cell"
+    discrepancy_at: str = "map"
     offset_std: float = 2.0
     slope_std: float = 0.5
     hidden_std: float = 1.0
@@ -50,7 +67,58 @@ class AdaptationParameters:
             _expect(self, name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
             _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
+        units = COUNTS[1:]
+        _expect(self, "update_unit", self.update_unit in units, f"one of {list(units)}")
+        _expect(self, "count", self.count in COUNTS, f"one of {list(COUNTS)}")
+        _expect(self, "discrepancy_at", self.discrepancy_at in PLACES, f"one of {list(PLACES)}")
         _expect(self, "update_interval", self.update_interval >= 1, ">= 1")
+
+
+@dataclass(kw_only=True)
+class PaperReading:
+    """What the paper leaves open about its segments, its input x and its map Psi.
+
+    The defaults are the readings with the highest held-out accuracy on the robots; the table of
+    all of them is in docs/paper.md. Those about t-SNE and the grid are attributes of
+    `AssessmentParameters`, as both modes use them.
+
+    Attributes:
+        stride: Samples between the starts of segments; 0 means H, segments that do not overlap: "We
+            split the simulated trajectories into segments spanning a duration of H". Gamma is asked
+            at every k, for which overlapping segments are the training data.
+        velocities: Whether x has the velocities in the state. "The robot's state s_k consists of
+            its floating base and joints configurations"; a pushed robot and one at rest then differ
+            in nothing.
+        standardized: Whether every column of x is scaled to mean 0 and standard deviation 1. The
+            paper does not say; raw columns weigh as their spread in SI units.
+        loss: "squared", the mean of ||y - Psi(x)||^2, or "norm", literally "the cost function
+            ||y - Psi(x)||_2".
+        hidden_sizes: Widths of the layers of Psi, "a deep neural network".
+        dropout: Dropout rate.
+        weight_decay: Weight decay of AdamW.
+        epochs: Passes over the segments.
+        held_out: Share of episodes held out of the training of Psi. The weights of the epoch with
+            the lowest loss on them are kept; 0 keeps the last.
+    """
+
+    stride: int = 1
+    velocities: bool = True
+    standardized: bool = False
+    loss: str = "squared"
+    hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
+    dropout: float = 0.2
+    weight_decay: float = 0.01
+    epochs: int = 40
+    held_out: float = 0.0
+
+    def __post_init__(self) -> None:
+        _expect(self, "stride", self.stride >= 0, ">= 0")
+        _expect(self, "loss", self.loss in LOSSES, f"one of {list(LOSSES)}")
+        _expect_sizes(self)
+        _expect(self, "weight_decay", self.weight_decay >= 0.0, ">= 0")
+        _expect(self, "epochs", self.epochs >= 1, ">= 1")
+        for name in ("dropout", "held_out"):
+            _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
 
 
 @dataclass(kw_only=True)
@@ -60,14 +128,21 @@ class AssessmentParameters:
     discount, horizon, score_weight, initial_uncertainty and min_count default to the paper's
     Table I, resolution and cell_length to its text; the other defaults are our own.
 
-    The paper's mode has one plain map with two layers of 128, trained on segments that do not
-    overlap; it ignores the attributes marked "sharpened".
+    The paper's mode has one plain map, described by `paper`; it ignores the attributes marked
+    "sharpened".
 
     Attributes:
         mode: "sharpened" or "paper".
         discount: gamma of the unsafety score.
-        horizon: H [steps].
+        horizon: H, samples of the preview and of a segment.
+        preview_stride: Rows of an episode between two of them. The parameters of the paper's tasks
+            "are identical [...] except for the prediction horizon", so both have about the same
+            step.
         score_weight: delta, the weight of score differences in Omega.
+        warping_cost: Cost of a path of dynamic time warping, one of `WARPING_COSTS`. The paper
+            names "the dynamic time warping operator"; with the sum of squares its delta = 0.01
+            gives its "two clusters separated in a low-dimensional space", with the root it does
+            not.
         initial_uncertainty: mu_ini of nominal beliefs.
         min_count: k_min, beliefs below which a cell stays empty.
         resolution: Number of cells per side of the grid.
@@ -75,10 +150,14 @@ class AssessmentParameters:
         distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
             which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
+        exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE. A larger
+            one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
+        initialization: Initial points of t-SNE: "spectral", which keeps the global order, or
+            "random".
         seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments per training step.
-        epochs: Passes over the segments (sharpened; 40 in the paper's mode).
+        epochs: Passes over the segments (sharpened).
         ensemble_size: Number of maps K (sharpened).
         held_out: Share of held-out episodes. The base logit is fitted to maps trained without
             them; the final maps are trained on all episodes (sharpened).
@@ -94,23 +173,28 @@ class AssessmentParameters:
             one (sharpened). A small scale prevents overfitting to them if the features suffice.
         feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
             margins near zero [unit of the features]; 0 disables it (sharpened).
-        shortest_segment: Least number of steps of a safe episode's segment; 0 means the whole
+        shortest_segment: Least number of samples of a safe episode's segment; 0 means the whole
             horizon (sharpened). For episodes that end at rest.
         first_row_weight: Weight of an episode's first segment relative to the others (sharpened).
             First segments are few, but verdicts at planning time depend on them.
+        paper: Reading of the paper (paper).
         adaptation: Parameters of the adaptation.
     """
 
     mode: str = "sharpened"
     discount: float = 0.99
     horizon: int = 10
+    preview_stride: int = 1
     score_weight: float = 0.01
     initial_uncertainty: float = 0.3
     min_count: int = 5
     resolution: int = 14
     cell_length: float = 10.0
+    warping_cost: str = "squared"
     distance_backend: str = "dtaidistance"
     perplexity: float = 30.0
+    exaggeration: float = 4.0
+    initialization: str = "spectral"
     seed: int = 0
     learning_rate: float = 2e-3
     batch_size: int = 512
@@ -128,6 +212,7 @@ class AssessmentParameters:
     shortest_segment: int = 0
     raw_input_scale: float = 1.0
     feature_unit: float = 0.0
+    paper: PaperReading = field(default_factory=PaperReading)
     adaptation: AdaptationParameters = field(default_factory=AdaptationParameters)
 
     def __post_init__(self) -> None:
@@ -135,9 +220,12 @@ class AssessmentParameters:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
             )
-        _expect(
-            self, "distance_backend", self.distance_backend in BACKENDS, f"one of {list(BACKENDS)}"
-        )
+        for name, known in (
+            ("distance_backend", BACKENDS),
+            ("warping_cost", WARPING_COSTS),
+            ("initialization", INITIALIZATIONS),
+        ):
+            _expect(self, name, getattr(self, name) in known, f"one of {list(known)}")
         for name in ("discount", "initial_uncertainty"):
             _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in (
@@ -148,7 +236,15 @@ class AssessmentParameters:
             "feature_unit",
         ):
             _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
-        for name in ("horizon", "min_count", "resolution", "batch_size", "epochs", "ensemble_size"):
+        for name in (
+            "horizon",
+            "preview_stride",
+            "min_count",
+            "resolution",
+            "batch_size",
+            "epochs",
+            "ensemble_size",
+        ):
             _expect(self, name, getattr(self, name) >= 1, ">= 1")
         for name in (
             "cell_length",
@@ -164,15 +260,11 @@ class AssessmentParameters:
             0 <= self.shortest_segment <= self.horizon,
             "a value in 0..horizon",
         )
-        _expect(self, "perplexity", self.perplexity >= 1.0, ">= 1")
+        for name in ("perplexity", "exaggeration"):
+            _expect(self, name, getattr(self, name) >= 1.0, ">= 1")
         for name in ("dropout", "held_out"):
             _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
-        _expect(
-            self,
-            "hidden_sizes",
-            bool(self.hidden_sizes) and all(size >= 1 for size in self.hidden_sizes),
-            "one width >= 1 per layer",
-        )
+        _expect_sizes(self)
         _expect(
             self,
             "margin_range",
@@ -192,10 +284,10 @@ class AssessmentParameters:
 
     @property
     def stride(self) -> int:
-        """Rows between the starts of segments: one, or H in the paper's mode."""
-        return 1 if self.is_sharpened else self.horizon
+        """Rows between the starts of segments: one when sharpened."""
+        return 1 if self.is_sharpened else self.preview_stride * (self.paper.stride or self.horizon)
 
     @property
     def shortest(self) -> int:
-        """Least number of steps of a safe episode's segment."""
+        """Least number of samples of a safe episode's segment."""
         return (self.shortest_segment or self.horizon) if self.is_sharpened else self.horizon

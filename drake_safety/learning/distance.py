@@ -1,5 +1,9 @@
 """The safety distance Omega between segments, as a graph of nearest neighbours.
 
+The paper names "the dynamic time warping operator" without a definition. `WARPING_COSTS` are the
+definitions in use: the sum of squared distances along the warping path, its root (tslearn,
+dtaidistance), and the sum of distances (fastdtw).
+
 Two exact bounds make the graph cheap. The Euclidean distance of two error sequences, the shorter
 one held at its last value, is the cost of one admissible warping path and so bounds DTW from above;
 it gives each segment a radius that contains its neighbours. Sorted by that radius, a block of
@@ -11,10 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 BACKENDS = ("dtaidistance", "tslearn")
+WARPING_COSTS = ("squared", "rooted", "absolute")
+"""Cost of a warping path: sum ||.||^2, its square root, or sum ||.||."""
+
 _BLOCK = 512
 _SLACK = 1e-9
 
@@ -26,7 +34,8 @@ class NeighbourGraph:
     Attributes:
         indices: Neighbours, (N, k).
         distances: Omega to each neighbour, (N, k), dimensionless.
-        max_dtw: w_max, the largest DTW distance over all pairs [unit of the errors].
+        max_dtw: w_max, the largest DTW distance over all pairs [unit of the errors; its square for
+            the cost "squared"].
     """
 
     indices: np.ndarray
@@ -41,6 +50,7 @@ def neighbour_graph(
     *,
     score_weight: float,
     num_neighbours: int,
+    cost: str = "squared",
     backend: str = "dtaidistance",
     progress: Callable[[float], None] | None = None,
 ) -> NeighbourGraph:
@@ -53,19 +63,21 @@ def neighbour_graph(
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
-        backend: "dtaidistance", or "tslearn", which ignores the bounds.
+        cost: One of `WARPING_COSTS`.
+        backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
         progress: Called with the fraction done.
 
     Returns:
         The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
 
     Raises:
-        ValueError: Unknown backend, errors that are not finite, or too few segments.
+        ValueError: Unknown backend or cost, errors that are not finite, or too few segments.
     """
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"distance: unknown backend '{backend}'; the backends are {list(BACKENDS)}"
-        )
+    for name, value, known in (("backend", backend, BACKENDS), ("cost", cost, WARPING_COSTS)):
+        if value not in known:
+            raise ValueError(f"distance: unknown {name} '{value}'; it is one of {list(known)}")
+    if backend == "tslearn" and cost == "absolute":
+        raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
     error = np.asarray(error, dtype=float)
     score = np.asarray(score, dtype=float)
     num_segments = len(error)
@@ -78,10 +90,17 @@ def neighbour_graph(
         raise ValueError("neighbour_graph: the errors contain values that are not finite")
     series = _series(error, length)
     held = _hold_last(error, length)
-    max_dtw = _max_dtw(series, held, backend)
-    scale = 1.0 / max_dtw if max_dtw > 0.0 else 0.0
+    # Omega is 1 / w_max * DTW ** power; bounds and DTW itself are those without the power.
+    power = 2.0 if cost == "squared" else 1.0
+    # sum ||.|| over H pairs is at most sqrt(H) times the root of sum ||.||^2.
+    looseness = np.sqrt(error.shape[1]) if cost == "absolute" else 1.0
+    dtw = partial(_dtw_block, backend=backend, is_absolute=cost == "absolute")
+    largest = _max_dtw(series, held, dtw, looseness)
+    scale = largest**-power if largest > 0.0 else 0.0
     radius = np.empty(num_segments)
     for rows, bound in _euclidean_blocks(held):
+        bound *= looseness
+        bound **= power
         bound *= scale
         bound += score_weight * np.abs(score[rows, None] - score)
         bound[np.arange(len(bound)), np.arange(rows.start, rows.stop)] = np.inf
@@ -95,9 +114,10 @@ def neighbour_graph(
     indices = np.full((num_segments, num_neighbours), -1)
     for start in range(0, num_segments, _BLOCK):
         stop = min(start + _BLOCK, num_segments)
-        limit = radius[stop - 1] * max_dtw * (1.0 + _SLACK)
-        omega = _dtw_block(series, slice(0, stop), slice(start, stop), backend, limit)
+        limit = radius[stop - 1] ** (1.0 / power) * largest * (1.0 + _SLACK)
+        omega = dtw(series, slice(0, stop), slice(start, stop), limit=limit)
         # Omega^ij = w^ij / w_max + delta |lambda^i - lambda^j|
+        omega **= power
         omega *= scale
         omega += score_weight * np.abs(sorted_score[:stop, None] - sorted_score[start:stop])
         omega[np.arange(start, stop), np.arange(stop - start)] = np.inf
@@ -113,7 +133,9 @@ def neighbour_graph(
     result_indices, result_distances = np.empty_like(original), np.empty_like(distances)
     result_indices[order] = np.take_along_axis(original, rank, axis=1)
     result_distances[order] = np.take_along_axis(distances, rank, axis=1)
-    return NeighbourGraph(indices=result_indices, distances=result_distances, max_dtw=max_dtw)
+    return NeighbourGraph(
+        indices=result_indices, distances=result_distances, max_dtw=largest**power
+    )
 
 
 def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
@@ -130,9 +152,18 @@ def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 
 def _dtw_block(
-    series: list[np.ndarray], rows: slice, columns: slice, backend: str, limit: float = np.inf
+    series: list[np.ndarray],
+    rows: slice,
+    columns: slice,
+    *,
+    backend: str = BACKENDS[0],
+    is_absolute: bool = False,
+    limit: float = np.inf,
 ) -> np.ndarray:
-    """DTW of `rows` against `columns`, sqrt(sum ||.||^2); values above `limit` may be infinite."""
+    """DTW of `rows` against `columns`, sqrt(sum ||.||^2) or, if absolute, sum ||.||.
+
+    Values above `limit` may be infinite.
+    """
     if backend == "tslearn":
         from tslearn.metrics import cdist_dtw
         from tslearn.utils import to_time_series_dataset
@@ -148,6 +179,7 @@ def _dtw_block(
         max_dist=max(limit, np.finfo(float).tiny) if np.isfinite(limit) else None,
         compact=True,
         parallel=True,
+        inner_dist="euclidean" if is_absolute else "squared euclidean",
     )
     shape = (rows.stop - rows.start, columns.stop - columns.start)
     return np.frombuffer(distances, dtype=float).reshape(shape).copy()
@@ -166,14 +198,19 @@ def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
         yield rows, np.sqrt(block, out=block)
 
 
-def _max_dtw(series: list[np.ndarray], held: np.ndarray, backend: str) -> float:
-    """w_max over all pairs, with DTW only where the Euclidean bound exceeds the largest yet."""
+def _max_dtw(
+    series: list[np.ndarray],
+    held: np.ndarray,
+    dtw: Callable[..., np.ndarray],
+    looseness: float,
+) -> float:
+    """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
     by_size = np.argsort(-np.linalg.norm(held - held.mean(axis=0), axis=1), kind="stable")
     held = held[by_size] - held.mean(axis=0)
     first = [series[i] for i in by_size[:64]]
-    largest = float(_dtw_block(first, slice(0, len(first)), slice(0, len(first)), backend).max())
+    largest = float(dtw(first, slice(0, len(first)), slice(0, len(first))).max())
     for rows, bound in _euclidean_blocks(held):
-        is_open = bound > largest
+        is_open = looseness * bound > largest
         is_open[:, : rows.start] = False
         open_rows = rows.start + np.flatnonzero(is_open.any(axis=1))
         open_columns = np.flatnonzero(is_open.any(axis=0))
@@ -181,7 +218,7 @@ def _max_dtw(series: list[np.ndarray], held: np.ndarray, backend: str) -> float:
             chosen = open_columns[first_column : first_column + 8 * _BLOCK]
             pool = [series[by_size[i]] for i in (*open_rows, *chosen)]
             split = len(open_rows)
-            block = _dtw_block(pool, slice(0, split), slice(split, len(pool)), backend)
+            block = dtw(pool, slice(0, split), slice(split, len(pool)))
             largest = max(largest, float(block.max()))
     return largest
 

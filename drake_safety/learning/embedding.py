@@ -21,6 +21,8 @@ def tsne(
     graph: NeighbourGraph,
     *,
     perplexity: float,
+    exaggeration: float,
+    initialization: str,
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> np.ndarray:
@@ -28,6 +30,14 @@ def tsne(
 
     Distances are not squared here: openTSNE squares them. It runs on one thread, as more threads
     do not speed up the FFT of large sets.
+
+    Args:
+        graph: The neighbour graph.
+        perplexity: Effective number of neighbours.
+        exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
+        initialization: "spectral" or "random".
+        seed: Seed of the initial points.
+        progress: Called with the fraction done.
 
     Raises:
         ValueError: The graph has fewer than three times `perplexity` neighbours per segment.
@@ -39,6 +49,7 @@ def tsne(
             f"the graph has {num_neighbours}"
         )
     import openTSNE
+    from openTSNE import initialization as initial_points
     from openTSNE.affinity import PerplexityBasedNN
     from openTSNE.nearest_neighbors import PrecomputedNeighbors
 
@@ -59,8 +70,12 @@ def tsne(
             random_state=seed,
             n_jobs=1,
         )
+        is_random = initialization == "random"
         embedding = openTSNE.TSNE(
-            initialization="random",
+            initialization="random"
+            if is_random
+            else initial_points.spectral(affinities.P, random_state=seed),
+            exaggeration=exaggeration,
             random_state=seed,
             n_jobs=1,
             callbacks=report,
@@ -109,6 +124,7 @@ def train_map(
     parameters: AssessmentParameters,
     *,
     seed: int,
+    held_out: MapData | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Trains one map Psi, deterministically for a seed and a machine.
@@ -122,6 +138,8 @@ def train_map(
             nearly constant columns are not amplified.
         parameters: The assessment's parameters. A head whose weight is 0 is omitted.
         seed: Seed of the initial weights, the batches and the dropout.
+        held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
+            these inputs are kept instead of the last epoch's.
         progress: Called with the fraction done.
 
     Returns:
@@ -133,7 +151,7 @@ def train_map(
     # One thread is fastest for layers of this size.
     torch.set_num_threads(1)
     try:
-        return _train(torch, data, parameters, seed, progress)
+        return _train(torch, data, parameters, seed, held_out, progress)
     finally:
         torch.set_num_threads(num_threads)
 
@@ -143,11 +161,18 @@ def _train(
     data: MapData,
     parameters: AssessmentParameters,
     seed: int,
+    held_out: MapData | None,
     progress: Callable[[float], None] | None,
 ) -> dict[str, np.ndarray]:
+    reading = parameters.paper
     has_safety, has_margins = parameters.safety_weight > 0.0, parameters.margin_weight > 0.0
     mean = data.x.mean(axis=0)
     spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
+    weight_decay, has_norm = 1e-4, False
+    if not parameters.is_sharpened:
+        weight_decay, has_norm = reading.weight_decay, reading.loss == "norm"
+        if not reading.standardized:
+            spread = np.ones(len(mean))
     target_scale = float(data.target.std())
     num_inputs, num_margins = data.x.shape[1], data.margins.shape[1] if has_margins else 0
 
@@ -166,7 +191,7 @@ def _train(
         margins = torch.from_numpy(clipped.astype(np.float32))
         num_batches = -(-len(x) // parameters.batch_size)
         optimiser = torch.optim.AdamW(
-            net.parameters(), lr=parameters.learning_rate, weight_decay=1e-4, fused=True
+            net.parameters(), lr=parameters.learning_rate, weight_decay=weight_decay, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser,
@@ -176,15 +201,19 @@ def _train(
         functional = torch.nn.functional
         # The share of targets varies between batches, so the mean over the whole set normalises.
         mean_target_weight = float(target_weight.mean())
+        best = _BestWeights(torch, held_out, mean, spread, target_scale)
         for epoch in range(parameters.epochs):
             for batch in torch.randperm(len(x)).split(parameters.batch_size):
                 z = net["trunk"](x[batch])
                 output = net["output"](z)
                 y, w = output[:, :2], weight[batch]
-                squared = ((y - target[batch]) ** 2).sum(dim=1)
+                distance = ((y - target[batch]) ** 2).sum(dim=1)
+                if has_norm:
+                    # The offset keeps the gradient finite at distance zero.
+                    distance = torch.sqrt(distance + _SMALLEST_SPREAD**2)
                 loss = (
                     parameters.target_weight
-                    * (target_weight[batch] * squared).mean()
+                    * (target_weight[batch] * distance).mean()
                     / mean_target_weight
                 )
                 if has_safety:
@@ -200,9 +229,47 @@ def _train(
                 loss.backward()
                 optimiser.step()
                 schedule.step()
+            best.keep(net)
             if progress is not None:
                 progress((epoch + 1) / parameters.epochs)
+        best.restore(net)
     return _folded_weights(net, mean, spread, target_scale, num_margins, parameters)
+
+
+class _BestWeights:
+    """The weights of the epoch with the smallest mean distance on held-out inputs, if any."""
+
+    def __init__(
+        self,
+        torch: Any,
+        held_out: MapData | None,
+        mean: np.ndarray,
+        spread: np.ndarray,
+        target_scale: float,
+    ):
+        self._torch, self._is_used = torch, held_out is not None
+        self._loss = np.inf
+        self._weights: dict[str, Any] | None = None
+        if held_out is not None:
+            x = (held_out.x[held_out.has_target] - mean) / spread
+            self._x = torch.from_numpy(x.astype(np.float32))
+            self._target = torch.from_numpy((held_out.target / target_scale).astype(np.float32))
+
+    def keep(self, net: Any) -> None:
+        if not self._is_used:
+            return
+        net.eval()
+        with self._torch.no_grad():
+            y = net["output"](net["trunk"](self._x))[:, :2]
+            loss = float((y - self._target).norm(dim=1).mean())
+        net.train()
+        if loss < self._loss:
+            self._loss = loss
+            self._weights = {name: value.clone() for name, value in net.state_dict().items()}
+
+    def restore(self, net: Any) -> None:
+        if self._weights is not None:
+            net.load_state_dict(self._weights)
 
 
 def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:

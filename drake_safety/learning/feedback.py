@@ -34,8 +34,8 @@ class FeedbackSet:
         desired_preview: Desired outputs over the horizon, (N, H*n_z).
         features: Features, (N, n_f).
         steps_since_start: Rows from the episode's `first_step` to each start, (N,).
-        remaining_steps: R, steps until the actual episode ends, (N,).
-        nominal_remaining_steps: Steps until the twin ends, (N,); 0 after its end.
+        remaining_steps: Rows until the actual episode ends, (N,).
+        nominal_remaining_steps: Rows until the twin ends, (N,); 0 after its end.
         twin_state: Measured state at the twin's first row, (n_s,).
         twin_desired_preview: Desired preview at the twin's first row, (H*n_z,).
         twin_features: Features at the twin's first row, (n_f,).
@@ -132,7 +132,15 @@ def feedback_sets(
 
 
 def _check_same_task(actual: EpisodesInfo, nominal: EpisodesInfo) -> None:
-    for name in ("scenario", "step_s", "horizon", "state_names", "output_names", "feature_names"):
+    for name in (
+        "scenario",
+        "step_s",
+        "horizon",
+        "preview_stride",
+        "state_names",
+        "output_names",
+        "feature_names",
+    ):
         here, there = getattr(actual, name), getattr(nominal, name)
         if here != there:
             raise ValueError(
@@ -159,6 +167,7 @@ def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> No
                 "scenario",
                 "step_s",
                 "horizon",
+                "preview_stride",
                 "constraint_names",
                 "state_names",
                 "output_names",
@@ -230,7 +239,7 @@ def segments_of(
     Args:
         feedback: The feedback sets.
         stride: Rows between two starts.
-        shortest: Least number of steps of a safe episode's segment.
+        shortest: Least number of samples of a safe episode's segment.
         discount: gamma of the unsafety score.
         plain: Whether to use the state without noise for "actual" episodes of the nominal plant, as
             in training in the paper's mode.
@@ -240,9 +249,13 @@ def segments_of(
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in FeedbackSegments.__annotations__}
     for position, one in enumerate(feedback):
+        sample = one.info.preview_stride
         is_taken = one.steps_since_start % stride == 0
-        if not one.is_unsafe:
-            is_taken &= one.remaining_steps >= shortest
+        left = one.remaining_steps
+        if one.is_unsafe:
+            # As in training, an unsafe episode has segments only where a complete one has them.
+            left = np.maximum(left, one.info.num_steps - one.steps_since_start)
+        is_taken &= left >= shortest * sample
         rows = np.flatnonzero(is_taken)
         is_unsafe = np.full(rows.size, one.is_unsafe)
         nominal_is_unsafe = np.full(rows.size, one.nominal_is_unsafe)
@@ -252,9 +265,9 @@ def segments_of(
             "state": state[rows],
             "desired_preview": one.desired_preview[rows],
             "features": one.features[rows],
-            "score": unsafety_score(one.remaining_steps[rows], is_unsafe, discount),
+            "score": unsafety_score(one.remaining_steps[rows] / sample, is_unsafe, discount),
             "nominal_score": unsafety_score(
-                one.nominal_remaining_steps[rows], nominal_is_unsafe, discount
+                one.nominal_remaining_steps[rows] / sample, nominal_is_unsafe, discount
             ),
             "is_unsafe": is_unsafe,
             "nominal_is_unsafe": nominal_is_unsafe,
@@ -266,6 +279,6 @@ def segments_of(
     if not len(segments):
         raise ValueError(
             f"feedback of '{feedback[0].info.scenario}': none of {len(feedback)} sets has a "
-            f"segment of {shortest} steps"
+            f"segment of {shortest} samples"
         )
     return segments

@@ -53,15 +53,16 @@ class EpisodesInfo:
         scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
         variation: The simulated plant variation, e.g. "nominal" or "actual".
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
-        step_s: Time between two rows of an episode, the assessment step [s].
-        horizon: The safety assessment horizon H [steps].
+        step_s: Time between two rows of an episode [s].
+        horizon: The safety assessment horizon H [samples of the preview].
         constraint_names: The n_c safety constraints: the columns of `margins` and the possible
             causes.
         state_names: Names of the n_s columns of `state`.
         output_names: Names of the n_z columns of `output`.
         feature_names: Names of the n_f columns of `features`.
         versions: Package versions at the time of the simulation.
-        num_steps: T, steps of a complete episode; 0 if unknown.
+        num_steps: T, rows after the first one of a complete episode; 0 if unknown.
+        preview_stride: Rows between two of the H samples of a preview or a segment.
         code: SHA-256 of the simulating source code; "" if unknown.
     """
 
@@ -78,6 +79,7 @@ class EpisodesInfo:
     versions: dict[str, str]
     num_steps: int = 0
     code: str = ""
+    preview_stride: int = 1
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
@@ -88,6 +90,17 @@ class EpisodesInfo:
             raise ValueError(
                 f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0"
             )
+
+        if self.preview_stride < 1:
+            raise ValueError(
+                f"episodes of '{self.scenario}': preview_stride is {self.preview_stride}, "
+                "expected >= 1"
+            )
+
+    @property
+    def preview_step_s(self) -> float:
+        """Time between two samples of a preview, the paper's step [s]."""
+        return self.preview_stride * self.step_s
 
     @property
     def widths(self) -> dict[str, int]:
@@ -235,7 +248,7 @@ class Segments:
         episode: Position of the episode in its set, (N,).
         start_row: Row of the episode at which the segment starts, (N,).
         is_first: Whether the segment starts at its episode's `first_step`, (N,).
-        remaining_steps: R, steps until the episode ends, (N,).
+        remaining_steps: Rows until the episode ends, (N,).
         is_unsafe: Whether the episode ended unsafely, (N,).
         score: Unsafety score lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
@@ -278,8 +291,9 @@ def split(
 ) -> Segments:
     """Splits episodes into segments of the assessment horizon H.
 
-    Segments start where at least ``shortest`` steps of a complete episode are left; less than the
-    horizon suffices if the robot is at rest after the episode's end. The rule is the same for both
+    A segment's H samples are ``preview_stride`` rows apart, and so are the steps of R. Segments
+    start where at least ``shortest`` samples of a complete episode are left; less than the horizon
+    suffices if the robot is at rest after the episode's end. The rule is the same for both
     labels, so that a segment's start row carries no information about its label. Segments that
     reach beyond the end are cut short and keep the terminal sample. Diverged episodes are skipped.
 
@@ -287,7 +301,7 @@ def split(
         episodes: The episodes; H is `episodes.info.horizon`.
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
-        shortest: Least number of steps left of a complete episode; H by default.
+        shortest: Least number of samples left of a complete episode; H by default.
 
     Raises:
         ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
@@ -299,7 +313,8 @@ def split(
     shortest = horizon if shortest is None else shortest
     if not 1 <= shortest <= horizon:
         raise ValueError(f"split: shortest is {shortest}, expected 1..{horizon}")
-    offsets = np.arange(horizon)
+    sample = episodes.info.preview_stride
+    offsets = sample * np.arange(horizon)
     names = episodes.info.constraint_names
     pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
     # If T is unknown, the longest episode is taken as complete.
@@ -309,7 +324,7 @@ def split(
             continue
         num_steps = episode.num_steps
         # A safe episode may be shorter than T, as a part of a robot's log is.
-        end = min(num_steps, (num_steps if episode.is_safe else whole) - shortest + 1)
+        end = min(num_steps, (num_steps if episode.is_safe else whole) - sample * shortest + 1)
         rows = np.arange(episode.first_step, end, stride)
         if rows.size == 0:
             continue
@@ -322,7 +337,7 @@ def split(
             "is_first": rows == episode.first_step,
             "remaining_steps": remaining,
             "is_unsafe": is_unsafe,
-            "score": unsafety_score(remaining, is_unsafe, discount),
+            "score": unsafety_score(remaining / sample, is_unsafe, discount),
             "cause": np.full(rows.size, -1 if episode.is_safe else names.index(episode.cause)),
             "state": episode.state[rows],
             "true_state": episode.true_state[rows],
@@ -330,13 +345,13 @@ def split(
             "features": episode.features[rows],
             "future_margins": np.minimum.accumulate(episode.margins[::-1], axis=0)[::-1][rows],
             "error": error[np.minimum(rows[:, None] + offsets, num_steps)],
-            "length": np.minimum(horizon, remaining + 1),
+            "length": np.minimum(horizon, remaining // sample + 1),
         }
         for name, values in piece.items():
             pieces[name].append(values)
     if not pieces["score"]:
         raise ValueError(
             f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives "
-            f"a segment of {shortest} steps ({episodes.num_diverged} diverged)"
+            f"a segment of {shortest} samples ({episodes.num_diverged} diverged)"
         )
     return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})

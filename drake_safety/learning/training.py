@@ -47,7 +47,7 @@ def segments_for(
         discount=parameters.discount,
         shortest=parameters.shortest,
     )
-    every = max(horizon // 2, 1) if is_sharpened else 1
+    every = max(horizon // 2, 1) * parameters.preview_stride if is_sharpened else 1
     first = np.array([episode.first_step for episode in episodes])[segments.episode]
     has_target = (segments.start_row - first) % every == 0
     num_targeted, num_neighbours = int(has_target.sum()), int(3 * parameters.perplexity)
@@ -74,7 +74,7 @@ def learned_maps(
     grid: Grid,
     parameters: AssessmentParameters,
     progress: StageProgress | None,
-) -> tuple[Embedding, BaseLogit | None]:
+) -> tuple[Embedding, BaseLogit | None, np.ndarray]:
     """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
@@ -86,7 +86,8 @@ def learned_maps(
         progress: Called with "distances", "t-SNE", "training" and the fraction done.
 
     Returns:
-        The maps, and the base logit of their heads; None without heads.
+        The maps, the base logit of their heads, None without heads, and t-SNE's points scaled to
+        the grid, (M, 2).
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
@@ -98,6 +99,7 @@ def learned_maps(
         targeted.length,
         targeted.score,
         score_weight=parameters.score_weight,
+        cost=parameters.warping_cost,
         num_neighbours=int(3 * parameters.perplexity),
         backend=parameters.distance_backend,
         progress=stage("distances"),
@@ -105,6 +107,8 @@ def learned_maps(
     points = tsne(
         graph,
         perplexity=parameters.perplexity,
+        exaggeration=parameters.exaggeration,
+        initialization=parameters.initialization,
         seed=parameters.seed,
         progress=stage("t-SNE"),
     )
@@ -120,7 +124,10 @@ def learned_maps(
     is_held_out = held_out_segments(segments, parameters)
     label = segments.is_unsafe[is_held_out]
     report = stage("training")
-    if not parameters.is_sharpened or not 0 < label.sum() < len(label):
+    if not parameters.is_sharpened:
+        held_out = data.take(is_held_out) if is_held_out.any() else None
+        return _train(data.take(~is_held_out), parameters, report, held_out), None, data.target
+    if not 0 < label.sum() < len(label):
         # No held-out episodes of both labels.
         embedding = _train(data, parameters, report)
         tried, is_held_out = embedding, np.ones(len(segments), dtype=bool)
@@ -130,10 +137,11 @@ def learned_maps(
         tried = _train(data.take(~is_held_out), parameters, _part(report, 0))
         embedding = _train(data, parameters, _part(report, 1))
     if not embedding.has_heads:
-        return embedding, None
-    return embedding, fitted_base_logit(
+        return embedding, None, data.target
+    base_logit = fitted_base_logit(
         tried.evaluate(x[is_held_out]), segments.take(is_held_out), parameters
     )
+    return embedding, base_logit, data.target
 
 
 def _part(progress: Callable[[float], None] | None, half: int) -> Callable[[float], None] | None:
@@ -142,20 +150,23 @@ def _part(progress: Callable[[float], None] | None, half: int) -> Callable[[floa
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Returns which segments are held out for the base logit, (N,), by whole episodes.
+    """Returns which segments are held out, (N,), by whole episodes.
 
-    The base logit is a function of the ensemble's mean, so all maps hold out the same episodes.
+    They are held out for the base logit, a function of the ensemble's mean, so all maps hold out
+    the same episodes; in the paper's mode for early stopping.
 
     Args:
         segments: The training segments.
         parameters: The assessment's parameters.
     """
     episodes = np.unique(segments.episode)
-    share = min(parameters.held_out, 0.5) if parameters.is_sharpened else 0.0
+    share = parameters.held_out if parameters.is_sharpened else parameters.paper.held_out
     rng = np.random.default_rng(
         np.random.SeedSequence(parameters.seed, spawn_key=(parameters.num_members,))
     )
-    return np.isin(segments.episode, rng.permutation(episodes)[: int(share * len(episodes))])
+    return np.isin(
+        segments.episode, rng.permutation(episodes)[: int(min(share, 0.5) * len(episodes))]
+    )
 
 
 def _sample_weight(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
@@ -179,13 +190,15 @@ def _train(
     data: MapData,
     parameters: AssessmentParameters,
     progress: Callable[[float], None] | None,
+    held_out: MapData | None = None,
 ) -> Embedding:
     if not parameters.is_sharpened:
+        reading = parameters.paper
         parameters = replace(
             parameters,
-            hidden_sizes=[128, 128],
-            dropout=0.0,
-            epochs=40,
+            hidden_sizes=reading.hidden_sizes,
+            dropout=reading.dropout,
+            epochs=reading.epochs,
             target_weight=1.0,
             safety_weight=0.0,
             margin_weight=0.0,
@@ -201,7 +214,7 @@ def _train(
         seed = int(
             np.random.SeedSequence(parameters.seed, spawn_key=(member,)).generate_state(1)[0]
         )
-        members.append(train_map(data, parameters, seed=seed, progress=report))
+        members.append(train_map(data, parameters, seed=seed, held_out=held_out, progress=report))
     num_margins = data.margins.shape[1] if parameters.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
     return _fill_grid(embedding, data) if parameters.is_sharpened else embedding

@@ -79,7 +79,8 @@ def _cut(
 ) -> list[tuple[Episode, EpisodeStart]]:
     """Episodes and starts of one log with z* in the world, (N, n_z) [m]."""
     scenario = loop.scenario
-    shortest = scenario.assessment.shortest_segment or scenario.assessment.horizon
+    assessment = scenario.assessment
+    shortest = assessment.preview_stride * (assessment.shortest_segment or assessment.horizon)
     context = loop.CreateDefaultContext()
     found: list[tuple[Episode, EpisodeStart]] = []
     begin_s = 0.0
@@ -140,7 +141,9 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
         feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
     scenario = loop.scenario
     # Previews and outlooks of the longest episode end before.
-    reach_s = 2 * scenario.episode_duration_s + scenario.assessment.horizon * scenario.step_s
+    reach_s = (
+        2 * scenario.episode_duration_s + scenario.assessment.horizon * scenario.preview_step_s
+    )
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
     start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)

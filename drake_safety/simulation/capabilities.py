@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_safety.control.observation import is_rate
+from drake_safety.learning.inputs import is_rate
 from drake_safety.simulation.planned_loop import PlannedLoop
 
 if TYPE_CHECKING:
@@ -229,6 +229,11 @@ def require(loop: object, capability: type[_Capability], who: str = "") -> _Capa
 def judging_options(task: type) -> dict[str, Any]:
     """Options of a task's diagram for evaluation, if they differ from those of training."""
     return dict(task.judging_options) if issubclass(task, PlannedLoop) else {}
+
+
+def paper_options(task: type) -> dict[str, Any]:
+    """Options of a task's diagram for training episodes of the paper's mode."""
+    return dict(task.paper_options) if issubclass(task, PlannedLoop) else {}
 
 
 def pairing_options(scenario: Any, variation: str) -> dict[str, Any]:

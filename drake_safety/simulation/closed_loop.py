@@ -49,7 +49,11 @@ class LoopScenario(Protocol):
 
     @property
     def num_steps(self) -> int:
-        """Assessment steps of a whole episode."""
+        """Rows after the first one of a whole episode."""
+
+    @property
+    def preview_step_s(self) -> float:
+        """Time between two samples of the preview [s]."""
 
     def variation(self, name: str) -> PlantVariation:
         """A plant variation by name."""
@@ -195,6 +199,7 @@ class ClosedLoop(FloatSystem, Diagram):
         sides = {
             "scenario": (info.scenario, scenario.name),
             "horizon": (info.horizon, scenario.assessment.horizon),
+            "preview_stride": (info.preview_stride, scenario.assessment.preview_stride),
             "step_s": (info.step_s, scenario.step_s),
             "state": (list(info.state_names), list(self.state_names)),
             "output": (list(info.output_names), list(self.output_names)),

@@ -146,7 +146,9 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     num_outputs = len(loop.output_names)
     # The first sample of a preview is that of its own row; the last preview reaches beyond.
     plan = np.concatenate([preview[:-1, :num_outputs], preview[-1].reshape(-1, num_outputs)])
-    times = loop.scenario.step_s * np.arange(len(plan))
+    scenario, num_rows = loop.scenario, len(preview) - 1
+    ahead_s = scenario.preview_step_s * np.arange(scenario.assessment.horizon)
+    times = np.append(scenario.step_s * np.arange(num_rows), scenario.step_s * num_rows + ahead_s)
     q, v = np.split(window.plant_state, [require(loop, CanStartAnywhere).plant_state_sizes[0]])
     return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.observation import is_rate
+from drake_safety.learning.inputs import is_rate
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop, LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -35,12 +35,15 @@ class PlannedLoop(ClosedLoop):
     Attributes:
         angular_constraints: Constraints whose margins are angles [rad]; the others are lengths [m].
         judging_options: Options of the diagram for evaluation, if they differ from training's.
+        paper_options: Options of the diagram for training episodes of the paper's mode, which has
+            no disturbances but the offsets of the initial state.
         monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         plant_state_sizes: n_q and n_v.
     """
 
     angular_constraints: tuple[str, ...] = ()
     judging_options: Mapping[str, Any] = MappingProxyType({})
+    paper_options: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
@@ -83,7 +86,7 @@ class PlannedLoop(ClosedLoop):
             "trajectory_planner",
             TrajectoryPlanner(
                 horizon=scenario.assessment.horizon,
-                step_s=scenario.step_s,
+                step_s=scenario.preview_step_s,
                 outlook_s=outlook_s,
                 num_outlook=num_outlook,
             ),

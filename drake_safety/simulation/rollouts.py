@@ -84,6 +84,7 @@ def episodes_info(
         versions=installed_versions("drake", "numpy", loop.variation.engine),
         num_steps=scenario.num_steps,
         code=scenario.code_digest(),
+        preview_stride=scenario.assessment.preview_stride,
     )
 
 

@@ -35,6 +35,9 @@ class StartSampling:
     """Of the base, along x, y and z."""
     angular_velocity_std_rad_s: float = 0.4
     joint_std_rad: float = 0.02
+    tracking_offset_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Of the base from the plan's start, along x, y and z: the initial tracking error. "We also add
+    a random offset to the initial state to simulate the disturbances" (paper)."""
     target_offset_m: list[float] = field(default_factory=lambda: [0.20, 0.11])
     """Where the plan ends, along x and along y of the stance frame."""
     target_height_m: list[float] = field(default_factory=lambda: [0.34, 0.46])
@@ -45,7 +48,12 @@ class StartSampling:
     def __post_init__(self) -> None:
         for name in ("base_height_m", "target_height_m", "plan_duration_s"):
             _check_range("start", name, getattr(self, name))
-        for name, size in (("base_offset_m", 2), ("velocity_std_m_s", 3), ("target_offset_m", 2)):
+        for name, size in (
+            ("base_offset_m", 2),
+            ("velocity_std_m_s", 3),
+            ("tracking_offset_m", 3),
+            ("target_offset_m", 2),
+        ):
             _check_size("start", name, getattr(self, name), size)
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
@@ -58,7 +66,10 @@ class StartSampling:
             _between(rng, self.base_height_m),
         )
         rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
-        X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start)
+        error = np.asarray(self.tracking_offset_m)
+        if error.any():
+            error = error * rng.uniform(-1, 1, 3)
+        X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start + error)
         joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
         w_WB = rng.normal(size=3) * self.angular_velocity_std_rad_s
         v_WB = rng.normal(size=3) * self.velocity_std_m_s

@@ -42,7 +42,8 @@ class Scenario:
     episode_duration_s: float = 2.0
     """T [s]."""
     step_s: float = 0.04
-    """Time between two assessment inputs, the unit of H [s]."""
+    """Time between two rows of an episode [s]; the assessment's ``preview_stride`` rows are the
+    paper's step, the unit of H."""
     time_step_s: float = 0.0025
     """Step of the discrete plant [s]."""
     control_period_s: float = 0.01
@@ -60,15 +61,21 @@ class Scenario:
                 raise ValueError(
                     f"scenario '{self.name}': {name} must be positive; got {getattr(self, name)}"
                 )
-        if self.assessment.horizon > self.num_steps:
+        if self.assessment.horizon * self.assessment.preview_stride > self.num_steps:
             raise ValueError(
                 f"scenario '{self.name}': the assessment horizon of {self.assessment.horizon} "
-                f"steps of {self.step_s} s exceeds the episode of {self.episode_duration_s} s"
+                f"steps of {self.preview_step_s:g} s exceeds the episode of "
+                f"{self.episode_duration_s} s"
             )
 
     @property
+    def preview_step_s(self) -> float:
+        """Time between two samples of the preview [s]."""
+        return self.assessment.preview_stride * self.step_s
+
+    @property
     def num_steps(self) -> int:
-        """Assessment steps of a whole episode."""
+        """Rows after the first one of a whole episode."""
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
@@ -124,9 +131,9 @@ class Scenario:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
         Defaults are included, so that episodes from before and after a change of one do not mix.
-        The assessment's parameters except the horizon, the task's online parameters and the other
-        variations are left out: episodes stay valid when only these change. Source code is covered
-        by :meth:`code_digest`.
+        The assessment's parameters except those of the preview, the task's online parameters and
+        the other variations are left out: episodes stay valid when only these change. Source code
+        is covered by :meth:`code_digest`.
 
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
@@ -138,7 +145,9 @@ class Scenario:
         if variation != "nominal":
             self.variation(variation)
         text = yaml.safe_load(self.to_yaml())
-        text["assessment"] = {"horizon": self.assessment.horizon}
+        text["assessment"] = {
+            name: getattr(self.assessment, name) for name in ("horizon", "preview_stride")
+        }
         text["variations"] = {
             name: text["variations"][name]
             for name in ("nominal", variation)

@@ -98,10 +98,10 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
         capacity: int = 400,
     ):
         super().__init__()
-        if num_steps < info.horizon:
+        if num_steps < info.horizon * info.preview_stride:
             raise ValueError(
                 f"feedback recorder: num_steps is {num_steps}, expected at least the horizon of "
-                f"{info.horizon}"
+                f"{info.horizon * info.preview_stride} steps"
             )
         if capacity < 1:
             raise ValueError(f"feedback recorder: capacity is {capacity}, expected >= 1")

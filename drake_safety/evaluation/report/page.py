@@ -298,7 +298,7 @@ def _map(
         "resolution": assessment.grid_.resolution,
         "min_count": assessment.parameters.min_count,
         "num_members": assessment.beliefs_.shape[0],
-        "horizon_s": info.horizon * info.step_s,
+        "horizon_s": info.horizon * info.preview_step_s,
         "causes": [spoken(name) for name in info.constraint_names],
         "colours": cause_colours(len(info.constraint_names)),
         "units": ["°" if name in angular_constraints else "cm" for name in info.constraint_names],

@@ -1,0 +1,191 @@
+"""``python -m studies converged``: the paper's mode judged as the paper judges."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    console,
+    new_table,
+    open_stages,
+    print_path,
+    versions,
+)
+from drake_safety.cli.training_folder import (
+    check_fresh,
+    feedback_folder,
+    load_assessment,
+    run_fresh_episodes,
+)
+from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
+from drake_safety.evaluation.plan_study import PROMISED_UNSAFE_RECALL
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import score_threshold
+from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.seeds import ADAPTATION, EVALUATION
+from drake_safety.learning.segments import Episodes, split
+from drake_safety.simulation.capabilities import HasGoals, is_fair
+from drake_safety.simulation.feedback import run_pairs
+from drake_safety.simulation.scenario import load_scenario
+from studies import command_line
+
+CONVERGED_FILE = "converged.json"
+
+
+def converged(
+    scenario: ScenarioArgument,
+    assessment: TrainingOption,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other ones, for thresholds and as nominal feedback.", min=20)
+    ] = 300,
+    throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
+    pairs: Annotated[
+        int, typer.Option(help="Pairs of the actual plant, the feedback before throws.", min=0)
+    ] = 160,
+    seed: Annotated[int, typer.Option(help="First seed of the fresh ones.")] = EVALUATION.first,
+    workers: WorkersOption = None,
+) -> None:
+    """Evaluate the paper's mode at its threshold 0.6, before and after its adaptation.
+
+    Nominal episodes are judged after feedback from other nominal episodes, throws at the actual
+    plant after feedback from it. Writes ASSESSMENT/converged.json.
+    """
+    loaded = load_scenario(scenario)
+    loop = loaded.make_loop()
+    prior = load_assessment(assessment, "paper")
+    seeds = EVALUATION.seeds(seed)
+    check_fresh(prior, loaded, seeds.values())
+    with open_stages() as stages:
+        test, other = (
+            run_fresh_episodes(
+                loaded, assessment, count, seeds[purpose], partial(stages, purpose), workers
+            )
+            for purpose, count in (("evaluation", episodes), ("thresholds", calibration_episodes))
+        )
+        rules = judged_rules(prior, prior.adapt(nominal_feedback(prior, other), method="paper"))
+        fair = np.array([isinstance(loop, HasGoals) and is_fair(loop, one) for one in test])
+        estimates = recalls(rules, other, test, fair)
+        if throws:
+            run = run_pairs(
+                loaded,
+                pairs,
+                seed=ADAPTATION.first,
+                num_workers=workers,
+                path=feedback_folder(
+                    assessment, loaded.simulation_hash("actual"), ADAPTATION.first
+                ),
+                progress=partial(stages, "pairs"),
+            )
+            adapted = prior.adapt(run.feedback(), method="paper")
+            literal = {"before": prior, "converged": adapted}
+            study = evaluate_throws(
+                loaded,
+                [
+                    TriggerRule(
+                        name=name,
+                        scorer=assessment_scorer(name, one, "safety_probability"),
+                        threshold=PAPER_THRESHOLD,
+                    )
+                    for name, one in literal.items()
+                ],
+                num_throws=throws,
+                num_calibration=0,
+                seed=seeds["disturbances"],
+                calibration_seed=seeds["disturbance thresholds"],
+                num_workers=workers,
+                progress=stages,
+            )
+            estimates |= study.estimates
+    report = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "seed": seed,
+        "training_episodes": prior.used_[0].num_episodes,
+        "feedback_episodes": calibration_episodes,
+        "feedback_pairs": pairs,
+        "versions": versions(),
+        **{f"converged.{key}": estimate.to_json() for key, estimate in estimates.items()},
+    }
+    file = assessment / CONVERGED_FILE
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    table = new_table("figure", "value", "interval", "n")
+    for key, one in estimates.items():
+        table.add_row(key, f"{one.value:.3f}", f"{one.low:.3f} to {one.high:.3f}", f"{one.n}")
+    console.print(table)
+    print_path("figures", file)
+
+
+def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[FeedbackSet]:
+    """Feedback of a robot without a reality gap: nominal episodes are their own twins."""
+    info = replace(episodes.info, scenario_hash=assessment.info_.scenario_hash)
+    twins = Episodes(info, list(episodes))
+    return feedback_sets(twins, twins)
+
+
+def judged_rules(
+    prior: SafetyAssessment, adapted: SafetyAssessment
+) -> dict[str, tuple[Scorer, float | str]]:
+    """Scorers by name, each with its threshold on Γ or the way to choose it.
+
+    Args:
+        prior: The assessment before feedback.
+        adapted: The same after it.
+    """
+    literal, normalized = "safety_probability", "normalized"
+    return {
+        "literal": (assessment_scorer("literal", prior, literal), PAPER_THRESHOLD),
+        "converged": (assessment_scorer("converged", adapted, literal), PAPER_THRESHOLD),
+        "normalized": (assessment_scorer("normalized", prior, normalized), "balanced"),
+        "conformal": (assessment_scorer("conformal", prior, normalized), "promised"),
+    }
+
+
+def recalls(
+    rules: dict[str, tuple[Scorer, float | str]],
+    calibration: Episodes,
+    test: Episodes,
+    fair: np.ndarray,
+) -> dict[str, Estimate]:
+    """Recalls and AUC on every segment, on first rows, and on first rows of fair episodes.
+
+    Args:
+        rules: See `judged_rules`.
+        calibration: Episodes for thresholds.
+        test: Other episodes.
+        fair: Whether each of these is fair, (N,); no row is judged apart without any.
+    """
+    segments, seen = (split(one, stride=1, discount=1.0) for one in (test, calibration))
+    kinds = {
+        "segments": (np.ones(len(segments), dtype=bool), np.ones(len(seen), dtype=bool)),
+        "first": (segments.is_first, seen.is_first),
+    }
+    if fair.any():
+        kinds["fair"] = (segments.is_first & fair[segments.episode], seen.is_first)
+    estimates: dict[str, Estimate] = {}
+    for name, (scorer, way) in rules.items():
+        score, seen_score = scorer.unsafe_score(segments), scorer.unsafe_score(seen)
+        for kind, (rows, seen_rows) in kinds.items():
+            seen_label = seen.is_unsafe[seen_rows]
+            if way == "balanced":
+                threshold = threshold_at(seen_score[seen_rows], seen_label)
+            elif way == "promised":
+                miss_rate = 1.0 - PROMISED_UNSAFE_RECALL
+                threshold = score_threshold(seen_score[seen_rows], seen_label, miss_rate)
+            else:
+                threshold = 1.0 - float(way)
+            found = segment_estimates(segments.take(rows), score[rows], threshold=threshold)
+            found["threshold"] = Estimate.exact(1.0 - threshold, int(seen_rows.sum()))
+            estimates |= {f"{kind}.{name}.{key}": estimate for key, estimate in found.items()}
+    return estimates

@@ -1,0 +1,262 @@
+"""``python -m studies readings``: what each reading of the paper costs or gains."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    console,
+    new_table,
+    open_stages,
+    print_path,
+    versions,
+)
+from drake_safety.cli.training_folder import episodes_folder, run_fresh_episodes
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.seeds import EVALUATION
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.capabilities import judging_options, paper_options
+from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from studies import command_line
+from studies.converged import judged_rules, nominal_feedback, recalls
+from studies.learning_curve import parse_sizes
+
+READINGS_FILE = "readings.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """One way to read the paper: what differs from the package's default reading.
+
+    Attributes:
+        name: Its name in tables.
+        assessment: Changed parameters of the assessment; those of `paper` have the prefix
+            "paper.".
+        start: Changed parameters of the start's sampling; the reading has episodes of its own.
+        is_exploring: Whether it learns from the sharpened mode's episodes.
+        num_episodes: Number of training episodes; 0 for the study's.
+    """
+
+    name: str
+    assessment: Mapping[str, Any] = field(default_factory=dict)
+    start: Mapping[str, Any] = field(default_factory=dict)
+    is_exploring: bool = False
+    num_episodes: int = 0
+
+    def parameters(self, base: AssessmentParameters) -> AssessmentParameters:
+        """The parameters of this reading."""
+        own = {k: v for k, v in self.assessment.items() if not k.startswith("paper.")}
+        paper = {k.removeprefix("paper."): v for k, v in self.assessment.items() if k not in own}
+        return replace(copy.deepcopy(base), mode="paper", paper=replace(base.paper, **paper), **own)
+
+    def has_own_episodes(self, base: AssessmentParameters) -> bool:
+        """Whether its episodes are simulated anew."""
+        stride = self.assessment.get("preview_stride", base.preview_stride)
+        return bool(self.start) or stride != base.preview_stride
+
+    def scenario(self, base: Scenario) -> Scenario:
+        """The scenario of its episodes."""
+        changed = copy.deepcopy(base)
+        changed.assessment = self.parameters(base.assessment)
+        for name, value in self.start.items():
+            setattr(changed.parameters.start, name, value)
+        return changed
+
+
+def readings_of(scenario: Scenario) -> list[Reading]:
+    """The default reading, each other reading alone, and the former ones together.
+
+    Args:
+        scenario: The scenario; a reading that it has already is left out.
+    """
+    base = scenario.assessment
+    rooted = {"warping_cost": "rooted"}
+    plain = {"exaggeration": 1.0}
+    bare = {"paper.dropout": 0.0, "paper.weight_decay": 1e-4}
+    former = {
+        **rooted,
+        **plain,
+        **bare,
+        "initialization": "random",
+        "paper.stride": 0,
+        "paper.standardized": True,
+    }
+    singles = [
+        Reading(name="default"),
+        Reading(name="path cost: root of the sum of squares", assessment=rooted),
+        Reading(name="path cost: sum of distances", assessment={"warping_cost": "absolute"}),
+        Reading(name="root, score weight 0.1", assessment={**rooted, "score_weight": 0.1}),
+        Reading(name="t-SNE without exaggeration", assessment=plain),
+        Reading(name="t-SNE from random points", assessment={"initialization": "random"}),
+        Reading(name="disjoint segments", assessment={"paper.stride": 0}),
+        Reading(
+            name="raw x" if base.paper.standardized else "standardised x",
+            assessment={"paper.standardized": not base.paper.standardized},
+        ),
+        Reading(name="x without velocities", assessment={"paper.velocities": False}),
+        Reading(name="loss: distance, not squared", assessment={"paper.loss": "norm"}),
+        Reading(name="no dropout or weight decay", assessment=bare),
+        Reading(name="three layers of 256", assessment={"paper.hidden_sizes": [256] * 3}),
+        Reading(name="200 epochs", assessment={"paper.epochs": 200}),
+        Reading(
+            name="200 epochs, stopped early",
+            assessment={"paper.epochs": 200, "paper.held_out": 0.1},
+        ),
+    ]
+    if base.preview_stride > 1:
+        name = f"step of {scenario.step_s:g} s"
+        singles.append(Reading(name=name, assessment={"preview_stride": 1}))
+    start = getattr(scenario.parameters, "start", None)
+    if any(getattr(start, "tracking_offset_m", ())):
+        offset = {"tracking_offset_m": [0.0, 0.0, 0.0]}
+        singles.append(Reading(name="no offset between plan and state", start=offset))
+    if paper_options(scenario.task_class()):
+        singles.append(Reading(name="disturbed episodes", is_exploring=True))
+    return [*singles, Reading(name="former reading", assessment=former, is_exploring=True)]
+
+
+def readings(
+    scenario: ScenarioArgument,
+    assessment: TrainingOption,
+    train_episodes: Annotated[
+        int, typer.Option(help="Training episodes of each reading.", min=64)
+    ] = 1024,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 400,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other ones, for thresholds and as nominal feedback.", min=20)
+    ] = 200,
+    sizes: Annotated[
+        str, typer.Option(help="Numbers of episodes for the default reading, such as '512,2048'.")
+    ] = "",
+    only: Annotated[str, typer.Option(help="Part of the names of the readings.")] = "",
+    seed: Annotated[int, typer.Option(help="First seed of the fresh ones.")] = EVALUATION.first,
+    workers: WorkersOption = None,
+) -> None:
+    """Train the paper's mode under every reading, and judge it on fresh episodes.
+
+    Episodes of readings with data of their own are kept in ASSESSMENT/readings. Writes
+    ASSESSMENT/readings.json.
+    """
+    loaded = load_scenario(scenario)
+    loaded.assessment.mode = "paper"
+    chosen = [one for one in readings_of(loaded) if only in one.name]
+    chosen += [
+        Reading(name=f"default, {size} episodes", num_episodes=size) for size in parse_sizes(sizes)
+    ]
+    if not chosen:
+        names = [one.name for one in readings_of(loaded)]
+        raise ValueError(f"--only '{only}': no reading of this name; they are {names}")
+    found: dict[str, dict[str, Estimate]] = {}
+    with open_stages() as stages:
+        for position, reading in enumerate(chosen):
+            stages("readings", position, len(chosen))
+            sets = _EpisodeSets(loaded, assessment, reading, seed, workers, stages)
+            train = sets.training(reading.num_episodes or train_episodes)
+            test = sets.fresh("evaluation", episodes)
+            calibration = sets.fresh("thresholds", calibration_episodes)
+            learned = SafetyAssessment(reading.parameters(loaded.assessment)).fit(train)
+            adapted = learned.adapt(nominal_feedback(learned, calibration), method="paper")
+            rules = judged_rules(learned, adapted)
+            never = np.zeros(len(test), dtype=bool)
+            found[reading.name] = recalls(rules, calibration, test, never)
+        stages("readings", len(chosen), len(chosen))
+    file = assessment / READINGS_FILE
+    report = {
+        "command": command_line(),
+        "scenario": loaded.name,
+        "seed": seed,
+        "training_episodes": train_episodes,
+        "versions": versions(),
+        "names": [one.name for one in chosen],
+        **{
+            f"readings.{position}.{key}": estimate.to_json()
+            for position, one in enumerate(chosen)
+            for key, estimate in found[one.name].items()
+        },
+    }
+    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    columns = [f"{kind}.normalized.auc" for kind in ("segments", "first")]
+    columns += [
+        f"first.{rule}.{label}_recall"
+        for rule in ("normalized", "converged")
+        for label in ("safe", "unsafe")
+    ]
+    table = new_table("reading", *columns)
+    for name, estimates in found.items():
+        table.add_row(name, *(f"{estimates[key].value:.3f}" for key in columns))
+    console.print(table)
+    print_path("figures", file)
+
+
+class _EpisodeSets:
+    """Episodes of a reading; those without changes are shared with `train` and `evaluate`."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        folder: Path,
+        reading: Reading,
+        seed: int,
+        workers: int | None,
+        stages: Any,
+    ):
+        self._folder, self._reading = folder, reading
+        self._is_own = reading.has_own_episodes(scenario.assessment)
+        self._scenario = reading.scenario(scenario) if self._is_own else scenario
+        self._seeds, self._workers, self._stages = EVALUATION.seeds(seed), workers, stages
+
+    def training(self, count: int) -> Episodes:
+        """The first training episodes."""
+        options = paper_options(self._scenario.task_class())
+        if not self._is_own:
+            mode = "sharpened" if self._reading.is_exploring else "paper"
+            episodes = load_episodes(episodes_folder(self._folder, mode))
+            if len(episodes) < count:
+                raise ValueError(
+                    f"readings: {episodes_folder(self._folder, mode)} holds {len(episodes)} "
+                    f"episodes, expected at least {count}: train with more"
+                )
+        else:
+            episodes = self._run("training", count, 0, options)
+        info = replace(episodes.info, scenario_hash=self._scenario.simulation_hash())
+        return Episodes(info, list(episodes[:count]))
+
+    def fresh(self, purpose: str, count: int) -> Episodes:
+        """Fresh episodes, as `evaluate` draws them."""
+        seed = self._seeds[purpose]
+        if self._is_own:
+            options = judging_options(self._scenario.task_class())
+            return self._run(purpose, count, seed, options)
+        progress = partial(self._stages, f"episodes, {purpose}")
+        episodes = run_fresh_episodes(
+            self._scenario, self._folder, count, seed, progress, self._workers
+        )
+        return Episodes(episodes.info, list(episodes[:count]))
+
+    def _run(self, what: str, count: int, seed: int, options: dict[str, Any]) -> Episodes:
+        own = f"{self._scenario.simulation_hash()[:12]}-{what}-{seed}"
+        episodes = run_episodes(
+            self._scenario,
+            count,
+            seed=seed,
+            num_workers=self._workers,
+            path=self._folder / "readings" / own,
+            progress=partial(self._stages, f"episodes, {what}"),
+            **options,
+        )
+        return Episodes(episodes.info, list(episodes[:count]))

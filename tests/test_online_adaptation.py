@@ -1,0 +1,96 @@
+"""OnlineAdaptation: an update after every k_u feedback sets of a running diagram."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_safety.learning.assessment import AdaptationParameters
+from drake_safety.learning.segments import Episodes, EpisodesInfo
+from drake_safety.simulation.online_adaptation import OnlineAdaptation
+from drake_safety.systems.feedback_recorder import FeedbackRecorder
+
+STEP_S, NUM_STEPS = 0.1, 4
+INFO = EpisodesInfo(
+    scenario="rest",
+    scenario_hash="hash",
+    variation="actual",
+    seed=0,
+    step_s=STEP_S,
+    horizon=2,
+    constraint_names=["edge"],
+    state_names=["x"],
+    output_names=["x"],
+    feature_names=[],
+    versions={},
+)
+PORTS = {"state": 1, "output": 1, "desired_output": 1, "desired_preview": 2, "plant_state": 2}
+
+
+class Prior:
+    """An assessment whose adaptations say how many feedback sets they are of."""
+
+    def __init__(self, **settings):
+        self.parameters = SimpleNamespace(adaptation=AdaptationParameters(**settings))
+
+    def adapt(self, feedback, *, method=None):
+        return (method, len(feedback))
+
+    def feedback_segments(self, feedback):
+        return [row for one in feedback for row in range(NUM_STEPS)]
+
+
+def run(duration_s, **settings):
+    builder = DiagramBuilder()
+    recorder = builder.AddSystem(
+        FeedbackRecorder(INFO, num_steps=NUM_STEPS, plant_state_size=2, watch_period_s=STEP_S)
+    )
+    for name, size in (PORTS | {"safe": 1, "margins": 1, "features": 0}).items():
+        source = builder.AddSystem(ConstantVectorSource(np.ones(size)))
+        builder.Connect(source.get_output_port(), recorder.GetInputPort(name))
+    diagram = builder.Build()
+    adopted = []
+    assessor = SimpleNamespace(
+        GetMyMutableContextFromRoot=lambda root: root,
+        adopt=lambda context, adapted: adopted.append((context.get_time(), adapted)),
+    )
+
+    def twins(scenario, windows):
+        info = replace(INFO, variation="nominal")
+        return Episodes(info, [window.episode for window in windows])
+
+    adaptation = OnlineAdaptation(
+        None, Prior(**settings), recorder, assessor, method="paper", run=twins
+    )
+    simulator = Simulator(diagram)
+    simulator.set_monitor(adaptation)
+    simulator.AdvanceTo(duration_s)
+    return adaptation, adopted
+
+
+@pytest.mark.parametrize(
+    ("settings", "numbers"),
+    [
+        ({"update_interval": 2}, [2, 4]),
+        ({"update_interval": 8, "update_unit": "segments"}, [2, 4]),
+        ({"update_interval": 12, "update_unit": "segments"}, [3]),
+        ({"update_interval": 6}, []),
+    ],
+)
+def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(settings, numbers):
+    # Five windows of four steps.
+    adaptation, adopted = run(2.05, **settings)
+    assert len(adaptation.feedback) == 5
+    assert adaptation.adapted == [("paper", number) for number in numbers]
+    assert [adapted for _, adapted in adopted] == adaptation.adapted
+    times = [0.4 * number for number in numbers]
+    assert [time_s for time_s, _ in adopted] == pytest.approx(times, abs=1.5 * STEP_S)
+
+
+def test_nothing_is_adapted_before_the_first_window_ends():
+    adaptation, adopted = run(0.35, update_interval=1)
+    assert not adaptation.feedback and not adopted

@@ -1,0 +1,158 @@
+"""The readings of the paper: each parameter does what the sentence says that it reads."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_safety.learning.assessment import (
+    AdaptationParameters,
+    AssessmentParameters,
+    SafetyAssessment,
+)
+from drake_safety.learning.assessment_parameters import PaperReading
+from drake_safety.learning.embedding import MapData, stack_members, train_map
+from drake_safety.learning.inputs import inputs, is_rate, num_inputs
+from drake_safety.learning.segments import Episodes
+from drake_safety.learning.training import segments_for
+from lip_assessments import QUICK, worse
+from lip_episodes import make_episodes
+
+
+def paper(**changes):
+    quick = {name: value for name, value in QUICK.items() if name != "epochs"}
+    return AssessmentParameters(mode="paper", **quick | {"perplexity": 8.0} | changes)
+
+
+def map_data(x, target):
+    return MapData(
+        x=x,
+        has_target=np.ones(len(x), dtype=bool),
+        target=target,
+        is_unsafe=np.zeros(len(x), dtype=bool),
+        margins=np.zeros((len(x), 0)),
+        sample_weight=np.ones(len(x)),
+        input_scale=np.ones(x.shape[1]),
+    )
+
+
+def trained(data, reading, held_out=None):
+    parameters = replace(
+        paper(paper=reading),
+        hidden_sizes=reading.hidden_sizes,
+        dropout=reading.dropout,
+        epochs=reading.epochs,
+        target_weight=1.0,
+        safety_weight=0.0,
+        margin_weight=0.0,
+        batch_size=64,
+    )
+    return stack_members([train_map(data, parameters, seed=0, held_out=held_out)], num_margins=0)
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes(90)
+
+
+def test_segments_overlap_by_all_but_one_sample_or_not_at_all(episodes):
+    horizon = episodes.info.horizon
+    for stride, expected in ((1, 1), (0, horizon)):
+        segments, has_target = segments_for(episodes, paper(paper=PaperReading(stride=stride)))
+        assert has_target.all()
+        first = segments.start_row[segments.episode == segments.episode[0]]
+        assert set(np.diff(first)) <= {expected}
+        assert not np.any(segments.start_row % expected)
+
+
+def test_without_velocities_gamma_depends_on_configurations_alone(episodes):
+    names = [f"base_{i}" if i % 2 else f"velocity_{i}" for i in range(6)]
+    info = replace(episodes.info, state_names=names)
+    episodes = Episodes(info, list(episodes))
+    reading = PaperReading(velocities=False, epochs=2)
+    assessment = SafetyAssessment(paper(paper=reading)).fit(episodes)
+    rates = np.array([is_rate(name) for name in episodes.info.state_names])
+    assert rates.any() and not rates.all()
+    whole = num_inputs(episodes.info, paper())
+    assert num_inputs(episodes.info, assessment.parameters) == whole - rates.sum()
+    one = episodes[0]
+    state = one.true_state.copy()
+    before = assessment.predict(state, one.desired_preview)
+    state[:, rates] += 3.0
+    after = assessment.predict(state, one.desired_preview)
+    np.testing.assert_array_equal(after.embedding, before.embedding)
+    x = inputs(state, one.desired_preview, None, episodes.info, assessment.parameters)
+    np.testing.assert_array_equal(x[:, : (~rates).sum()], state[:, ~rates])
+
+
+def test_the_loss_without_a_square_gives_the_median_and_with_it_the_mean():
+    # Of equal inputs, four fifths are at one point and a fifth is at another.
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(640, 2))
+    target = np.where((np.arange(640) % 5 == 0)[:, None], [10.0, 0.0], [0.0, 0.0])
+    found = {
+        loss: trained(map_data(x, target), PaperReading(loss=loss, epochs=60)).embed(x)[0, :, 0]
+        for loss in ("squared", "norm")
+    }
+    assert np.mean(found["squared"]) == pytest.approx(2.0, abs=0.5)
+    assert abs(np.mean(found["norm"])) < 0.5
+
+
+def test_stopping_early_keeps_the_epoch_that_is_best_on_held_out_inputs():
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(240, 12))
+    target = np.column_stack([x[:, 0], np.zeros(240)]) + rng.normal(size=(240, 2))
+    seen, unseen = map_data(x[:80], target[:80]), map_data(x[80:], target[80:])
+    reading = PaperReading(epochs=150, dropout=0.0, weight_decay=0.0, hidden_sizes=[64, 64])
+
+    def error(embedding):
+        return np.linalg.norm(embedding.embed(unseen.x)[0] - unseen.target, axis=1).mean()
+
+    assert error(trained(seen, reading, unseen)) < 0.95 * error(trained(seen, reading))
+
+
+def test_standardised_inputs_make_the_map_independent_of_units():
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(200, 3))
+    target = x[:, :2] * 5.0
+    scale = np.array([100.0, 1.0, 0.1])
+    for standardized in (True, False):
+        reading = PaperReading(standardized=standardized, epochs=3, dropout=0.0)
+        one = trained(map_data(x, target), reading).embed(x)
+        other = trained(map_data(x * scale, target), reading).embed(x * scale)
+        assert np.allclose(one, other, atol=1e-3) == standardized
+
+
+def test_the_discrepancy_is_predicted_where_t_sne_has_put_the_segments(episodes, tmp_path):
+    settings = AdaptationParameters(discrepancy_at="tsne")
+    prior = SafetyAssessment(paper(adaptation=settings, paper=PaperReading(epochs=2)))
+    prior.fit(episodes)
+    assert prior.training_target_.shape == (len(prior.training_score_), 2)
+    prior.save(tmp_path / "paper.safetensors")
+    loaded = SafetyAssessment.load(tmp_path / "paper.safetensors")
+    np.testing.assert_array_equal(loaded.training_target_, prior.training_target_)
+    assert loaded.parameters == prior.parameters
+    feedback = worse()
+    adapted = loaded.adapt(feedback)
+    prior.training_target_ = None
+    assert not np.array_equal(adapted.beliefs_, prior.adapt(feedback).beliefs_)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PaperReading(loss="l1"), r"loss is l1, expected one of \['squared', 'norm'\]"),
+        (lambda: PaperReading(stride=-1), "stride is -1, expected >= 0"),
+        (lambda: PaperReading(hidden_sizes=[]), "expected one width >= 1 per layer"),
+        (lambda: PaperReading(held_out=1.0), r"held_out is 1.0, expected a value in \[0, 1\)"),
+        (lambda: paper(warping_cost="fast"), r"warping_cost is fast, expected one of .*'rooted'"),
+        (lambda: paper(exaggeration=0.5), "exaggeration is 0.5, expected >= 1"),
+        (lambda: paper(initialization="pca"), "initialization is pca, expected one of"),
+        (lambda: AdaptationParameters(count="all"), "count is all, expected one of"),
+        (lambda: AdaptationParameters(update_unit="cell"), "update_unit is cell, expected one of"),
+        (lambda: AdaptationParameters(discrepancy_at="y"), "discrepancy_at is y, expected one of"),
+    ],
+)
+def test_a_reading_that_does_not_exist_is_refused_with_those_that_do(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
