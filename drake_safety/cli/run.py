@@ -43,6 +43,7 @@ _PORTS = (
     "belief",
     "cause_probability",
     "predicted_margins",
+    "embedding",
     "ball_state",
 )
 # Keys of a ball on the command line, and fields of a throw.
@@ -162,9 +163,11 @@ def _run_with_balls(settings: RunSettings) -> None:
         ports=_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    recording.save(
-        _timeline(loop, log, throws), _table_of_events(loop, settings.assessment, log, throws)
-    )
+    figures = {
+        "timeline": _timeline(loop, log, throws),
+        "path": _path(loop, settings.assessment, log, throws),
+    }
+    recording.save(figures, _table_of_events(loop, settings.assessment, log, throws))
     recording.save_animation(
         loop,
         log.time_s,
@@ -208,6 +211,24 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
             values["direction_rad"] = float(np.radians(values["direction_rad"]))
         throws.append(Throw(**values))
     return throws
+
+
+def _path(
+    loop: ClosedLoop, assessment: SafetyAssessment, log: ThrowLog, throws: list[Throw]
+) -> Figure:
+    from drake_safety.evaluation.path_figure import path_figure
+
+    events = {f"ball {i}": throw.time_s for i, throw in enumerate(throws, start=1)}
+    starts = [start for start, _ in log.recovery_intervals_s]
+    events |= {f"recovery {i}": start_s for i, start_s in enumerate(starts, start=1)}
+    return path_figure(
+        assessment,
+        log.time_s,
+        log.extra["embedding"],
+        log.extra[loop.trigger_port][:, 0],
+        loop.scenario.parameters.recovery.threshold,
+        {"start": 0.0, **events},
+    )
 
 
 def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:

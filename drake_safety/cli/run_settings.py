@@ -93,11 +93,11 @@ class Recording:
             input("Press Enter when the browser shows the robot. ")
         self.viewer.StartRecording()
 
-    def save(self, timeline: Figure, events: Table) -> None:
-        """Writes recording and timeline, and prints the events and the paths.
+    def save(self, figures: Mapping[str, Figure], events: Table) -> None:
+        """Writes recording and figures, and prints the events and the paths.
 
         Args:
-            timeline: Figure of Γ over time.
+            figures: Figures by the name of their files.
             events: Table of the events.
         """
         from drake_safety.evaluation.figure_style import save
@@ -108,7 +108,7 @@ class Recording:
         folder.mkdir(parents=True, exist_ok=True)
         recording = folder / "recording.html"
         recording.write_text(self.viewer.StaticHtml(), encoding="utf-8")
-        pictures = save(timeline, folder / "timeline")
+        pictures = [path for name in figures for path in save(figures[name], folder / name)]
         (folder / "run.json").write_text(_events_json(events), encoding="utf-8")
         console.print(events)
         print_path("recording", recording)

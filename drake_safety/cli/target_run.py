@@ -88,7 +88,7 @@ def run_to_target(
     # A motion has many rows: its promise has its own threshold.
     threshold = threshold if calibration is None else calibration.threshold
     recording.save(
-        draw_motion(loop, motion, threshold),
+        {"timeline": draw_motion(loop, motion, threshold)},
         table_of_motion(loop, settings.assessment, motion, threshold),
     )
     alarm = alarm_row(motion, threshold)

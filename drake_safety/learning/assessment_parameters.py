@@ -106,9 +106,9 @@ class PaperReading:
     standardized: bool = False
     loss: str = "squared"
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
-    dropout: float = 0.2
+    dropout: float = 0.3
     weight_decay: float = 0.01
-    epochs: int = 40
+    epochs: int = 60
     held_out: float = 0.0
 
     def __post_init__(self) -> None:

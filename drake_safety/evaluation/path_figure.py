@@ -1,0 +1,69 @@
+"""The path of a motion through the embedding space, beside Γ over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.embedding_figure import draw_safety
+from drake_safety.evaluation.figure_style import INK, drawing_style, new_figure
+from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from drake_safety.learning.assessment import SafetyAssessment
+
+
+def path_figure(
+    assessment: SafetyAssessment,
+    time_s: np.ndarray,
+    points: np.ndarray,
+    gamma: np.ndarray,
+    threshold: float,
+    events: Mapping[str, float],
+) -> Figure:
+    """Plots Ψ(x) of a motion over the beliefs of the cells, and its Γ over time.
+
+    As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble.
+
+    Args:
+        assessment: The fitted assessment of the motion.
+        time_s: Times [s], (N,).
+        points: Ψ(x), (N, 2).
+        gamma: Γ, (N,).
+        threshold: Γ_thre.
+        events: Times of named events [s]; they are marked and numbered in both panels.
+    """
+    cells, grid = assessment.beliefs_[0], assessment.grid_
+    is_empty = cells[:, UNCERTAINTY] >= 1.0
+    known = np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY])
+    with drawing_style():
+        fig = new_figure(12.0, 5.0)
+        left, right = fig.subplots(1, 2, width_ratios=(1.0, 1.25))
+        no_count = np.zeros(grid.num_cells, dtype=int)
+        label = "safe share of a cell"
+        draw_safety(fig, left, grid, cells[:, SAFE] / known, is_empty, no_count, label=label)
+        left.plot(points[:, 0], points[:, 1], color="white", linewidth=2.6, alpha=0.8)
+        left.plot(points[:, 0], points[:, 1], color=INK, linewidth=1.0)
+        half = grid.half_width
+        left.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
+        left.set(title="Path through the embedding space", xlabel="hatched: EMPTY")
+        right.plot(time_s, gamma, color=INK, linewidth=1.4)
+        right.axhline(threshold, color=INK, linewidth=0.8, linestyle="--")
+        right.text(time_s[0], threshold + 0.01, "Γ_thre", va="bottom")
+        right.set(title="Γ over time", xlabel="time [s]", ylim=(-0.04, 1.2))
+        ordered = sorted(events.items(), key=lambda event: event[1])
+        for number, (_, at_s) in enumerate(ordered, start=1):
+            row = int(np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1))
+            box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": INK, "lw": 0.8}
+            left.annotate(f"{number}", points[row], fontsize=8, bbox=box, ha="center", va="center")
+            right.axvline(at_s, color=INK, linewidth=0.6, alpha=0.5)
+            # Alternating heights, as events may be close together.
+            place = (at_s, 1.06 + 0.08 * (number % 2))
+            right.annotate(f"{number}", place, fontsize=8, bbox=box, ha="center", va="center")
+        words = [f"{number} {name}" for number, (name, _) in enumerate(ordered, start=1)]
+        right.set_xlabel(f"time [s]\n{', '.join(words)}")
+    return fig
