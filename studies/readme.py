@@ -110,12 +110,17 @@ def summary_text(results: Results) -> str:
     """Counts and the main table of an evaluation, as Markdown."""
     if results.has("plans."):
         sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
-        methods = ("paper", "gradient_boosting", "mlp", "reachability")
+        methods = ("paper", "gradient_boosting", "mlp", "reachability", "reachability_free")
         names = {
             "plans.sharpened": "`sharpened`",
             **{prefix: f"`sharpened`, {title}" for prefix, title in sets.items()},
             **{f"plans.{method}": _named(method) for method in methods},
         }
+        own = {
+            "converged.first.converged": "`paper`, Γ < 0.6 after adaptation",
+            "converged.fair.converged": "`paper`, Γ < 0.6 after adaptation, fair targets",
+        }
+        names |= {prefix: name for prefix, name in own.items() if results.has(prefix)}
         table = _rows(results, "all targets", names)
         printed = f"*{SAFE_RECALL:.3f}* | *{UNSAFE_RECALL:.3f}*"
         return f"{_counts(results)}\n\n{table}\n| *the paper's own* | {printed} | |"
@@ -136,6 +141,19 @@ def summary_text(results: Results) -> str:
             cells.append("" if found is None else column.text(found))
         if any(cells):
             lines.append(f"| {_named(method)} | {' | '.join(cells)} |")
+    adapted = (
+        "converged.segments.converged.auc",
+        "converged.first.converged.auc",
+        "converged.throws.converged.falls_with_recovery",
+        "converged.throws.converged.false_triggers",
+    )
+    if all(key in results.estimates for key in adapted):
+        formats = [column for _, column in columns.values()]
+        cells = [
+            column.text(results.estimates[key])
+            for key, column in zip(adapted, formats, strict=True)
+        ]
+        lines.append(f"| `paper`, Γ < 0.6 after adaptation | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
     if "throws.falls_without_recovery" in results.estimates:
         alone = results.estimates["throws.falls_without_recovery"]
@@ -246,6 +264,9 @@ def _counts(results: Results) -> str:
     calibration = entries.get("calibration_episodes")
     if calibration is not None:
         words.append(f"Thresholds come from {calibration} other episodes.")
+    studied = entries.get("converged")
+    if studied is not None and studied["training_episodes"] != entries.get("training_episodes"):
+        words.append(f"`paper` has learned from {studied['training_episodes']} episodes.")
     words.append("Intervals are 95 %.")
     if results.has("segments.paper.") or results.has("plans.paper."):
         words.append(INPUTS)

@@ -12,7 +12,7 @@ from lip_assessments import QUICK
 from lip_episodes import make_episodes
 from studies.converged import judged_rules, nominal_feedback, recalls
 from studies.readings import Reading, readings_of
-from studies.readme import converged_text, readings_text
+from studies.readme import converged_text, readings_text, summary_text
 
 
 @pytest.mark.parametrize(
@@ -93,3 +93,20 @@ def test_the_tables_of_the_papers_mode_say_what_was_found():
     text = converged_text(found)
     assert "| after adaptation | 50.0 % (40.0–60.0) | 50.0 % (40.0–60.0) |" in text
     assert "after 8 pairs" in text
+
+
+def test_the_summary_shows_the_papers_mode_after_its_adaptation():
+    one, entries = Estimate(0.25, 0.2, 0.3, 50), {"training_episodes": 8}
+    keys = ["segments.paper.auc", "episodes.paper.auc", "episodes.share_unsafe"]
+    keys += ["converged.segments.converged.auc", "converged.first.converged.auc"]
+    keys += ["converged.throws.converged.falls_with_recovery"]
+    keys += ["converged.throws.converged.false_triggers"]
+    found = Results(
+        estimates=dict.fromkeys(keys, one),
+        entries=entries | {"converged": entries | {"training_episodes": 9}},
+    )
+    text = summary_text(found)
+    assert "`paper` has learned from 9 episodes." in text
+    rates = "25.0 % (20.0–30.0) | 25.0 % (20.0–30.0)"
+    auc = "0.250 (0.200–0.300) | 0.250 (0.200–0.300)"
+    assert f"| `paper`, Γ < 0.6 after adaptation | {auc} | {rates} |" in text

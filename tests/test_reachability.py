@@ -88,3 +88,18 @@ def test_a_point_that_is_none_is_refused(reachability, point):
 def test_a_robot_without_that_hand_is_answered_with_those_it_has(robot):
     with pytest.raises(ValueError, match=r"no reaching frame 'third'; it has \['left', 'right'\]"):
         Reachability(robot, "third")
+
+
+def test_a_free_base_reaches_further_and_the_feet_stay_where_they_are(robot, kinematics):
+    fixed, free = (Reachability(robot, "left", is_base_free=is_free) for is_free in (False, True))
+    standing = kinematics.standing_positions()
+    hand = kinematics.reaching_position(standing, robot.reaching_frame("left"))
+    assert free.miss(hand) < 1e-3
+    ahead = np.array([1.4, 0.3, 0.9])
+    assert free.miss(ahead) < fixed.miss(ahead) - 0.05
+    assert free.miss(np.array([4.0, 0.3, 1.2])) > 1.0
+    assert set(fixed.joint_names) < set(free.joint_names)
+    free.miss(ahead)
+    feet = kinematics.contact_positions(standing)
+    found = kinematics.contact_positions(free._plant.GetPositions(free._context))
+    np.testing.assert_allclose(found, feet, atol=3e-3)

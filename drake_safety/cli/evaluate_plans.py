@@ -138,7 +138,9 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     rules += [scorer_rule(scorer) for scorer in judged.classifiers]
     known = [hand for hand in hands if hand is not None]
     if known:
-        rules.append(reachability_rule({hand: Reachability(loop.robot, hand) for hand in known}))
+        for name, is_free in (("reachability", False), ("reachability_free", True)):
+            reach = {hand: Reachability(loop.robot, hand, is_base_free=is_free) for hand in known}
+            rules.append(reachability_rule(reach, name))
     return rules
 
 

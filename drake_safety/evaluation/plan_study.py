@@ -140,11 +140,14 @@ def scorer_rule(scorer: Scorer, calibration: Calibration | None = None) -> PlanR
     )
 
 
-def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
+def reachability_rule(
+    reachability: Mapping[str, Reachability], name: str = "reachability"
+) -> PlanRule:
     """The rule that accepts goals within reach of inverse kinematics.
 
     Args:
         reachability: Reachability by hand.
+        name: Key of the rule.
     """
 
     def unsafe_score(plans: Plans) -> np.ndarray:
@@ -154,7 +157,7 @@ def reachability_rule(reachability: Mapping[str, Reachability]) -> PlanRule:
             )
         return 1.0 - reachability[plans.hand].is_reachable(plans.goals)
 
-    return PlanRule(name="reachability", unsafe_score=unsafe_score, threshold=0.5)
+    return PlanRule(name=name, unsafe_score=unsafe_score, threshold=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)

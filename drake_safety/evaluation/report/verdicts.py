@@ -17,6 +17,7 @@ from drake_safety.evaluation.report.tables import Column, Row, Table
 LABELS = {
     "mlp": "MLP",
     "reachability": "inverse kinematics",
+    "reachability_free": "inverse kinematics, free base",
     "sharpened_literal_0.6": "sharpened, literal Γ",
     "paper_literal_0.6": "paper, literal Γ",
     "sharpened_literal": "sharpened, literal Γ",
