@@ -72,9 +72,9 @@ def _typical_episodes(
     is_sharpened = parameters.is_sharpened
     segments = split(
         episodes,
-        stride=1 if is_sharpened else parameters.horizon,
+        stride=parameters.stride,
         discount=parameters.discount,
-        shortest=(parameters.shortest_segment or None) if is_sharpened else None,
+        shortest=parameters.shortest,
     )
     points = assessment.predict(
         segments.state if is_sharpened else segments.true_state,
