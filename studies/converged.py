@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from functools import partial
@@ -74,7 +75,12 @@ def converged(
             )
             for purpose, count in (("evaluation", episodes), ("thresholds", calibration_episodes))
         )
-        rules = judged_rules(prior, prior.adapt(nominal_feedback(prior, other), method="paper"))
+        feedback = nominal_feedback(prior, other)
+        adapted = prior.adapt(feedback, method="paper")
+        rules = judged_rules(prior, adapted)
+        prior_alone = without_feedback_beliefs(prior).adapt(feedback, method="paper")
+        for name, gamma in {"adapted": adapted, "discrepancy": prior_alone}.items():
+            rules[name] = (assessment_scorer(name, gamma, "normalized"), PAPER_THRESHOLD)
         fair = np.array([isinstance(loop, HasGoals) and is_fair(loop, one) for one in test])
         estimates = recalls(rules, other, test, fair)
         if throws:
@@ -88,8 +94,7 @@ def converged(
                 ),
                 progress=partial(stages, "pairs"),
             )
-            adapted = prior.adapt(run.feedback(), method="paper")
-            literal = {"before": prior, "converged": adapted}
+            literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
             study = evaluate_throws(
                 loaded,
                 [
@@ -132,6 +137,14 @@ def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[F
     info = replace(episodes.info, scenario_hash=assessment.info_.scenario_hash)
     twins = Episodes(info, list(episodes))
     return feedback_sets(twins, twins)
+
+
+def without_feedback_beliefs(prior: SafetyAssessment) -> SafetyAssessment:
+    """The assessment with feedback beliefs that stay empty: feedback updates the prior alone."""
+    settings = replace(prior.parameters.adaptation, first_uncertainty=1.0, decay_rate=0.0)
+    changed = copy.copy(prior)
+    changed.parameters = replace(prior.parameters, adaptation=settings)
+    return changed
 
 
 def judged_rules(

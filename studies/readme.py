@@ -214,6 +214,18 @@ def converged_text(results: Results) -> str:
         "other nominal episodes are the feedback and choose the thresholds.",
         "\n".join(lines),
     ]
+    brier = [
+        _SHARE.text(estimates[key])
+        for rule in ("normalized", "adapted", "discrepancy")
+        if (key := f"converged.segments.{rule}.brier") in estimates
+    ]
+    if len(brier) == 3:
+        before, after, prior_alone = brier
+        parts.append(
+            f"Brier score of b_safe / (1 − μ) on every segment, without a gap: {before} before "
+            f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, without "
+            "feedback beliefs."
+        )
     if results.has("converged.throws."):
         columns = {"falls with recovery": "falls_with_recovery", "false triggers": "false_triggers"}
         lines = [f"| throws, Γ < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
