@@ -172,6 +172,8 @@ def readings(
             learned = SafetyAssessment(reading.parameters(loaded.assessment)).fit(train)
             adapted = learned.adapt(nominal_feedback(learned, calibration), method="paper")
             rules = judged_rules(learned, adapted)
+            # A promised miss rate takes more calibration episodes than the others need.
+            del rules["conformal"]
             never = np.zeros(len(test), dtype=bool)
             found[reading.name] = recalls(rules, calibration, test, never)
         stages("readings", len(chosen), len(chosen))

@@ -223,8 +223,8 @@ def converged_text(results: Results) -> str:
         before, after, prior_alone = brier
         parts.append(
             f"Brier score of b_safe / (1 − μ) on every segment, without a gap: {before} before "
-            f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, without "
-            "feedback beliefs."
+            f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, "
+            "without feedback beliefs."
         )
     if results.has("converged.throws."):
         columns = {"falls with recovery": "falls_with_recovery", "false triggers": "false_triggers"}
