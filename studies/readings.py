@@ -96,6 +96,7 @@ def readings_of(scenario: Scenario) -> list[Reading]:
         "paper.stride": 0,
         "paper.standardized": True,
     }
+    usual = Reading(name="default").parameters(base)
     singles = [
         Reading(name="default"),
         Reading(name="path cost: root of the sum of squares", assessment=rooted),
@@ -127,6 +128,11 @@ def readings_of(scenario: Scenario) -> list[Reading]:
         singles.append(Reading(name="no offset between plan and state", start=offset))
     if paper_options(scenario.task_class()):
         singles.append(Reading(name="disturbed episodes", is_exploring=True))
+    singles = [
+        one
+        for one in singles
+        if one == singles[0] or one.start or one.is_exploring or one.parameters(base) != usual
+    ]
     return [*singles, Reading(name="former reading", assessment=former, is_exploring=True)]
 
 

@@ -31,6 +31,8 @@ def balancing_scenario():
     start = scenario.parameters.start
     start.plan_duration_s = [0.3, 0.5]  # The log holds all of the plan.
     start.base_height_m = [0.39, 0.42]
+    start.tracking_offset_m = [0.0, 0.0, 0.0]
+    scenario.assessment.preview_stride, scenario.assessment.shortest_segment = 1, 0
     scenario.parameters.safe_set.height_m = [0.37, 0.44]
     scenario.variations["actual"] = PlantVariation(joint_friction_nm=0.4)
     return scenario

@@ -94,7 +94,9 @@ def test_an_input_that_is_not_finite_gets_the_empty_belief(assessment, held_out,
         assert gamma == 0.0
         assert normalized == 0.0
     assert np.all(np.isfinite(result.belief))
-    assert result.belief[0, 2] < 1.0
+    np.testing.assert_array_equal(
+        result.belief[[0, 2]], assessment.predict(*inputs(held_out, slice(0, 3))).belief[[0, 2]]
+    )
 
 
 def test_other_beliefs_may_be_given_in_place_of_the_learned_ones(assessment, held_out):
@@ -193,9 +195,9 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
         SafetyAssessment.load(tmp_path / "foreign")
     metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
     save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match="schema version 0, this version reads 4"):
+    with pytest.raises(ValueError, match="schema version 0, this version reads 5"):
         SafetyAssessment.load(tmp_path / "old")
-    metadata["schema_version"] = "4"
+    metadata["schema_version"] = "5"
     save_file(load_file(path), tmp_path / "hollow", metadata)
     with pytest.raises(ValueError, match="damaged safety assessment"):
         SafetyAssessment.load(tmp_path / "hollow")
@@ -338,4 +340,4 @@ def test_the_papers_mode_knows_no_short_segments(episodes):
     few = episodes[:60]
     learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
     sizes = {assessment.training_score_.shape[-1] for assessment in learned}
-    assert sizes == {len(split(few, stride=10, discount=0.99))}
+    assert sizes == {len(split(few, stride=1, discount=0.99))}

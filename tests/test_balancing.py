@@ -242,7 +242,10 @@ def test_starts_are_inside_the_ranges_that_the_scenario_gives():
         joints = state[12 : 12 + loop.kinematics.num_joints]
         assert np.all((joints >= lowest) & (joints <= highest))
         height = state[names.index("base_z")]
-        assert sampling.base_height_m[0] <= height <= sampling.base_height_m[1]
+        offset_m = sampling.tracking_offset_m[2]
+        assert (
+            sampling.base_height_m[0] - offset_m <= height <= sampling.base_height_m[1] + offset_m
+        )
         assert np.abs(state[3:5]).max() < 2 * sampling.tilt_rad
     assert first_steps == {0, 1}
 

@@ -56,7 +56,7 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     others = blocks("python", OWN_DIAGRAM)
     # The README's number of episodes takes minutes; it is the only thing that is changed.
     assert first.count("num_episodes=2048") == 1
-    first = first.replace("num_episodes=2048", "num_episodes=32")
+    first = first.replace("num_episodes=2048", "num_episodes=56")
     script = tmp_path / "readme.py"
     script.write_text("\n".join([first, *others]), encoding="utf-8")
     paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
