@@ -163,7 +163,9 @@ def summary_text(results: Results) -> str:
 
 def readings_text(results: Results) -> str:
     """Table of the readings of the paper, as Markdown."""
-    entries = results.entries["readings"]
+    entries = results.entries.get("readings")
+    if entries is None:
+        return "Not measured yet."
     columns = {
         "every segment, AUC": ("segments.normalized.auc", _SHARE),
         "k = 0, AUC": ("first.normalized.auc", _SHARE),
