@@ -12,8 +12,8 @@ DEVELOPED := .venv/.developed
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED) ## Train on 400 episodes, evaluate, and throw balls at the robot
-	$(BIN)/drake-safety train laikago_balancing --episodes 400 --out runs/demo --resume
+demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the robot
+	$(BIN)/drake-safety train laikago_balancing --episodes 300 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
 		--episodes 128 --calibration-episodes 60 --throws 30 --no-baselines
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
