@@ -6,6 +6,7 @@ import pytest
 from command_line import call
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
+from drake_safety.learning.assessment_parameters import PaperReading
 from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
@@ -21,6 +22,11 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("short")
     (folder / "short.yaml").write_text(balancing_scenario().to_yaml())
     scenario = load_scenario(folder / "short.yaml")
+    # Plain t-SNE spreads these few segments over more cells.
+    assessment = scenario.assessment
+    assessment.warping_cost, assessment.initialization = "rooted", "random"
+    assessment.exaggeration = 1.0
+    assessment.paper = PaperReading(stride=0, standardized=True, dropout=0.0, epochs=40)
     episodes = run_episodes(scenario, 48, seed=11, num_workers=1)
     assert 8 <= episodes.num_unsafe <= 40
     for mode in MODES:
@@ -74,13 +80,13 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
     for mode in MODES:
         adapted = load(adapted_folder(folder, files[0].stem), mode)
         changed = np.abs(adapted.beliefs_ - load(folder, mode).beliefs_).max()
-        assert changed > 0.02
+        assert changed > 0.05
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
         change = adapted.correction_.change
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
         np.testing.assert_allclose(
-            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.25 * changed, 0.01)
+            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.01)
         )
         np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 
