@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety import load_scenario
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.feedback import (
+    AddFeedbackRecorder,
     feedback_of_windows,
-    make_recorder,
     run_pairs,
     run_twins,
     window_start,
@@ -78,7 +79,8 @@ def test_a_recorded_window_gives_the_twin_that_the_episode_would_have(kept):
     assert rows > 3
     # Not to the bit: the feet stand where q has them, and the plan was seen in samples.
     np.testing.assert_allclose(twins[0].output[:rows], expected.output[:rows], atol=5e-3)
-    recorder = make_recorder(scenario.make_loop("payload"))
+    builder = DiagramBuilder()
+    recorder = AddFeedbackRecorder(builder, builder.AddSystem(scenario.make_loop("payload")))
     assert recorder.info.variation == "payload"
     (feedback,) = feedback_of_windows(scenario, recorder, [window], run=lambda *given: twins)
     assert feedback.info.variation == "payload"

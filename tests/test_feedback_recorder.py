@@ -43,6 +43,7 @@ class Drift(LeafSystem):
             "margins": lambda x, v: [1.0 - x, 1.0 + x],
             "safe": lambda x, v: [float(abs(x) < 1.0)],
             "plant_state": lambda x, v: [x, v],
+            "recovery_active": lambda x, v: [float(0.2 < x < 0.3)],
         }
         for name, calc in ports.items():
             self.DeclareVectorOutputPort(
@@ -61,7 +62,7 @@ class Drift(LeafSystem):
 class Running:
     """A drift with a recorder beside it."""
 
-    def __init__(self, x, v, without=(), **options):
+    def __init__(self, x, v, without=("recovery_active",), **options):
         builder = DiagramBuilder()
         self.drift = builder.AddSystem(Drift())
         options = {"num_steps": NUM_STEPS, "plant_state_size": 2, **options}
@@ -128,6 +129,16 @@ def test_leaving_for_less_than_a_step_is_noticed():
     assert window.episode.margins[-1, 0] == pytest.approx(-0.005, abs=0.006)
 
 
+def test_windows_with_recovery_are_dropped_as_their_twins_have_none():
+    # x = 0.5 t: recovery from 0.4 s to 0.6 s.
+    windows = Running(0.0, 0.5, without=()).advance(1.05).take()
+    starts = [window.start_time_s for window in windows]
+    np.testing.assert_allclose(starts, [0.0, 0.2, 0.6, 0.8], atol=1e-6)
+    assert all(len(window.episode.time_s) == NUM_STEPS + 1 for window in windows)
+    without = Running(0.0, 0.5).advance(1.05).take()
+    assert [window.start_time_s for window in without] != pytest.approx(starts)
+
+
 def test_a_jump_in_time_drops_the_open_window():
     running = Running(0.0, 0.0).advance(0.1)
     running.root.SetTime(0.0)
@@ -135,6 +146,16 @@ def test_a_jump_in_time_drops_the_open_window():
     (window,) = running.advance(NUM_STEPS * STEP_S + 0.001).take()
     assert window.start_time_s == 0.0
     assert len(window.episode.time_s) == NUM_STEPS + 1
+
+
+def test_a_jump_in_time_forgets_that_the_safe_set_was_left_before():
+    running = Running(0.985, 1.0).advance(0.03)  # Left at 0.02 s, seen by no row.
+    running.set(0.0, 0.0)
+    running.root.SetTime(0.0)
+    running.simulator.Initialize()
+    (window,) = running.advance(NUM_STEPS * STEP_S + 0.001).take()
+    assert window.start_time_s == 0.0
+    assert window.episode.is_safe
 
 
 def test_taking_empties_and_what_nobody_takes_is_dropped_and_counted():
@@ -148,7 +169,7 @@ def test_taking_empties_and_what_nobody_takes_is_dropped_and_counted():
 
 
 def test_without_a_true_state_it_is_the_measured_one():
-    (window,) = Running(0.1, 0.0, without=["true_state"]).advance(0.201).take()
+    (window,) = Running(0.1, 0.0, without=["true_state", "recovery_active"]).advance(0.201).take()
     np.testing.assert_array_equal(window.episode.true_state, window.episode.state)
 
 

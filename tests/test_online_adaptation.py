@@ -9,9 +9,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.learning.assessment import AdaptationParameters
 from drake_safety.learning.segments import Episodes, EpisodesInfo
+from drake_safety.simulation.feedback import AddFeedbackRecorder
 from drake_safety.simulation.online_adaptation import OnlineAdaptation
+from drake_safety.simulation.rollouts import episode_rng
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 
 STEP_S, NUM_STEPS = 0.1, 4
@@ -94,3 +97,39 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(settings
 def test_nothing_is_adapted_before_the_first_window_ends():
     adaptation, adopted = run(0.35, update_interval=1)
     assert not adaptation.feedback and not adopted
+
+
+def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterwards():
+    scenario = load_scenario("laikago_balancing")
+    prior = load_assessment("laikago_balancing", "paper")
+    prior.parameters.adaptation.update_interval = 2
+    builder = DiagramBuilder()
+    loop = builder.AddSystem(
+        scenario.make_loop("payload", assessment=prior, recovery=False, ball=False)
+    )
+    recorder = AddFeedbackRecorder(builder, loop)
+    simulator = Simulator(builder.Build())
+    assessor = loop.GetSubsystemByName("safety_assessor")
+    online = OnlineAdaptation(scenario, prior, recorder, assessor)
+    simulator.set_monitor(online)
+    root = simulator.get_mutable_context()
+    for index in range(3):
+        loop.reset(root, episode_rng(7, index))
+        simulator.Initialize()
+        simulator.AdvanceTo(scenario.episode_duration_s + 0.5 * scenario.control_period_s)
+    alone = scenario.make_loop("payload", ball=False)
+    for index in range(3):
+        # A loop in a diagram begins and moves as it does alone. One that falls may come back into
+        # the safe set, where another window begins.
+        episode = run_episode(alone, index, seed=7)
+        start = episode.true_state[0]
+        (same,) = (one for one in online.feedback if np.allclose(one.true_state[0], start))
+        rows = len(same.true_state)
+        np.testing.assert_allclose(same.true_state, episode.true_state[:rows], atol=1e-9)
+        assert same.is_unsafe != episode.is_safe
+    assert len(online.adapted) == len(online.feedback) // 2 > 0
+    expected = prior.adapt(online.feedback[: 2 * len(online.adapted)])
+    np.testing.assert_array_equal(online.adapted[-1].beliefs_, expected.beliefs_)
+    context = assessor.GetMyContextFromRoot(root)
+    np.testing.assert_array_equal(assessor.get_beliefs(context), expected.beliefs_)
+    assert not np.array_equal(expected.beliefs_, prior.beliefs_)

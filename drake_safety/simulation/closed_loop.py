@@ -132,7 +132,8 @@ class ClosedLoop(FloatSystem, Diagram):
         """Samples an initial state and a plan into the root Context.
 
         Args:
-            context: The diagram's Context; its state is overwritten.
+            context: The root Context, of this diagram or of one that contains it. Its time is set
+                to zero, and the state of this diagram is overwritten.
             rng: Random generator.
 
         Returns:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
@@ -113,23 +114,36 @@ def run_pairs(
     )
 
 
-def make_recorder(
-    loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
+def AddFeedbackRecorder(
+    builder: DiagramBuilder,
+    loop: ClosedLoop,
+    *,
+    num_steps: int | None = None,
+    capacity: int = 400,
 ) -> FeedbackRecorder:
-    """Makes the recorder for a loop.
+    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop.
 
     Args:
-        loop: The loop of the actual robot.
+        builder: The diagram's builder.
+        loop: The loop of the actual robot, a system of the diagram.
         num_steps: Assessment steps of a window; those of an episode by default.
         capacity: Largest number of finished windows kept.
     """
-    return FeedbackRecorder(
-        episodes_info(loop, seed=NOT_DRAWN),
-        num_steps=num_steps or loop.scenario.num_steps,
-        plant_state_size=loop.GetOutputPort("plant_state").size(),
-        watch_period_s=loop.scenario.control_period_s,
-        capacity=capacity,
+    recorder = builder.AddNamedSystem(
+        "feedback_recorder",
+        FeedbackRecorder(
+            episodes_info(loop, seed=NOT_DRAWN),
+            num_steps=num_steps or loop.scenario.num_steps,
+            plant_state_size=loop.GetOutputPort("plant_state").size(),
+            watch_period_s=loop.scenario.control_period_s,
+            capacity=capacity,
+        ),
     )
+    for i in range(recorder.num_input_ports()):
+        port = recorder.get_input_port(i)
+        if loop.HasOutputPort(port.get_name()):
+            builder.Connect(loop.GetOutputPort(port.get_name()), port)
+    return recorder
 
 
 def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:

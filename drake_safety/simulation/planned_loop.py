@@ -198,9 +198,8 @@ class PlannedLoop(ClosedLoop):
 
     def start_of(self, context: Context) -> EpisodeStart:
         """State and plan of a Context, as a start."""
-        q, v = np.split(
-            self.GetOutputPort("plant_state").Eval(context), [self.plant_state_sizes[0]]
-        )
+        plant_state = self.GetOutputPort("plant_state").Eval(self.GetMyContextFromRoot(context))
+        q, v = np.split(plant_state, [self.plant_state_sizes[0]])
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
         return EpisodeStart(q=q, v=v, plan=plan)
 
@@ -208,7 +207,7 @@ class PlannedLoop(ClosedLoop):
         """Sets the plan and keeps the state.
 
         Args:
-            context: The diagram's Context.
+            context: The root Context.
             plan: Desired output over simulation time, in the stance frame, (n_z, 1) [m].
         """
         self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
@@ -219,7 +218,8 @@ class PlannedLoop(ClosedLoop):
     def _enter(self, context: Context, start: EpisodeStart) -> None:
         # Only the state is reset: parameters such as an assessor's beliefs outlive an episode.
         context.SetTime(0.0)
-        context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
+        own_context = self.GetMyMutableContextFromRoot(context)
+        own_context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         self._set_state(context, start)
         self._planner.set_plan(
             self._planner.GetMyMutableContextFromRoot(context), start.plan, self._stance_of(start)

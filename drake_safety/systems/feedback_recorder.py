@@ -68,6 +68,7 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
         - margins
         - safe
         - plant_state
+        - recovery_active (optional)
         output_ports:
         - num_finished
 
@@ -75,7 +76,8 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
     next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
     ``watch_period_s``, is below one, and the next one begins when it is one again. When time
     jumps, as at a reset, the open window is dropped. The windows are state of the Context;
-    :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a robot.
+    :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a robot. A window
+    with a row at which ``recovery_active`` is not zero is dropped: its twin has no recovery.
 
     Args:
         info: Metadata of the windows as episodes.
@@ -120,8 +122,10 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
             "plant_state": plant_state_size,
         }
         self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
-        # A latch: whether the safe set was left since the last row, and the margins at that time.
-        self.DeclareDiscreteState(1 + num_margins)
+        self._recovery_port = self.DeclareVectorInputPort("recovery_active", 1)
+        # A latch: when the safe set was left since the last row, and the margins at that time.
+        self._closed_latch = np.append(-np.inf, np.zeros(num_margins))
+        self.DeclareDiscreteState(self._closed_latch)
         self._index = self.DeclareAbstractState(Value(Recording()))
         self.DeclarePeriodicDiscreteUpdateEvent(watch_period_s, 0.0, self._watch)
         self.DeclarePeriodicUnrestrictedUpdateEvent(info.step_s, 0.0, self._record)
@@ -146,9 +150,9 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
 
     def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
         latch = context.get_discrete_state_vector().get_value()
-        if latch[0] == 0.0 and self._ports["safe"].Eval(context)[0] < 1.0:
+        if latch[0] == -np.inf and self._ports["safe"].Eval(context)[0] < 1.0:
             margins = self._ports["margins"].Eval(context)
-            discrete_state.set_value(np.concatenate([[1.0], margins]))
+            discrete_state.set_value(np.append(context.get_time(), margins))
 
     def _row(self, context: Context) -> tuple[np.ndarray, ...]:
         ports = dict(self._ports)
@@ -160,15 +164,19 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
         recording = self.recording(context)
         time_s = context.get_time()
         latch = context.get_discrete_state_vector().get_value()
-        has_left = latch[0] > 0.0 or self._ports["safe"].Eval(context)[0] < 1.0
+        # A latch of before a jump in time says nothing.
+        was_left = 0.0 <= time_s - latch[0] <= 1.01 * self.info.step_s
+        has_left = was_left or self._ports["safe"].Eval(context)[0] < 1.0
         if recording.times_s:
             lapse_s = time_s - recording.times_s[-1]
             if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
                 recording = replace(recording, rows=(), times_s=(), plant_state=None)
         row = self._row(context)
-        if has_left:
+        if self._recovery_port.HasValue(context) and self._recovery_port.Eval(context)[0] != 0.0:
+            recording = replace(recording, rows=(), times_s=(), plant_state=None)
+        elif has_left:
             if recording.rows:
-                if latch[0] > 0.0:
+                if was_left:
                     margins = np.minimum(row[-1], latch[1:])
                     row = (*row[:-1], margins)
                 recording = self._finished(self._extended(context, recording, row), is_safe=False)
@@ -179,7 +187,7 @@ class FeedbackRecorder(FloatSystem, LeafSystem):
                 recording = self._finished(recording, is_safe=True)
                 empty = replace(recording, rows=(), times_s=(), plant_state=None)
                 recording = self._extended(context, empty, row)
-        state.get_mutable_discrete_state().set_value(np.zeros(latch.size))
+        state.get_mutable_discrete_state().set_value(self._closed_latch)
         state.get_mutable_abstract_state(int(self._index)).set_value(recording)
 
     def _extended(
