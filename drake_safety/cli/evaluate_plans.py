@@ -128,7 +128,7 @@ def evaluate_plans(
 
 def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> list[PlanRule]:
     from drake_safety.evaluation.plan_study import reachability_rule, scorer_rule
-    from drake_safety.evaluation.reachability import Reachability
+    from drake_safety.evaluation.reachability import BASELINES, Reachability
     from drake_safety.evaluation.scorers import assessment_scorer
 
     rules = [
@@ -138,7 +138,7 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     rules += [scorer_rule(scorer) for scorer in judged.classifiers]
     known = [hand for hand in hands if hand is not None]
     if known:
-        for name, is_free in (("reachability", False), ("reachability_free", True)):
+        for name, is_free in BASELINES.items():
             reach = {hand: Reachability(loop.robot, hand, is_base_free=is_free) for hand in known}
             rules.append(reachability_rule(reach, name))
     return rules

@@ -9,6 +9,8 @@ from pydrake.solvers import SnoptSolver
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot_model import RobotModel
 
+BASELINES = {"reachability": False, "reachability_free": True}
+"""Baselines by inverse kinematics, and whether the base moves in each."""
 _TOLERANCE_M = 2e-3  # Well above the residual of the solver at a reachable point.
 
 

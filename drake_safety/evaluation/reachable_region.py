@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.plan_study import SAFE
-from drake_safety.evaluation.reachability import Reachability
+from drake_safety.evaluation.reachability import BASELINES, Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.planning.goal_verdict import goal_inputs
@@ -35,8 +35,8 @@ class ReachableRegion:
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
         safety_probability: Normalised Γ there, (n_z, n_y).
         threshold: Γ_thre.
-        is_reachable: Whether inverse kinematics reaches each point, (n_z, n_y); None for a task
-            without a hand.
+        is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
+            (n_z, n_y); empty for a task without a hand.
         obstacle_y_m, obstacle_z_m: The grid of obstacle distances, (o_y,), (o_z,) [m].
         obstacle_distance_m: Signed distance to the nearest obstacle, at most 5 cm, (o_z, o_y) [m];
             None for a diagram without geometry.
@@ -49,7 +49,7 @@ class ReachableRegion:
     z_m: np.ndarray
     safety_probability: np.ndarray
     threshold: float
-    is_reachable: np.ndarray | None
+    is_reachable: dict[str, np.ndarray]
     obstacle_y_m: np.ndarray
     obstacle_z_m: np.ndarray
     obstacle_distance_m: np.ndarray | None
@@ -61,13 +61,11 @@ class ReachableRegion:
         """Shares of correct verdicts on the simulated grid.
 
         Returns:
-            `share_safe`, `sharpened.right` and `reachability.right`. Points of a grid are not a
-            random sample: the intervals only indicate their number.
+            `share_safe`, `sharpened.right`, and `NAME.right` for the names of `BASELINES`. Points
+            of a grid are not a random sample: the intervals only indicate their number.
         """
         is_safe = self.outcomes == SAFE
-        verdicts = {"sharpened": self.safety_probability >= self.threshold}
-        if self.is_reachable is not None:
-            verdicts["reachability"] = self.is_reachable
+        verdicts = {"sharpened": self.safety_probability >= self.threshold, **self.is_reachable}
         estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
@@ -122,18 +120,20 @@ def reachable_region(
     outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
 
     targets = _targets(x_m, *fine)
-    reachability = None
+    reachability = {}
     if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
-        reachability = Reachability(loop.robot, loop.hand)
+        for name, is_base_free in BASELINES.items():
+            reachability[name] = Reachability(loop.robot, loop.hand, is_base_free=is_base_free)
     scorer = assessment_scorer("sharpened", assessment, "calibrated")
-    probability, reachable = [], []
+    probability = []
+    reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
     for start in range(0, len(targets), _REPORT_EVERY):
         if progress is not None:
             progress("verdicts on the plane", start, len(targets))
         chunk = targets[start : start + _REPORT_EVERY]
         probability.append(scorer.probability(*goal_inputs(loop, chunk)))
-        if reachability is not None:
-            reachable.append(reachability.is_reachable(chunk))
+        for name, kinematics in reachability.items():
+            reachable[name].append(kinematics.is_reachable(chunk))
     if progress is not None:
         progress("verdicts on the plane", len(targets), len(targets))
     shape = (len(fine[1]), len(fine[0]))
@@ -145,7 +145,7 @@ def reachable_region(
         z_m=fine[1],
         safety_probability=np.concatenate(probability).reshape(shape),
         threshold=threshold,
-        is_reachable=np.concatenate(reachable).reshape(shape) if reachable else None,
+        is_reachable={name: np.concatenate(one).reshape(shape) for name, one in reachable.items()},
         obstacle_y_m=edge[0],
         obstacle_z_m=edge[1],
         obstacle_distance_m=None if distance is None else distance.reshape(len(edge[1]), -1),

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 _SAFE_TINT = "#bcd3ec"
 _UNSAFE_TINTS = ("#f6d3c2", "#f3e2b3", "#e3d2ec", "#d9d9d9", "#f2c4d6", "#cfe3d4")
-_KINEMATICS_DASHES = (0, (4, 2))
+_KINEMATICS = {
+    "reachability": ((0, (4, 2)), "inverse kinematics, fixed base"),
+    "reachability_free": ((0, (1, 1.5)), "inverse kinematics, free base"),
+}
 
 
 def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figure:
@@ -67,24 +70,16 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
         handles.append(
             Line2D([], [], color=UNSAFE_COLOUR, lw=2.4, label=f"Γ = {region.threshold:.2f}")
         )
-        if region.is_reachable is not None:
+        for name, is_reachable in region.is_reachable.items():
+            dashes, label = _KINEMATICS[name]
             axes.contour(
-                *_closed(region.y_m, region.z_m, region.is_reachable.astype(float)),
+                *_closed(region.y_m, region.z_m, is_reachable.astype(float)),
                 levels=[0.5],
                 colors=[SAFE_COLOUR],
                 linewidths=2.0,
-                linestyles=[_KINEMATICS_DASHES],
+                linestyles=[dashes],
             )
-            handles.append(
-                Line2D(
-                    [],
-                    [],
-                    color=SAFE_COLOUR,
-                    lw=2.0,
-                    ls=_KINEMATICS_DASHES,
-                    label="inverse kinematics",
-                )
-            )
+            handles.append(Line2D([], [], color=SAFE_COLOUR, lw=2.0, ls=dashes, label=label))
         axes.set_aspect("equal")
         half_y, half_z = 0.5 * (y[1] - y[0]), 0.5 * (z[1] - z[0])
         axes.set_xlim(y[-1] + half_y, y[0] - half_y)
