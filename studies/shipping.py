@@ -17,10 +17,9 @@ import numpy as np
 
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
-from drake_safety.evaluation.throw_study import PAPER_THRESHOLD
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
-from drake_safety.learning.calibration import PLAN, SAFE, UNSAFE
+from drake_safety.learning.calibration import PLAN
 from drake_safety.learning.segments import split
 from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
@@ -67,8 +66,7 @@ def ship(
         if not file.is_file():
             raise ValueError(f"ship: there is no '{mode}' assessment at {file}: train both modes")
         assessments[mode] = SafetyAssessment.load(file)
-        # The paper has its own threshold.
-        if mode != "paper" and PLAN not in assessments[mode].calibrations_:
+        if PLAN not in assessments[mode].calibrations_:
             raise ValueError(
                 f"ship: {file} holds no calibrated threshold: `drake-safety calibrate` chooses one;"
                 " evaluate after that"
@@ -194,12 +192,7 @@ def first_verdicts(
     for mode, assessment in assessments.items():
         scorer = assessment_scorer(mode, assessment, "calibrated")
         gamma = 1.0 - scorer.unsafe_score(first)
-        if PLAN in assessment.calibrations_:
-            verdicts = assessment.calibrations_[PLAN].verdicts(gamma)
-        else:
-            literal = assessment_scorer(mode, assessment, "safety_probability")
-            is_accepted = 1.0 - literal.unsafe_score(first) >= PAPER_THRESHOLD
-            verdicts = np.where(is_accepted, SAFE, UNSAFE)
+        verdicts = assessment.calibrations_[PLAN].verdicts(gamma)
         for position, verdict, value in zip(first.episode, verdicts, gamma, strict=True):
             entries[position][mode] = {
                 "verdict": str(verdict),

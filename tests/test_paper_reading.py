@@ -37,16 +37,7 @@ def map_data(x, target):
 
 
 def trained(data, reading, held_out=None):
-    parameters = replace(
-        paper(paper=reading),
-        hidden_sizes=reading.hidden_sizes,
-        dropout=reading.dropout,
-        epochs=reading.epochs,
-        target_weight=1.0,
-        safety_weight=0.0,
-        margin_weight=0.0,
-        batch_size=64,
-    )
+    parameters = paper(paper=reading, batch_size=64).of_maps()
     return stack_members([train_map(data, parameters, seed=0, held_out=held_out)], num_margins=0)
 
 

@@ -195,7 +195,7 @@ def test_what_was_not_evaluated_as_it_is_is_not_shipped(
 ):
     folder, into = tmp_path / "run", tmp_path / "into"
     shutil.copytree(run[1], folder, ignore=shutil.ignore_patterns("fresh"))
-    file = assessment_file(folder, "sharpened" if change == "uncalibrated" else "paper")
+    file = assessment_file(folder, "paper")
     learned = SafetyAssessment.load(file)
     if change == "gone":
         file.unlink()

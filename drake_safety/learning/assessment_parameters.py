@@ -1,6 +1,7 @@
 """The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 from drake_safety.learning.distance import BACKENDS, WARPING_COSTS
 
@@ -286,6 +287,20 @@ class AssessmentParameters:
     def stride(self) -> int:
         """Rows between the starts of segments: one when sharpened."""
         return 1 if self.is_sharpened else self.preview_stride * (self.paper.stride or self.horizon)
+
+    def of_maps(self) -> Self:
+        """The parameters with which the maps are trained: in the paper's mode, those of `paper`."""
+        if self.is_sharpened:
+            return self
+        return replace(
+            self,
+            hidden_sizes=self.paper.hidden_sizes,
+            dropout=self.paper.dropout,
+            epochs=self.paper.epochs,
+            target_weight=1.0,
+            safety_weight=0.0,
+            margin_weight=0.0,
+        )
 
     @property
     def shortest(self) -> int:

@@ -192,17 +192,7 @@ def _train(
     progress: Callable[[float], None] | None,
     held_out: MapData | None = None,
 ) -> Embedding:
-    if not parameters.is_sharpened:
-        reading = parameters.paper
-        parameters = replace(
-            parameters,
-            hidden_sizes=reading.hidden_sizes,
-            dropout=reading.dropout,
-            epochs=reading.epochs,
-            target_weight=1.0,
-            safety_weight=0.0,
-            margin_weight=0.0,
-        )
+    parameters = parameters.of_maps()
     num_members = parameters.num_members
     members = []
     for member in range(num_members):
