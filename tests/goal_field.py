@@ -61,4 +61,5 @@ class FieldAssessment:
             predicted_margins=np.column_stack([gamma - 0.5, np.full(n, 0.02)]),
             unsafe_logit=np.zeros(n),
             calibrated=gamma,
+            novelty=np.zeros(len(gamma)),
         )

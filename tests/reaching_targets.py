@@ -17,12 +17,15 @@ def made_up_episodes(loop):
 
     What the assessment sees of them is real; what came of them is not, so that it is known.
     """
-    goals = np.random.default_rng(0).uniform(*loop.target_box, (160, 3))
+    rng = np.random.default_rng(0)
+    goals = rng.uniform(*loop.target_box, (160, 3))
     episodes = []
     columns = zip(goals, *goal_inputs(loop, goals), strict=True)
     for index, (goal, state, preview, features) in enumerate(columns):
         margins = np.full((loop.scenario.num_steps + 1, len(loop.constraint_names)), 0.1)
         shape = (len(margins), 1)
+        # No two robots stand alike, nor does one with the other hand.
+        state, features = (part + rng.normal(0.0, 0.01, part.shape) for part in (state, features))
         is_safe = bool(goal[0] < BOUNDARY_M)
         column = loop.constraint_names.index(CAUSE)
         margins[:, column] = np.linspace(0.05, 0.05 if is_safe else -0.02, len(margins))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,8 @@ def data():
         margins=(0.02 * (0.5 - x[:, :1])),
         sample_weight=np.ones(600),
         input_scale=np.ones(4),
+        neighbours=np.full((600, 1), -1),
+        tsne_unit=1.0,
     )
 
 
@@ -127,15 +131,12 @@ def test_a_sample_weight_draws_the_map_towards_its_samples(data):
     is_unsafe = np.where(contrary, ~data.is_unsafe, data.is_unsafe)
     x = data.x.copy()
     x[contrary, 2] += 2.0
-    shared = {"x": x, "has_target": data.has_target, "target": data.target, "is_unsafe": is_unsafe}
-    shared["margins"] = data.margins
     settings = AssessmentParameters(**{**vars(SETTINGS), "epochs": 4})
     agreement = []
     for weight in (0.01, 20.0):
         sample_weight = np.where(contrary, weight, 1.0)
-        trained = train_map(
-            MapData(**shared, sample_weight=sample_weight, input_scale=np.ones(4)), settings, seed=0
-        )
+        changed = replace(data, x=x, is_unsafe=is_unsafe, sample_weight=sample_weight)
+        trained = train_map(changed, settings, seed=0)
         logit = stack_members([trained], num_margins=1).evaluate(x[contrary]).unsafe_logit[0]
         agreement.append(((logit > 0.0) == is_unsafe[contrary]).mean())
     assert agreement[1] > agreement[0]

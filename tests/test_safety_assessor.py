@@ -13,7 +13,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
-PERIOD_S = 0.04
+PERIOD_S, NOVELTY = 0.04, 0.7
 STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0, 8.0, 9.0])
 
 
@@ -61,6 +61,7 @@ class AssessmentDouble:
             embedding=np.array([3.0, -4.0]),
             predicted_margins=np.array([0.01, np.nan]),
             calibrated=calibrated,
+            novelty=NOVELTY,
         )
 
 
@@ -91,6 +92,7 @@ def test_its_ports_have_the_sizes_the_assessment_was_learned_with():
         "cause_probability": 2,
         "predicted_margins": 2,
         "calibrated_safety_probability": 1,
+        "novelty": 1,
     }
     assert {n: assessor.GetInputPort(n).size() for n in inputs} == inputs
     assert {n: assessor.GetOutputPort(n).size() for n in outputs} == outputs
@@ -113,6 +115,7 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
         "cause_probability": [0.2, 0.3],
         "predicted_margins": [0.01, np.nan],
         "calibrated_safety_probability": [0.25],
+        "novelty": [NOVELTY],
     }
     for name, numbers in expected.items():
         np.testing.assert_allclose(value(assessor, context, name), numbers)

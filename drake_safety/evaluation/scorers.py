@@ -9,7 +9,6 @@ import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
 
@@ -57,10 +56,7 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
         result = assessment.predict(
             state, desired_preview, features if assessment.uses_features else None
         )
-        probability = getattr(result, published)
-        if published == "calibrated":
-            mu = assessment.parameters.initial_uncertainty
-            return np.where(is_unknown(result.belief, mu), 0.0, probability)
+        probability: np.ndarray = getattr(result, published)
         return probability
 
     return Scorer(

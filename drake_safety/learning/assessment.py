@@ -26,10 +26,11 @@ from drake_safety.learning.feedback import (
     used_episodes,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import check_width, inputs
+from drake_safety.learning.inputs import check_width, input_names, inputs
+from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
-from drake_safety.learning.segments import Episodes, EpisodesInfo
+from drake_safety.learning.segments import Episodes, EpisodesInfo, split
 from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.training import learned_maps, segments_for
 
@@ -59,6 +60,7 @@ class SafetyAssessment:
       training segments, (K, N, 2), (N,), (N,), from which adaptation starts; for maps with heads
       also `training_heads_` and `training_nearest_`, and `training_target_` if the discrepancy is
       predicted there, see `TrainingScores`, (N, 2), (N,), (N, 2).
+    - `novelty_`: the `Novelty`, which says which inputs are unlike those of training.
     - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
     - `adaptation_`: the `Adaptation` to feedback; initially None.
@@ -122,6 +124,14 @@ class SafetyAssessment:
         )
         self.embedding_, base_logit, target = learned_maps(
             segments, has_target, x, self.grid_, parameters, progress
+        )
+        every = split(episodes, stride=1, discount=1.0, shortest=1)
+        self.novelty_ = Novelty.fit(
+            # With noise in either mode, as on a robot.
+            self._inputs(every.state, every.desired_preview, every.features),
+            every.episode,
+            every.is_unsafe,
+            parameters.novelty_rate,
         )
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
@@ -334,7 +344,8 @@ class SafetyAssessment:
             correction: Correction of the base logit; `correction_` by default.
 
         Returns:
-            The assessments. Inputs that are not finite get the empty belief, where Γ is 0.
+            The assessments. Novel inputs and those that are not finite get the empty belief, where
+            Γ is 0.
 
         Raises:
             ValueError: A width or a shape is wrong, or the assessment is not fitted.
@@ -354,6 +365,8 @@ class SafetyAssessment:
             beliefs=beliefs,
             correction=correction,
             base_logit=self.base_logit_,
+            novelty=self.novelty_,
+            initial_uncertainty=self.parameters.initial_uncertainty,
             is_sharpened=self.parameters.is_sharpened,
         )
 
@@ -375,6 +388,27 @@ class SafetyAssessment:
             correction=correction,
         )
         return result.one(0)
+
+    def strangest_input(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None = None,
+    ) -> tuple[str, float]:
+        """Returns the entry of x that contradicts the others most, and by how much.
+
+        The arguments are those of `predict_one`.
+
+        Returns:
+            Its name, as in `inputs.input_names`, and the difference from what the other entries
+            say, in standard deviations of training.
+        """
+        self._check_fitted()
+        found = self.novelty_.gaussian.contradictions(
+            self._inputs(state, desired_preview, features)
+        )
+        column = int(np.argmax(np.abs(found)))
+        return input_names(self.info_, self.parameters)[column], float(found[column])
 
     def unsafe_logits(
         self,

@@ -22,15 +22,16 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import num_inputs
+from drake_safety.learning.novelty import Gaussian, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
-_MAPS, _CORRECTION = "embedding.", "correction."
+_MAPS, _CORRECTION, _NOVELTY = "embedding.", "correction.", "novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
     "training_points": (np.float32, np.float32),
     "training_score": (np.float32, float),
@@ -58,12 +59,15 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     tensors |= {f"{_CORRECTION}{name}": value for name, value in asdict(correction).items()}
     tensors["correction.guard"] = correction.guard.astype(np.uint8)
     tensors["beliefs"] = learned["beliefs_"]
+    novelty = learned["novelty_"]
+    tensors |= {f"{_NOVELTY}{name}": value for name, value in vars(novelty.gaussian).items()}
     for name, (stored, _) in _TRAINING.items():
         if learned[f"{name}_"] is not None:
             tensors[name] = learned[f"{name}_"].astype(stored)
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,
+        "novelty_limit": novelty.limit,
         "base_logit": None if base_logit is None else asdict(base_logit),
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
         "used": [asdict(one) for one in learned["used_"]],
@@ -144,6 +148,7 @@ def _learned(
         base_logit = BaseLogit(**base_logit | {"margin_range": (low, high)})
     correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
     correction["guard"] = correction["guard"].astype(float)
+    gaussian = {field.name: tensors[f"{_NOVELTY}{field.name}"] for field in fields(Gaussian)}
     calibrations = [Calibration(**one) for one in numbers["calibrations"]]
     adaptation = entries["adaptation"]
     learned: dict[str, Any] = {
@@ -153,6 +158,7 @@ def _learned(
         "base_logit_": base_logit,
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
+        "novelty_": Novelty(gaussian=Gaussian(**gaussian), limit=float(numbers["novelty_limit"])),
         "calibrations_": {one.kind: one for one in calibrations},
         "used_": _used(info, calibrations, numbers.get("used")),
         "adaptation_": None if adaptation is None else Adaptation(**adaptation),
@@ -169,6 +175,8 @@ def _learned(
         "correction.hidden": (embedding.num_members, embedding.num_activations + 1),
         "correction.hidden_range": (2,),
         "correction.guard": cells,
+        "novelty.mean": (expected_inputs,),
+        "novelty.precision_root": (expected_inputs, expected_inputs),
     }
     for name, shape in expected.items():
         if tensors[name].shape != shape:

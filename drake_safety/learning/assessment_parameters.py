@@ -94,6 +94,9 @@ class PaperReading:
             paper does not say; raw columns weigh as their spread in SI units.
         loss: "squared", the mean of ||y - Psi(x)||^2, or "norm", literally "the cost function
             ||y - Psi(x)||_2".
+        neighbour_weight: Share of a second term of the loss, that of parametric t-SNE: neighbours
+            under Omega become neighbours in the plane for inputs on which Psi cannot reproduce y. 0
+            leaves the paper's loss alone.
         hidden_sizes: Widths of the layers of Psi, "a deep neural network".
         dropout: Dropout rate.
         weight_decay: Weight decay of AdamW.
@@ -106,6 +109,7 @@ class PaperReading:
     velocities: bool = True
     standardized: bool = False
     loss: str = "squared"
+    neighbour_weight: float = 0.0
     hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
     dropout: float = 0.3
     weight_decay: float = 0.01
@@ -120,6 +124,8 @@ class PaperReading:
         _expect(self, "epochs", self.epochs >= 1, ">= 1")
         for name in ("dropout", "held_out"):
             _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
+        share = self.neighbour_weight
+        _expect(self, "neighbour_weight", 0.0 <= share <= 1.0, "a value in [0, 1]")
 
 
 @dataclass(kw_only=True)
@@ -155,6 +161,7 @@ class AssessmentParameters:
             one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
         initialization: Initial points of t-SNE: "spectral", which keeps the global order, or
             "random".
+        novelty_rate: Share of safe episodes in which an input may be novel, see `novelty.Novelty`.
         seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments per training step.
@@ -196,6 +203,7 @@ class AssessmentParameters:
     perplexity: float = 30.0
     exaggeration: float = 4.0
     initialization: str = "spectral"
+    novelty_rate: float = 0.01
     seed: int = 0
     learning_rate: float = 2e-3
     batch_size: int = 512
@@ -261,6 +269,7 @@ class AssessmentParameters:
             0 <= self.shortest_segment <= self.horizon,
             "a value in 0..horizon",
         )
+        _expect(self, "novelty_rate", 0.0 < self.novelty_rate < 1.0, "a value in (0, 1)")
         for name in ("perplexity", "exaggeration"):
             _expect(self, name, getattr(self, name) >= 1.0, ">= 1")
         for name in ("dropout", "held_out"):

@@ -32,7 +32,7 @@ _BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust agai
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Two thresholds of Γ = b_safe / (1 - μ) and their promised rates.
+    """Two thresholds of Γ, the calibrated safety probability, and their promised rates.
 
     The verdict is "safe" for Γ ≥ `threshold`, "unsafe" for Γ < `unsafe_below`, and "don't know" in
     between.

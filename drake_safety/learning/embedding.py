@@ -96,6 +96,9 @@ class MapData:
         margins: Smallest future margins, (N, n_c).
         sample_weight: Weight of each input in all losses, (N,).
         input_scale: Spread of each column of x after standardisation, (n_x,).
+        neighbours: Nearest neighbours under Omega of each input, as rows of x, (N, k); -1 for an
+            input without a point in t-SNE or a neighbour that was not selected.
+        tsne_unit: Length of t-SNE's unit in that of the target.
     """
 
     x: np.ndarray
@@ -105,9 +108,13 @@ class MapData:
     margins: np.ndarray
     sample_weight: np.ndarray
     input_scale: np.ndarray
+    neighbours: np.ndarray
+    tsne_unit: float
 
     def take(self, rows: np.ndarray) -> MapData:
         """Selects inputs by a mask (N,)."""
+        # The last entry is that of no neighbour.
+        position = np.append(np.where(rows, np.cumsum(rows) - 1, -1), -1)
         return MapData(
             x=self.x[rows],
             has_target=self.has_target[rows],
@@ -116,6 +123,8 @@ class MapData:
             margins=self.margins[rows],
             sample_weight=self.sample_weight[rows],
             input_scale=self.input_scale,
+            neighbours=position[self.neighbours[rows]],
+            tsne_unit=self.tsne_unit,
         )
 
 
@@ -168,9 +177,10 @@ def _train(
     has_safety, has_margins = parameters.safety_weight > 0.0, parameters.margin_weight > 0.0
     mean = data.x.mean(axis=0)
     spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
-    weight_decay, has_norm = 1e-4, False
+    weight_decay, has_norm, neighbour_weight = 1e-4, False, 0.0
     if not parameters.is_sharpened:
         weight_decay, has_norm = reading.weight_decay, reading.loss == "norm"
+        neighbour_weight = reading.neighbour_weight
         if not reading.standardized:
             spread = np.ones(len(mean))
     target_scale = float(data.target.std())
@@ -185,6 +195,7 @@ def _train(
         target[has_target] = torch.from_numpy((data.target / target_scale).astype(np.float32))
         weight = torch.from_numpy(np.asarray(data.sample_weight, dtype=np.float32))
         target_weight = weight * has_target
+        neighbours = torch.from_numpy(np.asarray(data.neighbours, dtype=np.int64))
         is_unsafe = torch.from_numpy(np.asarray(data.is_unsafe, dtype=np.float32))
         low, high = parameters.margin_range
         clipped = np.clip(data.margins, low, high) / parameters.margin_unit
@@ -216,6 +227,13 @@ def _train(
                     * (target_weight[batch] * distance).mean()
                     / mean_target_weight
                 )
+                if neighbour_weight > 0.0:
+                    chosen = torch.randint(neighbours.shape[1], (len(batch),))
+                    neighbour = neighbours[batch, chosen]
+                    other = net["output"](net["trunk"](x[neighbour.clamp(min=0)]))[:, :2]
+                    contrast = _neighbour_loss(torch, y, other, target_scale / data.tsne_unit)
+                    contrast = (contrast * (neighbour >= 0)).mean()
+                    loss = (1.0 - neighbour_weight) * loss + neighbour_weight * contrast
                 if has_safety:
                     logit = net["safety"](y)[:, 0]
                     entropy = functional.binary_cross_entropy_with_logits(
@@ -234,6 +252,23 @@ def _train(
                 progress((epoch + 1) / parameters.epochs)
         best.restore(net)
     return _folded_weights(net, mean, spread, target_scale, num_margins, parameters)
+
+
+def _neighbour_loss(torch: Any, y: Any, neighbour: Any, unit: float) -> Any:
+    """The loss of parametric t-SNE for inputs and one neighbour of each, (N,).
+
+    InfoNC-t-SNE (Damrich et al., 2023), whose expectation over neighbours is KL(P || Q) of t-SNE up
+    to a constant: -log(q / (q + sum of those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
+
+    Args:
+        torch: The module.
+        y: Points of the inputs, (N, 2).
+        neighbour: Point of one neighbour of each, (N, 2).
+        unit: Length of y's unit in that of t-SNE.
+    """
+    near = 1.0 / (1.0 + (unit * (y - neighbour)).square().sum(dim=1))
+    others = 1.0 / (1.0 + (unit * (y[:, None] - y[None])).square().sum(dim=2))
+    return torch.log1p((others.sum(dim=1) - 1.0) / near)
 
 
 class _BestWeights:

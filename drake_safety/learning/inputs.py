@@ -56,6 +56,17 @@ def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:
     return width
 
 
+def input_names(info: EpisodesInfo, parameters: AssessmentParameters) -> list[str]:
+    """Returns the names of the columns of x, (n_x,); previews are counted from 0."""
+    is_used = used_states(info, parameters)
+    names = [name for name, used in zip(info.state_names, is_used, strict=True) if used]
+    names += [f"desired {name} [{k}]" for k in range(info.horizon) for name in info.output_names]
+    if parameters.is_sharpened:
+        names += info.feature_names
+        names += [f"asinh {name}" for name in info.feature_names if parameters.feature_unit]
+    return names
+
+
 def check_width(num_columns: int, info: EpisodesInfo, parameters: AssessmentParameters) -> None:
     """Checks the width of x.
 

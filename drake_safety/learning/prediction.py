@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.grid import OUTSIDE, Grid
+from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 LOGIT_LIMIT = 8.0
@@ -23,14 +24,17 @@ class Assessments:
     Attributes:
         safety_probability: Γ = b_safe, (N,). At most 1 - mu: not a calibrated probability.
         normalized: b_safe / (1 - mu), the safe share of the known mass, (N,); 0 where mu is 1.
-        belief: (b_safe, b_unsafe, mu), (N, 3); empty for inputs that are not finite.
+        belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs.
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
         unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN without a head.
         calibrated: Calibrated probability of safety from the base logit with the correction by
-            feedback, (N,); 0 where mu is 1. Without heads equal to `normalized`.
+            feedback, (N,); 0 where the belief is "don't know", see `is_unknown`. Without heads
+            otherwise equal to `normalized`.
+        novelty: Distance of x from the training inputs in units of the largest known one, (N,);
+            novel above 1, infinite for inputs that are not finite.
     """
 
     safety_probability: np.ndarray
@@ -41,6 +45,7 @@ class Assessments:
     predicted_margins: np.ndarray
     unsafe_logit: np.ndarray
     calibrated: np.ndarray
+    novelty: np.ndarray
 
     def one(self, row: int) -> Assessment:
         """Returns the assessment in one row."""
@@ -52,6 +57,7 @@ class Assessments:
             embedding=self.embedding[row],
             predicted_margins=self.predicted_margins[row],
             calibrated=float(self.calibrated[row]),
+            novelty=float(self.novelty[row]),
         )
 
 
@@ -66,6 +72,7 @@ class Assessment:
     embedding: np.ndarray
     predicted_margins: np.ndarray
     calibrated: float
+    novelty: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,9 +193,11 @@ def predict(
     beliefs: np.ndarray,
     correction: Correction,
     base_logit: BaseLogit | None,
+    novelty: Novelty,
+    initial_uncertainty: float,
     is_sharpened: bool,
 ) -> Assessments:
-    """Assesses inputs; rows that are not finite get the empty belief.
+    """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
     Args:
         x: Inputs, (N, n_x).
@@ -197,6 +206,8 @@ def predict(
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
         correction: Correction of the base logit by feedback.
         base_logit: The base logit; None without heads.
+        novelty: Says which inputs are novel.
+        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)
@@ -209,6 +220,10 @@ def predict(
     # A map whose output lies outside its grid contributes the empty belief.
     masses[:, belief_masses.UNCERTAINTY] += is_outside.sum(axis=0)
     masses /= num_members
+    # Departure: beyond the training inputs the maps place x in cells of others.
+    distance = novelty.of(x)
+    masses[distance > 1.0] = 0.0
+    masses[distance > 1.0, belief_masses.UNCERTAINTY] = 1.0
     safe = masses[:, belief_masses.SAFE]
     # A sum instead of 1 - mu, so that rounding cannot raise the share above one.
     known = safe + masses[:, belief_masses.UNSAFE]
@@ -225,6 +240,7 @@ def predict(
             residual[is_known] = correction.residual(embedding, x[is_known])
             shift = correction.shift(heads, residual, guard)
         calibrated[is_known] = sigmoid(-base_logit.of_heads(heads) - shift)[is_known]
+    calibrated[is_unknown(masses, initial_uncertainty)] = 0.0
     margins = np.full((len(x), num_columns - 3), np.nan)
     if output.margins.shape[2]:
         margins = output.margins.mean(axis=0)
@@ -238,6 +254,7 @@ def predict(
         predicted_margins=margins,
         unsafe_logit=output.unsafe_logit.mean(axis=0),
         calibrated=calibrated,
+        novelty=distance,
     )
 
 

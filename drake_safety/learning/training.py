@@ -21,6 +21,8 @@ from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
+_NUM_NEIGHBOURS = 15
+"""Nearest neighbours of a segment in the loss of parametric t-SNE, as in its publication."""
 _INSIDE_SHARE = 0.995
 """Quantile of the inputs whose outputs are scaled to the extent of t-SNE's points."""
 _logger = logging.getLogger("drake_safety")
@@ -112,14 +114,20 @@ def learned_maps(
         seed=parameters.seed,
         progress=stage("t-SNE"),
     )
+    target = grid.scale(points)
+    nearest = graph.indices[:, :_NUM_NEIGHBOURS]
+    neighbours = np.full((len(x), nearest.shape[1]), -1)
+    neighbours[has_target] = np.flatnonzero(has_target)[nearest]
     data = MapData(
         x=x,
         has_target=has_target,
-        target=grid.scale(points),
+        target=target,
         is_unsafe=segments.is_unsafe,
         margins=segments.future_margins,
         sample_weight=_sample_weight(segments, parameters),
         input_scale=_input_scale(x.shape[1], segments.features.shape[1], parameters),
+        neighbours=neighbours,
+        tsne_unit=float(target.std() / points.std()),
     )
     is_held_out = held_out_segments(segments, parameters)
     label = segments.is_unsafe[is_held_out]

@@ -142,8 +142,8 @@ def assess_goals(
 ) -> list[GoalVerdict]:
     """Assesses goals inside the region sampled in training.
 
-    The verdict is "don't know" where more than half of the belief comes from cells without
-    training data.
+    The verdict is "don't know" where the input is novel, or more than half of the belief comes from
+    cells without training data.
 
     Args:
         loop: A closed loop whose plans have a goal.
@@ -155,7 +155,8 @@ def assess_goals(
     if len(goals) == 0:
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
-    prediction = assessment.predict(*goal_inputs(loop, goals))
+    seen = goal_inputs(loop, goals)
+    prediction = assessment.predict(*seen)
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
@@ -168,7 +169,14 @@ def assess_goals(
                 f"Γ {probability:.3f} lies between {unsafe_below:.3f} and {threshold:.3f}, where "
                 "safe and unsafe targets cannot be distinguished"
             )
-        if has_no_data[i]:
+        if prediction.novelty[i] > 1.0:
+            verdict = UNKNOWN
+            name, deviation = assessment.strangest_input(*(part[i] for part in seen))
+            reason = (
+                f"the input is unlike those of training: '{name}' differs by {abs(deviation):.0f} "
+                "standard deviations from what the other entries say"
+            )
+        elif has_no_data[i]:
             verdict = UNKNOWN
             reason = "too little training data near this target's embedding"
         verdicts.append(

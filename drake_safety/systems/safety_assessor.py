@@ -19,6 +19,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import Correction
 from drake_safety.systems.float_system import FloatSystem
 
+_LARGEST_NOVELTY = 1e6
 _CORRECTION = tuple(field.name for field in fields(Correction))
 
 
@@ -40,14 +41,16 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         - embedding
         - predicted_margins
         - calibrated_safety_probability
+        - novelty
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
     b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
-    heads with the correction from feedback. The beliefs of the grid and the correction are numeric
+    heads with the correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the
+    distance of the inputs from those of training, novel above 1. The belief of inputs that are
+    novel or not finite is (0, 0, 1). The beliefs of the grid and the correction are numeric
     parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
-    between simulations and during them. The embedding is immutable. The belief of a state, preview
-    or feature that is not finite is (0, 0, 1).
+    between simulations and during them. The embedding is immutable.
 
     Args:
         assessment: A fitted assessment.
@@ -85,6 +88,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             "embedding": 2,
             "predicted_margins": n_c,
             "calibrated_safety_probability": 1,
+            "novelty": 1,
         }
         state = self.DeclareDiscreteState(sum(sizes.values()))
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
@@ -179,7 +183,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
                     prediction.cause_probability,
                     prediction.embedding,
                     prediction.predicted_margins,
-                    (prediction.calibrated,),
+                    (prediction.calibrated, min(prediction.novelty, _LARGEST_NOVELTY)),
                 ]
             )
         )

@@ -1,0 +1,130 @@
+"""Novelty: what no training input was like is not known, however sure the maps are of it."""
+
+import numpy as np
+import pytest
+
+from drake_safety import load_assessment, load_scenario
+from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.inputs import input_names
+from drake_safety.learning.novelty import Gaussian, Novelty
+
+ROWS, EPISODES = 20, 200
+
+
+def redundant(rng, num_episodes=EPISODES):
+    """Inputs whose third column is the sum of the others, whose fourth is constant."""
+    free = rng.normal(size=(num_episodes * ROWS, 2)) * [1.0, 100.0]
+    noise = 0.01 * rng.normal(size=len(free))
+    x = np.column_stack([free, free[:, 0] + 0.01 * free[:, 1] + noise, np.full(len(free), 7.0)])
+    return x, np.repeat(np.arange(num_episodes), ROWS)
+
+
+@pytest.fixture(scope="module")
+def novelty():
+    x, episode = redundant(np.random.default_rng(0))
+    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.05)
+
+
+def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
+    x, _ = redundant(np.random.default_rng(0))
+    x = x[:, :3]
+    distance = Gaussian.of(x).distance(x)
+    inverse = np.linalg.inv(np.cov(x.T, bias=True))
+    offset = x - x.mean(axis=0)
+    expected = np.sqrt(np.einsum("ij,jk,ik->i", offset, inverse, offset))
+    np.testing.assert_allclose(distance, expected, rtol=0.05)
+    scaled = x * [1e3, 1e-3, 1.0]
+    np.testing.assert_allclose(Gaussian.of(scaled).distance(scaled), distance, rtol=1e-6)
+
+
+def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty):
+    x, _ = redundant(np.random.default_rng(1))
+    assert (novelty.of(x) > 1.0).mean() < 0.01
+    shuffled = np.random.default_rng(2).permuted(x, axis=0)
+    assert (novelty.of(shuffled) > 1.0).mean() > 0.9
+    assert np.all(shuffled.max(axis=0) == x.max(axis=0))
+
+
+def test_the_promised_share_of_other_safe_episodes_has_a_novel_input(novelty):
+    x, episode = redundant(np.random.default_rng(3), num_episodes=2000)
+    is_novel = novelty.of(x) > 1.0
+    share = np.mean([is_novel[episode == i].any() for i in range(0, 2000, 2)])
+    assert 0.01 < share < 0.12
+
+
+def test_unsafe_episodes_widen_the_gaussian_and_not_the_limit():
+    x, episode = redundant(np.random.default_rng(0))
+    is_unsafe = episode % 4 == 0
+    x[is_unsafe, 0] *= 3.0
+    x[is_unsafe, 2] += 2.0 / 3.0 * x[is_unsafe, 0]
+    counted = Novelty.fit(x, episode, is_unsafe, rate=0.05)
+    assert counted.limit < Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05).limit
+
+
+def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_zero(novelty):
+    distance = novelty.of(np.array([[np.nan, 0.0, 0.0, 7.0], [0.0, 0.0, 0.0, 7.0]]))
+    assert distance[0] == np.inf
+    assert distance[1] < 0.5
+    assert novelty.of(np.array([[0.0, 0.0, 0.0, 7.001]]))[0] > 1.0
+
+
+def test_the_entry_that_contradicts_the_others_is_named(novelty):
+    x = np.array([0.5, 50.0, 1.0, 7.0])
+    assert np.abs(novelty.gaussian.contradictions(x)).max() < 3.0
+    found = novelty.gaussian.contradictions(x + [0.0, 0.0, 0.3, 0.0])
+    assert int(np.argmax(np.abs(found))) in (0, 1, 2)
+    assert found[2] == pytest.approx(30.0, rel=0.3)
+
+
+@pytest.fixture(scope="module", params=["laikago_balancing", "atlas_reaching"])
+def robot(request):
+    scenario = load_scenario(request.param)
+    loop = scenario.make_loop()
+    context = loop.CreateDefaultContext()
+    rng = np.random.default_rng(5)
+    rows = []
+    for _ in range(30):
+        loop.reset(context, rng)
+        names = ("state", "desired_preview", "features")
+        rows.append([loop.GetOutputPort(name).Eval(context).copy() for name in names])
+    return request.param, [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("mode", ["sharpened", "paper"])
+def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(robot, mode):
+    name, parts = robot
+    assessment = load_assessment(name, mode)
+    known = assessment.predict(*parts)
+    assert (known.novelty <= 1.0).mean() > 0.9
+    rng = np.random.default_rng(0)
+    result = assessment.predict(*(rng.permuted(part, axis=0) for part in parts))
+    assert (result.novelty > 1.0).all()
+    np.testing.assert_array_equal(result.belief, np.tile(EMPTY, (30, 1)))
+    for published in (result.safety_probability, result.normalized, result.calibrated):
+        assert not published.any()
+    assert not result.cause_probability.any()
+
+
+def test_what_is_not_known_is_not_taken_for_safe_in_any_calibrated_output(robot):
+    name, parts = robot
+    assessment = load_assessment(name, "sharpened")
+    beliefs = 0.1 * assessment.beliefs_
+    beliefs[..., UNCERTAINTY] = 1.0 - beliefs[..., SAFE] - beliefs[..., UNSAFE]
+    known, unknown = assessment.predict(*parts), assessment.predict(*parts, beliefs=beliefs)
+    assert known.calibrated.max() > 0.5
+    assert unknown.normalized.max() > 0.5
+    assert not unknown.calibrated.any()
+
+
+def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):
+    name, parts = robot
+    assessment = load_assessment(name, "sharpened")
+    state, *others = (part[0] for part in parts)
+    names = input_names(assessment.info_, assessment.parameters)
+    assert len(names) == len(assessment.novelty_.gaussian.mean)
+    column = assessment.info_.state_names.index(assessment.info_.state_names[-1])
+    found, deviation = assessment.strangest_input(
+        state + 100.0 * np.eye(len(state))[column], *others
+    )
+    assert found == assessment.info_.state_names[-1]
+    assert deviation > 30.0
