@@ -1,5 +1,7 @@
 """Novelty: what no training input was like is not known, however sure the maps are of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,23 @@ def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):
     )
     assert found == assessment.info_.state_names[-1]
     assert deviation > 30.0
+
+
+@pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])
+def test_a_robot_that_is_lifted_or_lies_is_in_no_state_of_training(name):
+    loop = load_scenario(name).make_loop()
+    context = loop.CreateDefaultContext()
+    start = loop.standing_start()
+    on_its_side = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+    for orientation, height_m in ((start.q[:4], 1.5), (on_its_side, 0.2)):
+        q = start.q.copy()
+        q[:4], q[6] = orientation, height_m
+        loop.reset_to(context, None, replace(start, q=q))
+        parts = [
+            loop.GetOutputPort(port).Eval(context)
+            for port in ("state", "desired_preview", "features")
+        ]
+        for mode in ("sharpened", "paper"):
+            result = load_assessment(name, mode).predict_one(*parts)
+            assert result.novelty > 1.0
+            np.testing.assert_array_equal(result.belief, EMPTY)
