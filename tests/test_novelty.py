@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_safety import load_assessment, load_scenario
+from drake_safety import SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.inputs import input_names
-from drake_safety.learning.novelty import Gaussian, Novelty
+from drake_safety.learning.novelty import Moments, Novelty
 
 ROWS, EPISODES = 20, 200
 
@@ -30,13 +30,14 @@ def novelty():
 def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
     x, _ = redundant(np.random.default_rng(0))
     x = x[:, :3]
-    distance = Gaussian.of(x).distance(x)
+    distance = Novelty(training=Moments.of(x), limit=1.0).of(x)
     inverse = np.linalg.inv(np.cov(x.T, bias=True))
     offset = x - x.mean(axis=0)
     expected = np.sqrt(np.einsum("ij,jk,ik->i", offset, inverse, offset))
     np.testing.assert_allclose(distance, expected, rtol=0.05)
     scaled = x * [1e3, 1e-3, 1.0]
-    np.testing.assert_allclose(Gaussian.of(scaled).distance(scaled), distance, rtol=1e-6)
+    again = Novelty(training=Moments.of(scaled), limit=1.0).of(scaled)
+    np.testing.assert_allclose(again, distance, rtol=1e-6)
 
 
 def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty):
@@ -72,10 +73,32 @@ def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_z
 
 def test_the_entry_that_contradicts_the_others_is_named(novelty):
     x = np.array([0.5, 50.0, 1.0, 7.0])
-    assert np.abs(novelty.gaussian.contradictions(x)).max() < 3.0
-    found = novelty.gaussian.contradictions(x + [0.0, 0.0, 0.3, 0.0])
+    assert np.abs(novelty.contradictions(x)).max() < 3.0
+    found = novelty.contradictions(x + [0.0, 0.0, 0.3, 0.0])
     assert int(np.argmax(np.abs(found))) in (0, 1, 2)
     assert found[2] == pytest.approx(30.0, rel=0.3)
+
+
+def test_moments_are_joined_as_if_all_inputs_had_been_given_at_once():
+    x, _ = redundant(np.random.default_rng(0))
+    joined, whole = Moments.of(x[:700]).joined(Moments.of(x[700:] + 1.0)), x.copy()
+    whole[700:] += 1.0
+    expected = Moments.of(whole)
+    assert joined.count == expected.count
+    np.testing.assert_allclose(joined.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(joined.covariance, expected.covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_what_an_actual_robot_did_is_known_after_adaptation(novelty):
+    x, _ = redundant(np.random.default_rng(4), num_episodes=100)
+    sagging = x + [0.0, 0.0, 0.3, 0.0]
+    assert (novelty.of(sagging) > 1.0).mean() > 0.9
+    adapted = novelty.with_feedback(sagging[:1000])
+    assert (adapted.of(sagging[1000:]) > 1.0).mean() < 0.05
+    assert (adapted.of(x) > 1.0).mean() < 0.01
+    # Other feedback replaces it.
+    assert (adapted.with_feedback(x).of(sagging) > 1.0).mean() > 0.9
+    assert (adapted.of(sagging + [0.0, 0.0, 3.0, 0.0]) > 1.0).all()
 
 
 @pytest.fixture(scope="module", params=["laikago_balancing", "atlas_reaching"])
@@ -123,13 +146,24 @@ def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):
     assessment = load_assessment(name, "sharpened")
     state, *others = (part[0] for part in parts)
     names = input_names(assessment.info_, assessment.parameters)
-    assert len(names) == len(assessment.novelty_.gaussian.mean)
+    assert len(names) == len(assessment.novelty_.training.mean)
     column = assessment.info_.state_names.index(assessment.info_.state_names[-1])
     found, deviation = assessment.strangest_input(
         state + 100.0 * np.eye(len(state))[column], *others
     )
     assert found == assessment.info_.state_names[-1]
     assert deviation > 30.0
+
+
+def test_a_file_keeps_what_is_known_from_training_and_from_feedback(robot, tmp_path):
+    name, parts = robot
+    assessment = load_assessment(name, "paper")
+    x = np.random.default_rng(0).normal(size=(50, len(assessment.novelty_.training.mean)))
+    assessment.novelty_ = assessment.novelty_.with_feedback(x)
+    assessment.save(tmp_path / "adapted.safetensors")
+    loaded = SafetyAssessment.load(tmp_path / "adapted.safetensors").novelty_
+    assert loaded.feedback.count == 50
+    np.testing.assert_array_equal(loaded.of(x), assessment.novelty_.of(x))
 
 
 @pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])

@@ -10,6 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
@@ -41,11 +42,13 @@ class AssessmentDouble:
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
         self.correction_ = correction(0.0)
         self.base_logit_ = object()
+        self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limit=1.0)
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
-        self.asked = []
+        self.asked, self.novelties = [], []
 
-    def predict_one(self, state, desired_preview, features, *, beliefs, correction):
+    def predict_one(self, state, desired_preview, features, *, beliefs, correction, novelty):
+        self.novelties.append(novelty)
         self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
         if not np.isfinite(state).all():
             safe, belief = 0.0, [0.0, 0.0, 1.0]
@@ -188,6 +191,8 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     simulator.AdvanceTo(PERIOD_S + 0.001)
     assert value(assessor, context, "safety_probability")[0] == 0.5
     assert value(assessor, context, "calibrated_safety_probability")[0] == 0.625
+    assert assessment.novelties[0] is assessment.novelty_
+    assert assessment.novelties[-1] is adapted.novelty_
     found = assessor.get_correction(context)
     for name in ("change", "hidden", "hidden_range", "guard"):
         np.testing.assert_array_equal(getattr(found, name), getattr(adapted.correction_, name))

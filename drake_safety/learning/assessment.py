@@ -216,6 +216,7 @@ class SafetyAssessment:
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
+        adapted.novelty_ = self.novelty_.with_feedback(self._feedback_inputs(feedback))
         adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
@@ -300,6 +301,11 @@ class SafetyAssessment:
             plain=not parameters.is_sharpened,
         )
 
+    def _feedback_inputs(self, feedback: Sequence[FeedbackSet]) -> np.ndarray:
+        """Returns the inputs of all rows of the actual robot, (N, n_x)."""
+        rows = [self._inputs(one.state, one.desired_preview, one.features) for one in feedback]
+        return np.concatenate(rows)
+
     def _inputs(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
@@ -333,6 +339,7 @@ class SafetyAssessment:
         *,
         beliefs: np.ndarray | None = None,
         correction: Correction | None = None,
+        novelty: Novelty | None = None,
     ) -> Assessments:
         """Assesses N inputs.
 
@@ -342,6 +349,7 @@ class SafetyAssessment:
             features: Features, (N, n_f); ignored in the paper's mode.
             beliefs: Beliefs of the cells; `beliefs_` by default, (K, R*R, 3 + n_c).
             correction: Correction of the base logit; `correction_` by default.
+            novelty: Says which inputs are novel; `novelty_` by default.
 
         Returns:
             The assessments. Novel inputs and those that are not finite get the empty belief, where
@@ -365,7 +373,7 @@ class SafetyAssessment:
             beliefs=beliefs,
             correction=correction,
             base_logit=self.base_logit_,
-            novelty=self.novelty_,
+            novelty=self.novelty_ if novelty is None else novelty,
             initial_uncertainty=self.parameters.initial_uncertainty,
             is_sharpened=self.parameters.is_sharpened,
         )
@@ -378,6 +386,7 @@ class SafetyAssessment:
         *,
         beliefs: np.ndarray | None = None,
         correction: Correction | None = None,
+        novelty: Novelty | None = None,
     ) -> Assessment:
         """Assesses one input; the arguments are those of `predict` without the axis N."""
         result = self.predict(
@@ -386,6 +395,7 @@ class SafetyAssessment:
             None if features is None else np.asarray(features)[None],
             beliefs=beliefs,
             correction=correction,
+            novelty=novelty,
         )
         return result.one(0)
 
@@ -404,9 +414,7 @@ class SafetyAssessment:
             say, in standard deviations of training.
         """
         self._check_fitted()
-        found = self.novelty_.gaussian.contradictions(
-            self._inputs(state, desired_preview, features)
-        )
+        found = self.novelty_.contradictions(self._inputs(state, desired_preview, features))
         column = int(np.argmax(np.abs(found)))
         return input_names(self.info_, self.parameters)[column], float(found[column])
 

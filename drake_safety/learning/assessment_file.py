@@ -22,7 +22,7 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import num_inputs
-from drake_safety.learning.novelty import Gaussian, Novelty
+from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
@@ -31,7 +31,8 @@ from drake_safety.learning.trained_maps import Embedding
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 6
 
-_MAPS, _CORRECTION, _NOVELTY = "embedding.", "correction.", "novelty."
+_MAPS, _CORRECTION = "embedding.", "correction."
+_NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
     "training_points": (np.float32, np.float32),
     "training_score": (np.float32, float),
@@ -60,7 +61,10 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     tensors["correction.guard"] = correction.guard.astype(np.uint8)
     tensors["beliefs"] = learned["beliefs_"]
     novelty = learned["novelty_"]
-    tensors |= {f"{_NOVELTY}{name}": value for name, value in vars(novelty.gaussian).items()}
+    moments = {_NOVELTY: novelty.training, _FEEDBACK_NOVELTY: novelty.feedback}
+    for prefix, one in moments.items():
+        if one is not None:
+            tensors[f"{prefix}mean"], tensors[f"{prefix}covariance"] = one.mean, one.covariance
     for name, (stored, _) in _TRAINING.items():
         if learned[f"{name}_"] is not None:
             tensors[name] = learned[f"{name}_"].astype(stored)
@@ -68,6 +72,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     numbers = {
         "num_margins": embedding.num_margins,
         "novelty_limit": novelty.limit,
+        "novelty_counts": [0 if one is None else one.count for one in moments.values()],
         "base_logit": None if base_logit is None else asdict(base_logit),
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
         "used": [asdict(one) for one in learned["used_"]],
@@ -148,7 +153,6 @@ def _learned(
         base_logit = BaseLogit(**base_logit | {"margin_range": (low, high)})
     correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
     correction["guard"] = correction["guard"].astype(float)
-    gaussian = {field.name: tensors[f"{_NOVELTY}{field.name}"] for field in fields(Gaussian)}
     calibrations = [Calibration(**one) for one in numbers["calibrations"]]
     adaptation = entries["adaptation"]
     learned: dict[str, Any] = {
@@ -158,7 +162,7 @@ def _learned(
         "base_logit_": base_logit,
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
-        "novelty_": Novelty(gaussian=Gaussian(**gaussian), limit=float(numbers["novelty_limit"])),
+        "novelty_": _novelty(numbers, tensors, expected_inputs),
         "calibrations_": {one.kind: one for one in calibrations},
         "used_": _used(info, calibrations, numbers.get("used")),
         "adaptation_": None if adaptation is None else Adaptation(**adaptation),
@@ -175,13 +179,37 @@ def _learned(
         "correction.hidden": (embedding.num_members, embedding.num_activations + 1),
         "correction.hidden_range": (2,),
         "correction.guard": cells,
-        "novelty.mean": (expected_inputs,),
-        "novelty.precision_root": (expected_inputs, expected_inputs),
     }
     for name, shape in expected.items():
         if tensors[name].shape != shape:
             raise ValueError(f"the shape of its {name} is {tensors[name].shape}, expected {shape}")
     return learned
+
+
+def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_columns: int) -> Novelty:
+    found: list[Moments | None] = []
+    for prefix, count in zip((_NOVELTY, _FEEDBACK_NOVELTY), numbers["novelty_counts"], strict=True):
+        if not count and prefix == _FEEDBACK_NOVELTY:
+            found.append(None)
+            continue
+        for name, shape in {"mean": (num_columns,), "covariance": (num_columns,) * 2}.items():
+            tensor = tensors[prefix + name]
+            if tensor.shape != shape or not np.isfinite(tensor).all():
+                raise ValueError(
+                    f"the shape of its {prefix}{name} is {tensor.shape}, expected {shape} of "
+                    "finite numbers"
+                )
+        found.append(
+            Moments(
+                count=int(count),
+                mean=tensors[f"{prefix}mean"],
+                covariance=tensors[f"{prefix}covariance"],
+            )
+        )
+    training, feedback = found
+    if training is None:
+        raise KeyError("novelty")
+    return Novelty(training=training, feedback=feedback, limit=float(numbers["novelty_limit"]))
 
 
 def _used(

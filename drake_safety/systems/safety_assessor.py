@@ -6,6 +6,7 @@ import math
 from dataclasses import fields
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -48,7 +49,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
     b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
     heads with the correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the
     distance of the inputs from those of training, novel above 1. The belief of inputs that are
-    novel or not finite is (0, 0, 1). The beliefs of the grid and the correction are numeric
+    novel or not finite is (0, 0, 1). The beliefs of the grid, the correction and the novelty are
     parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
     between simulations and during them. The embedding is immutable.
 
@@ -73,6 +74,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         correction = assessment.correction_
         self._correction_shapes = [getattr(correction, name).shape for name in _CORRECTION]
         self._correction_index = self.DeclareNumericParameter(BasicVector(_packed(correction)))
+        self._novelty_index = self.DeclareAbstractParameter(Value(assessment.novelty_))
         # Without heads there is no logit to correct.
         self._has_heads = assessment.base_logit_ is not None
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
@@ -148,7 +150,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         _replace(context, self._correction_index, _packed(correction))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over beliefs and correction of an assessment adapted from this system's own.
+        """Takes over what an assessment adapted from this system's own has learned.
 
         Args:
             context: This system's Context.
@@ -165,6 +167,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             )
         self.set_beliefs(context, adapted.beliefs_)
         self.set_correction(context, adapted.correction_)
+        context.get_mutable_abstract_parameter(self._novelty_index).set_value(adapted.novelty_)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         prediction = self._assessment.predict_one(
@@ -173,6 +176,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             self._features_port.Eval(context) if self.reads_features else self._no_features,
             beliefs=self.get_beliefs(context),
             correction=self.get_correction(context) if self._has_heads else None,
+            novelty=context.get_abstract_parameter(self._novelty_index).get_value(),
         )
         # In the order of the ports.
         discrete_state.set_value(
