@@ -156,7 +156,7 @@ def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):
 
 
 def test_a_file_keeps_what_is_known_from_training_and_from_feedback(robot, tmp_path):
-    name, parts = robot
+    name, _ = robot
     assessment = load_assessment(name, "paper")
     x = np.random.default_rng(0).normal(size=(50, len(assessment.novelty_.training.mean)))
     assessment.novelty_ = assessment.novelty_.with_feedback(x)
