@@ -9,16 +9,16 @@ from drake_safety import SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.inputs import input_names
 from drake_safety.learning.novelty import Moments, Novelty
+from drake_safety.simulation.capabilities import judging_options
 
 ROWS, EPISODES = 20, 200
 
 
 def redundant(rng, num_episodes=EPISODES):
-    """Inputs whose third column is the sum of the others, whose fourth is constant."""
+    """Inputs whose third column follows from the others, and whose fourth is constant."""
     free = rng.normal(size=(num_episodes * ROWS, 2)) * [1.0, 100.0]
-    noise = 0.01 * rng.normal(size=len(free))
-    x = np.column_stack([free, free[:, 0] + 0.01 * free[:, 1] + noise, np.full(len(free), 7.0)])
-    return x, np.repeat(np.arange(num_episodes), ROWS)
+    x = np.column_stack([free, free[:, 0] + 0.01 * free[:, 1], np.full(len(free), 7.0)])
+    return x + 1e-6 * rng.normal(size=x.shape), np.repeat(np.arange(num_episodes), ROWS)
 
 
 @pytest.fixture(scope="module")
@@ -28,16 +28,21 @@ def novelty():
 
 
 def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
-    x, _ = redundant(np.random.default_rng(0))
-    x = x[:, :3]
-    distance = Novelty(training=Moments.of(x), limit=1.0).of(x)
-    inverse = np.linalg.inv(np.cov(x.T, bias=True))
+    x = np.random.default_rng(0).normal(size=(4000, 3)) @ [[1.0, 0.5, 0.0], [0, 1, 0.2], [0, 0, 1]]
+    distance = Novelty(training=Moments.of(x), limits=np.ones(2)).of(x)
     offset = x - x.mean(axis=0)
+    inverse = np.linalg.inv(np.cov(x.T, bias=True))
     expected = np.sqrt(np.einsum("ij,jk,ik->i", offset, inverse, offset))
-    np.testing.assert_allclose(distance, expected, rtol=0.05)
-    scaled = x * [1e3, 1e-3, 1.0]
-    again = Novelty(training=Moments.of(scaled), limit=1.0).of(scaled)
+    np.testing.assert_allclose(distance, expected, rtol=1e-9)
+    scaled = x * [1e3, 0.1, 1.0]
+    again = Novelty(training=Moments.of(scaled), limits=np.ones(2)).of(scaled)
     np.testing.assert_allclose(again, distance, rtol=1e-6)
+
+
+def test_an_input_far_outside_the_range_is_novel_though_it_contradicts_nothing(novelty):
+    along = np.array([[0.5, 50.0, 1.0, 0.0]])
+    distances = novelty.distances(7.0 * np.eye(4)[3] + along * [[1.0], [20.0]]) / novelty.limits
+    np.testing.assert_array_equal(distances > 1.0, [[False, False], [True, False]])
 
 
 def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty):
@@ -58,25 +63,25 @@ def test_the_promised_share_of_other_safe_episodes_has_a_novel_input(novelty):
 def test_unsafe_episodes_widen_the_gaussian_and_not_the_limit():
     x, episode = redundant(np.random.default_rng(0))
     is_unsafe = episode % 4 == 0
-    x[is_unsafe, 0] *= 3.0
-    x[is_unsafe, 2] += 2.0 / 3.0 * x[is_unsafe, 0]
+    x[is_unsafe, :3] *= 3.0
     counted = Novelty.fit(x, episode, is_unsafe, rate=0.05)
-    assert counted.limit < Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05).limit
+    every = Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05)
+    assert counted.limits[0] < every.limits[0]
 
 
 def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_zero(novelty):
     distance = novelty.of(np.array([[np.nan, 0.0, 0.0, 7.0], [0.0, 0.0, 0.0, 7.0]]))
     assert distance[0] == np.inf
     assert distance[1] < 0.5
-    assert novelty.of(np.array([[0.0, 0.0, 0.0, 7.001]]))[0] > 1.0
+    assert novelty.of(np.array([[0.0, 0.0, 0.0, 7.1]]))[0] > 1.0
 
 
 def test_the_entry_that_contradicts_the_others_is_named(novelty):
     x = np.array([0.5, 50.0, 1.0, 7.0])
     assert np.abs(novelty.contradictions(x)).max() < 3.0
-    found = novelty.contradictions(x + [0.0, 0.0, 0.3, 0.0])
-    assert int(np.argmax(np.abs(found))) in (0, 1, 2)
-    assert found[2] == pytest.approx(30.0, rel=0.3)
+    found = np.abs(novelty.contradictions(x + [0.0, 0.0, 0.3, 0.0]))
+    assert set(np.argsort(found)[1:]) == {0, 1, 2}  # Any of the three may be wrong.
+    assert found[2] > 100.0
 
 
 def test_moments_are_joined_as_if_all_inputs_had_been_given_at_once():
@@ -91,20 +96,20 @@ def test_moments_are_joined_as_if_all_inputs_had_been_given_at_once():
 
 def test_what_an_actual_robot_did_is_known_after_adaptation(novelty):
     x, _ = redundant(np.random.default_rng(4), num_episodes=100)
-    sagging = x + [0.0, 0.0, 0.3, 0.0]
-    assert (novelty.of(sagging) > 1.0).mean() > 0.9
-    adapted = novelty.with_feedback(sagging[:1000])
-    assert (adapted.of(sagging[1000:]) > 1.0).mean() < 0.05
+    heavy = x + [30.0, 0.0, 30.0, 0.0]
+    assert (novelty.of(heavy) > 1.0).all()
+    adapted = novelty.with_feedback(heavy[:1000])
+    assert (adapted.of(heavy[1000:]) > 1.0).mean() < 0.05
     assert (adapted.of(x) > 1.0).mean() < 0.01
-    # Other feedback replaces it.
-    assert (adapted.with_feedback(x).of(sagging) > 1.0).mean() > 0.9
-    assert (adapted.of(sagging + [0.0, 0.0, 3.0, 0.0]) > 1.0).all()
+    # Other feedback replaces it, and what neither did is still novel.
+    assert (adapted.with_feedback(x).of(heavy) > 1.0).all()
+    assert (adapted.of(x + [300.0, 0.0, 300.0, 0.0]) > 1.0).all()
 
 
 @pytest.fixture(scope="module", params=["laikago_balancing", "atlas_reaching"])
 def robot(request):
     scenario = load_scenario(request.param)
-    loop = scenario.make_loop()
+    loop = scenario.make_loop(**judging_options(scenario.task_class()))
     context = loop.CreateDefaultContext()
     rng = np.random.default_rng(5)
     rows = []

@@ -71,7 +71,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,
-        "novelty_limit": novelty.limit,
+        "novelty_limits": novelty.limits.tolist(),
         "novelty_counts": [0 if one is None else one.count for one in moments.values()],
         "base_logit": None if base_logit is None else asdict(base_logit),
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
@@ -209,7 +209,7 @@ def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_column
     training, feedback = found
     if training is None:
         raise KeyError("novelty")
-    return Novelty(training=training, feedback=feedback, limit=float(numbers["novelty_limit"]))
+    return Novelty(training=training, feedback=feedback, limits=np.array(numbers["novelty_limits"]))
 
 
 def _used(

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 
 NUM_FOLDS = 5
-"""Folds of the episodes for the limit: every distance is from the inputs of other episodes."""
-_SMALLEST_SPREAD = 1e-4  # Of a column; constant ones would be divided by zero.
-_SMALLEST_VARIANCE = 1e-5  # Of the standardised inputs along an axis; they are redundant.
+"""Folds of the episodes for the limits: every distance is from the inputs of other episodes."""
+_SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
+# Variances of the standardised inputs along an axis:
+_REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
+_LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
+_LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs that much.
+_LEAST_LIMIT = 3.0  # Of the root mean square along the redundancies, against rounding.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,42 +45,55 @@ class Moments:
         between = share * (1.0 - share) * np.outer(shift, shift)
         return Moments(count=count, mean=self.mean + share * shift, covariance=within + between)
 
-    def precision_root(self) -> np.ndarray:
-        """Returns W with (x - mean) W of unit covariance, (n_x, n_x).
+    def whitenings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns W with (x - mean) W of unit covariance, for the range and for the redundancies.
 
-        The variance along axes of the standardised inputs has a lower bound: they are redundant.
+        The variance along the axes of the standardised inputs has a lower bound.
+
+        Returns:
+            (n_x, n_x) for all axes, and (n_x, m) for the m redundancies.
         """
         scale = np.maximum(np.sqrt(np.diag(self.covariance)), _SMALLEST_SPREAD)
         variance, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        return axes / np.sqrt(np.maximum(variance, _SMALLEST_VARIANCE)) / scale[:, None]
+        axes = axes / scale[:, None]
+        is_redundant = variance < _REDUNDANT_VARIANCE
+        redundant = np.maximum(variance[is_redundant], _LEAST_REDUNDANT_VARIANCE)
+        return (
+            axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE)),
+            axes[:, is_redundant] / np.sqrt(redundant),
+        )
 
 
 class Novelty:
-    """Says which inputs are beyond those of training, by their Mahalanobis distance.
+    """Says which inputs are beyond those of training, by two Mahalanobis distances.
 
-    x is redundant: features and preview follow from state and plan. A contradiction between them
-    lies along the axes of least variance, which the maps ignore. The object is immutable.
+    One is along all axes of the training inputs, with a tolerance: an input outside their range is
+    novel. The other is along their redundancies alone. Features and preview follow from state and
+    plan, in an actual robot as in the nominal one; an input that contradicts itself, such as the
+    features of another plan, is novel though every entry is within its range, and the maps ignore
+    these axes. The two distances are known in process monitoring as T^2 and SPE. The object is
+    immutable.
 
     Args:
         training: Moments of the training inputs.
-        limit: Largest distance of a known input.
+        limits: Largest distances of a known input, along all axes and along redundancies, (2,).
         feedback: Moments of an actual robot's inputs, which are known as well; None before
             adaptation.
     """
 
-    def __init__(self, *, training: Moments, limit: float, feedback: Moments | None = None):
-        self.training, self.limit, self.feedback = training, limit, feedback
+    def __init__(self, *, training: Moments, limits: np.ndarray, feedback: Moments | None = None):
+        self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         known = training if feedback is None else training.joined(feedback)
-        self._mean, self._precision_root = known.mean, known.precision_root()
+        self._mean, self._whitenings = known.mean, known.whitenings()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Novelty:
         return self
 
     @classmethod
     def fit(cls, x: np.ndarray, episode: np.ndarray, is_unsafe: np.ndarray, rate: float) -> Novelty:
-        """Computes the moments of training inputs and chooses the limit.
+        """Computes the moments of training inputs and chooses the limits.
 
-        The limit is exceeded somewhere in at most a share of `rate` of the safe episodes, each
+        Each limit is exceeded somewhere in at most a share of `rate` of the safe episodes, each
         judged by the moments of other episodes. Unsafe ones do not count: they lead out of what is
         known.
 
@@ -87,35 +104,49 @@ class Novelty:
             rate: Share of safe episodes with a novel input, in (0, 1).
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
-        distance = np.full(len(x), np.inf)
+        distances = np.full((len(x), 2), np.inf)
         for part in range(NUM_FOLDS):
             is_part = fold == part
             if is_part.any() and not is_part.all():
-                others = cls(training=Moments.of(x[~is_part]), limit=1.0)
-                distance[is_part] = others.of(x[is_part])
+                others = cls(training=Moments.of(x[~is_part]), limits=np.ones(2))
+                distances[is_part] = others.distances(x[is_part])
         counted = ~is_unsafe if not is_unsafe.all() else np.ones(len(x), dtype=bool)
         _, position = np.unique(episode[counted], return_inverse=True)
-        farthest = np.zeros(position.max() + 1)
-        np.maximum.at(farthest, position, distance[counted])
-        limit = np.quantile(farthest, 1.0 - rate, method="higher")
-        return cls(training=Moments.of(x), limit=float(limit))
+        farthest = np.zeros((position.max() + 1, 2))
+        np.maximum.at(farthest, position, distances[counted])
+        whole = cls(training=Moments.of(x), limits=np.ones(2))
+        limits = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
+        num_redundancies = whole._whitenings[1].shape[1]
+        limits[1] = max(limits[1], _LEAST_LIMIT * np.sqrt(num_redundancies), 1.0)
+        return cls(training=whole.training, limits=limits)
 
     def with_feedback(self, x: np.ndarray) -> Novelty:
         """Returns the novelty for which an actual robot's inputs (N, n_x) are known as well.
 
         They replace those of earlier feedback.
         """
-        return Novelty(training=self.training, limit=self.limit, feedback=Moments.of(x))
+        return Novelty(training=self.training, limits=self.limits, feedback=Moments.of(x))
+
+    def distances(self, x: np.ndarray) -> np.ndarray:
+        """Returns the distances of inputs (N, n_x) along all axes and redundancies, (N, 2).
+
+        Those of an input that is not finite are infinite.
+        """
+        offset = x - self._mean
+        found = []
+        for whitening in self._whitenings:
+            with np.errstate(invalid="ignore"):
+                whitened = offset @ whitening
+            squared = np.einsum("ij,ij->i", whitened, whitened)
+            found.append(np.sqrt(np.where(np.isnan(squared), np.inf, squared)))
+        return np.stack(found, axis=1)
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Returns the distances of inputs (N, n_x) in units of the limit, (N,); novel above 1.
+        """Returns the larger distance of inputs (N, n_x) in units of its limit, (N,).
 
-        The distance of an input that is not finite is infinite.
+        An input is novel above 1; that of an input that is not finite is infinite.
         """
-        with np.errstate(invalid="ignore"):
-            whitened = (x - self._mean) @ self._precision_root
-        squared = np.einsum("ij,ij->i", whitened, whitened)
-        return np.sqrt(np.where(np.isnan(squared), np.inf, squared)) / self.limit
+        return (self.distances(x) / self.limits).max(axis=1)
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each column is from what the other columns say, (n_x,).
@@ -125,5 +156,6 @@ class Novelty:
         Args:
             x: One input, (n_x,).
         """
-        precision = self._precision_root @ self._precision_root.T
+        whitening = np.concatenate(self._whitenings, axis=1)
+        precision = whitening @ whitening.T
         return precision @ (x - self._mean) / np.sqrt(np.diag(precision))
