@@ -117,6 +117,8 @@ def summary_text(results: Results) -> str:
             **{f"plans.{method}": _named(method) for method in methods},
         }
         own = {
+            "converged.first.literal": "`paper`, Γ < 0.6",
+            "converged.fair.literal": "`paper`, Γ < 0.6, fair targets",
             "converged.first.converged": "`paper`, Γ < 0.6 after adaptation",
             "converged.fair.converged": "`paper`, Γ < 0.6 after adaptation, fair targets",
         }
