@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drake_safety.cli.training_folder import MODES
+from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Column, Row, Table
@@ -19,7 +20,6 @@ from drake_safety.evaluation.report.verdicts import (
     INPUTS,
     columns_of,
     estimate_rows,
-    label_of,
     plan_sets,
     set_title,
     verdict_tables,

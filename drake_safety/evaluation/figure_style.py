@@ -55,6 +55,27 @@ _STYLE: dict[Any, Any] = {
     "savefig.facecolor": "white",
     "svg.hashsalt": "drake_safety",
 }
+
+_LABELS = {
+    "mlp": "MLP",
+    "reachability": "inverse kinematics",
+    "reachability_free": "inverse kinematics, free base",
+    "sharpened_literal_0.6": "sharpened, literal Γ",
+    "paper_literal_0.6": "paper, literal Γ",
+    "sharpened_literal": "sharpened, literal Γ",
+    "sharpened_calibrated": "sharpened, calibrated Γ",
+    "paper_literal": "paper, literal Γ",
+    "capture_point_margin": "capture-point margin",
+    "support_margin": "support-polygon margin",
+    "smallest_margin": "smallest margin (true state)",
+    "by_cause_probability": "all, by unsafe mass alone",
+    "right_cause": "all",
+    **{
+        f"{mode}.{kind}": f"{mode}, {row}"
+        for mode in ("sharpened", "paper")
+        for kind, row in (("plan", "first row"), ("motion", "worst row"))
+    },
+}
 _DPI = 200
 
 
@@ -104,3 +125,8 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
 def spoken(name: str) -> str:
     """A name as readable text: `support_polygon` → support polygon."""
     return name.replace("_", " ")
+
+
+def label_of(key: str) -> str:
+    """Label of a method in tables and figures."""
+    return _LABELS.get(key, spoken(key))

@@ -12,6 +12,7 @@ from drake_safety.evaluation.figure_style import (
     SERIES_COLOURS,
     SERIES_DASHES,
     drawing_style,
+    label_of,
     new_figure,
 )
 from drake_safety.evaluation.metrics import area_under_curve
@@ -40,7 +41,7 @@ def roc_figure(
         whole, magnified = fig.subplots(1, 2)
         for i, (name, (score, label)) in enumerate(curves.items()):
             score = np.where(np.isnan(score), np.inf, np.asarray(score, dtype=float))
-            words = f"{name}   {area_under_curve(score, label):.3f}"
+            words = f"{label_of(name)}   {area_under_curve(score, label):.3f}"
             for axes in (whole, magnified):
                 draw_roc(axes, score, label, words, thresholds.get(name), **series_style(i))
         whole.set(xlim=(0, 1), ylim=(0, 1))

@@ -10,30 +10,10 @@ from importlib.resources import files
 
 import yaml
 
-from drake_safety.evaluation.figure_style import spoken
+from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Column, Row, Table
 
-LABELS = {
-    "mlp": "MLP",
-    "reachability": "inverse kinematics",
-    "reachability_free": "inverse kinematics, free base",
-    "sharpened_literal_0.6": "sharpened, literal Γ",
-    "paper_literal_0.6": "paper, literal Γ",
-    "sharpened_literal": "sharpened, literal Γ",
-    "sharpened_calibrated": "sharpened, calibrated Γ",
-    "paper_literal": "paper, literal Γ",
-    "capture_point_margin": "capture-point margin",
-    "support_margin": "support-polygon margin",
-    "smallest_margin": "smallest margin (true state)",
-    "by_cause_probability": "all, by unsafe mass alone",
-    "right_cause": "all",
-    **{
-        f"{mode}.{kind}": f"{mode}, {row}"
-        for mode in ("sharpened", "paper")
-        for kind, row in (("plan", "first row"), ("motion", "worst row"))
-    },
-}
 INPUTS = (
     "Inputs differ: sharpened and the baseline classifiers use the whole plan, through its "
     "features; paper uses its next H steps and no features."
@@ -54,11 +34,6 @@ def columns_of(table: str) -> tuple[Column, ...]:
     """The columns of a kind of table, from ``columns.yaml``."""
     text = (files(__package__) / "columns.yaml").read_text(encoding="utf-8")
     return tuple(Column(**fields) for fields in yaml.safe_load(text)[table])
-
-
-def label_of(key: str) -> str:
-    """Label of a method in tables."""
-    return LABELS.get(key, spoken(key))
 
 
 def verdict_tables(results: Results) -> list[Table]:
