@@ -141,7 +141,12 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
         results = [
             adapted.predict(*given),
             loaded.predict(*given),
-            assessment.predict(*given, beliefs=adapted.beliefs_, correction=adapted.correction_),
+            assessment.predict(
+                *given,
+                beliefs=adapted.beliefs_,
+                correction=adapted.correction_,
+                novelty=adapted.novelty_,
+            ),
         ]
         for field in dataclasses.fields(results[0]):
             for other in results[1:]:

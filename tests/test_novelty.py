@@ -98,11 +98,13 @@ def test_what_an_actual_robot_did_is_known_after_adaptation(novelty):
     x, _ = redundant(np.random.default_rng(4), num_episodes=100)
     heavy = x + [30.0, 0.0, 30.0, 0.0]
     assert (novelty.of(heavy) > 1.0).all()
-    adapted = novelty.with_feedback(heavy[:1000])
+    adapted = novelty.with_feedback(heavy[:1000], 0.05)
     assert (adapted.of(heavy[1000:]) > 1.0).mean() < 0.05
     assert (adapted.of(x) > 1.0).mean() < 0.01
-    # Other feedback replaces it, and what neither did is still novel.
-    assert (adapted.with_feedback(x).of(heavy) > 1.0).all()
+    # Other feedback replaces it, and what neither did is still novel. A robot like the nominal one
+    # changes nothing.
+    assert adapted.with_feedback(x, 0.05).feedback is None
+    assert (adapted.with_feedback(x, 0.05).of(heavy) > 1.0).all()
     assert (adapted.of(x + [300.0, 0.0, 300.0, 0.0]) > 1.0).all()
 
 
@@ -164,7 +166,7 @@ def test_a_file_keeps_what_is_known_from_training_and_from_feedback(robot, tmp_p
     name, _ = robot
     assessment = load_assessment(name, "paper")
     x = np.random.default_rng(0).normal(size=(50, len(assessment.novelty_.training.mean)))
-    assessment.novelty_ = assessment.novelty_.with_feedback(x)
+    assessment.novelty_ = assessment.novelty_.with_feedback(10.0 + x, 0.01)
     assessment.save(tmp_path / "adapted.safetensors")
     loaded = SafetyAssessment.load(tmp_path / "adapted.safetensors").novelty_
     assert loaded.feedback.count == 50

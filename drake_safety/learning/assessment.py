@@ -216,7 +216,9 @@ class SafetyAssessment:
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
-        adapted.novelty_ = self.novelty_.with_feedback(self._feedback_inputs(feedback))
+        adapted.novelty_ = self.novelty_.with_feedback(
+            self._feedback_inputs(feedback), self.parameters.novelty_rate
+        )
         adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}

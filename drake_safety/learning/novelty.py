@@ -120,11 +120,19 @@ class Novelty:
         limits[1] = max(limits[1], _LEAST_LIMIT * np.sqrt(num_redundancies), 1.0)
         return cls(training=whole.training, limits=limits)
 
-    def with_feedback(self, x: np.ndarray) -> Novelty:
-        """Returns the novelty for which an actual robot's inputs (N, n_x) are known as well.
+    def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
+        """Returns the novelty for which an actual robot's inputs are known as well.
 
-        They replace those of earlier feedback.
+        They replace those of earlier feedback. If at most a share of `rate` of them is beyond the
+        training inputs, these alone describe the robot.
+
+        Args:
+            x: Inputs, (N, n_x).
+            rate: Largest share of novel inputs of a robot without a reality gap, in (0, 1).
         """
+        alone = Novelty(training=self.training, limits=self.limits)
+        if np.mean(alone.of(x) > 1.0) <= rate:
+            return alone
         return Novelty(training=self.training, limits=self.limits, feedback=Moments.of(x))
 
     def distances(self, x: np.ndarray) -> np.ndarray:
