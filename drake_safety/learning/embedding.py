@@ -257,8 +257,8 @@ def _train(
 def _neighbour_loss(torch: Any, y: Any, neighbour: Any, unit: float) -> Any:
     """The loss of parametric t-SNE for inputs and one neighbour of each, (N,).
 
-    InfoNC-t-SNE (Damrich et al., 2023), whose expectation over neighbours is KL(P || Q) of t-SNE up
-    to a constant: -log(q / (q + sum of those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
+    InfoNC-t-SNE (Damrich et al., 2023), the contrastive form of t-SNE's loss: -log(q / (q + sum of
+    those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
 
     Args:
         torch: The module.
