@@ -76,6 +76,29 @@ def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_z
     assert novelty.of(np.array([[0.0, 0.0, 0.0, 7.1]]))[0] > 1.0
 
 
+def test_one_episode_gives_no_limit_and_what_is_not_finite_is_novel_all_the_same():
+    x, _ = redundant(np.random.default_rng(0), num_episodes=1)
+    alone = Novelty.fit(x, np.zeros(len(x)), np.zeros(len(x), dtype=bool), rate=0.05)
+    assert np.isinf(alone.limits).all()
+    np.testing.assert_array_equal(alone.of(np.array([[np.nan] * 4, [1e3] * 4])), [np.inf, 0.0])
+
+
+def test_inputs_that_are_all_alike_are_known_and_others_are_not():
+    x = np.tile([1.0, 2.0], (40, 1))
+    alike = Novelty.fit(x, np.arange(40) // 2, np.zeros(40, dtype=bool), rate=0.05)
+    np.testing.assert_array_equal(alike.of(x[:1]), [0.0])
+    assert alike.of(np.array([[1.0, 3.0]]))[0] > 1.0
+
+
+@pytest.mark.parametrize("limits", [[1.0], [1.0, 0.0], [1.0, float("nan")]])
+def test_a_file_whose_limits_are_none_is_refused(robot, limits, tmp_path):
+    assessment = load_assessment(robot[0], "paper")
+    assessment.novelty_.limits = np.array(limits)
+    assessment.save(tmp_path / "forged.safetensors")
+    with pytest.raises(ValueError, match=r"limits of novelty are .* expected two positive numbers"):
+        SafetyAssessment.load(tmp_path / "forged.safetensors")
+
+
 def test_the_entry_that_contradicts_the_others_is_named(novelty):
     x = np.array([0.5, 50.0, 1.0, 7.0])
     assert np.abs(novelty.contradictions(x)).max() < 3.0

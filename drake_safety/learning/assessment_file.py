@@ -207,9 +207,10 @@ def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_column
             )
         )
     training, feedback = found
-    if training is None:
-        raise KeyError("novelty")
-    return Novelty(training=training, feedback=feedback, limits=np.array(numbers["novelty_limits"]))
+    limits = np.array(numbers["novelty_limits"], dtype=float)
+    if training is None or limits.shape != (2,) or not np.all(limits > 0.0):
+        raise ValueError(f"its limits of novelty are {limits}, expected two positive numbers")
+    return Novelty(training=training, feedback=feedback, limits=limits)
 
 
 def _used(

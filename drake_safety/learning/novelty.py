@@ -14,7 +14,7 @@ _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would
 _REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
 _LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
 _LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs that much.
-_LEAST_LIMIT = 3.0  # Of the root mean square along the redundancies, against rounding.
+_LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; against rounding.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,8 +117,8 @@ class Novelty:
         whole = cls(training=Moments.of(x), limits=np.ones(2))
         limits = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
         num_redundancies = whole._whitenings[1].shape[1]
-        limits[1] = max(limits[1], _LEAST_LIMIT * np.sqrt(num_redundancies), 1.0)
-        return cls(training=whole.training, limits=limits)
+        least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies))]
+        return cls(training=whole.training, limits=np.maximum(limits, least))
 
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
@@ -154,7 +154,12 @@ class Novelty:
 
         An input is novel above 1; that of an input that is not finite is infinite.
         """
-        return (self.distances(x) / self.limits).max(axis=1)
+        distances = self.distances(x)
+        # Without other episodes to choose them from, the limits are infinite as well.
+        share = np.divide(
+            distances, self.limits, out=np.full_like(distances, np.inf), where=distances < np.inf
+        )
+        return share.max(axis=1)
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each column is from what the other columns say, (n_x,).
