@@ -6,12 +6,18 @@ Drake plant still describes bodies, joints and shapes, for rendering and geometr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import HalfSpace, SceneGraph
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    GeometrySet,
+    HalfSpace,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -33,6 +39,7 @@ from drake_safety.plants.obstacles import (
     collision_geometries,
     filter_collisions,
 )
+from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot import (
     PlantVariation,
@@ -42,6 +49,7 @@ from drake_safety.robots.robot import (
     require_motors,
 )
 from drake_safety.robots.robot_model import RobotModel
+from drake_safety.robots.shift import Shift
 
 
 @dataclass(kw_only=True)
@@ -86,7 +94,7 @@ class DrakePhysics:
         )
         plant, scene_graph = AddMultibodyPlant(config, builder)
         instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
-        self._robot, self._variation = robot, variation
+        self._robot, self._variation, self._time_step_s = robot, variation, time_step_s
         self.plant: MultibodyPlant = plant
         self.scene_graph: SceneGraph = scene_graph
         self.instance = instance
@@ -103,6 +111,7 @@ class DrakePhysics:
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
         """Connects torques in actuator order to a robot without servos."""
+        torques = self._delayed(builder, torques)
         builder.Connect(torques, self.plant.get_actuation_input_port(self.instance))
         if self._variation.joint_friction_nm:
             # Without a desired state Drake deactivates the servos that model dry friction.
@@ -117,12 +126,24 @@ class DrakePhysics:
 
         Actuators that model dry friction get a desired velocity of zero.
         """
+        desired_joint_state = self._delayed(builder, desired_joint_state)
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
         builder.Connect(
             servos.get_output_port(), self.plant.get_desired_state_input_port(self.instance)
         )
+
+    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
+        """Adds the variation's delay of the command."""
+        delay_s = 0.0 if self._variation.shift is None else self._variation.shift.command_delay_s
+        if not delay_s:
+            return command
+        delay = builder.AddNamedSystem(
+            "command_delay", SampledDelay(command.size(), delay_s, period_s=self._time_step_s)
+        )
+        builder.Connect(command, delay.get_input_port())
+        return delay.get_output_port()
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
@@ -158,6 +179,8 @@ class MujocoPhysics:
                 "engine 'mujoco' has no ball to throw: pass ball=False, for both sides of a "
                 "comparison, or set the share of pushes to 0"
             )
+        if variation.shift is not None:
+            raise ValueError("engine 'mujoco' has no shifts; simulate them by engine 'drake'")
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
         plant = MultibodyPlant(time_step_s)
         plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -268,6 +291,55 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
     )
 
 
+def _friction(robot: RobotModel, variation: PlantVariation) -> float:
+    return variation.foot_friction or robot.foot_friction
+
+
+def _incline(plant: MultibodyPlant, shift: Shift) -> None:
+    """Inclines the gravity against the ground, which stays at z = 0."""
+    field = plant.mutable_gravity_field()
+    magnitude = np.linalg.norm(field.gravity_vector())
+    direction, slope = shift.slope_direction_rad, shift.slope_rad
+    downhill = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
+    field.set_gravity_vector(magnitude * np.append(downhill, -math.cos(slope)))
+
+
+def _dig_holes(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    robot: RobotModel,
+    instance: ModelInstanceIndex,
+    depths_m: Mapping[str, float],
+    friction: float,
+) -> None:
+    """Lowers the ground under some feet."""
+    if not depths_m:
+        return
+    ground = plant.GetCollisionGeometriesForBody(plant.world_body())
+    holes = {}
+    for name, depth_m in depths_m.items():
+        if name not in robot.feet:
+            raise ValueError(
+                f"robot '{robot.name}' has no foot '{name}' for a hole; it has {list(robot.feet)}"
+            )
+        X_WH = RigidTransform([0.0, 0.0, -depth_m])
+        material = CoulombFriction(friction, friction)
+        shape = f"hole_{name}"
+        holes[name] = plant.RegisterCollisionGeometry(
+            plant.world_body(), X_WH, HalfSpace(), shape, material
+        )
+    filters = scene_graph.collision_filter_manager()
+    for index in plant.GetBodyIndices(instance):
+        body = plant.get_body(index)
+        shapes = plant.GetCollisionGeometriesForBody(body)
+        own = [hole for name, hole in holes.items() if robot.feet[name].body == body.name()]
+        others = [hole for hole in holes.values() if hole not in own] + (ground if own else [])
+        if shapes and others:
+            declaration = CollisionFilterDeclaration()
+            declaration.ExcludeBetween(GeometrySet(shapes), GeometrySet(others))
+            filters.Apply(declaration)
+
+
 def _furnish(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
@@ -284,8 +356,12 @@ def _furnish(
     config.default_proximity_properties.resolution_hint = None
     scene_graph.set_config(config)
     instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
-    add_ground(plant, variation.foot_friction or robot.foot_friction)
+    add_ground(plant, _friction(robot, variation))
     ball = add_ball(plant) if scene.has_ball else None
+    shift = variation.shift or Shift()
+    _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, _friction(robot, variation))
+    if shift.slope_rad:
+        _incline(plant, shift)
     obstacles = add_obstacles(plant, list(scene.obstacles or ()))
     decorations = add_obstacles(plant, list(scene.decorations))
     plant.Finalize()

@@ -14,6 +14,7 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     JointActuator,
+    LinearSpringDamper,
     ModelInstanceIndex,
     PdControllerGains,
     SpatialInertia,
@@ -26,6 +27,7 @@ from drake_safety.robots.robot_description import (
     ignore_neighbours,
 )
 from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.shift import JointShift, Shift
 
 ENGINES = ("drake", "mujoco")
 """Physics engines that a plant variation may choose."""
@@ -78,6 +80,8 @@ class PlantVariation:
     """Noise on the assessor's inputs alone; the motion does not depend on it."""
     payload: Payload | None = None
     """A mass that the controllers do not model."""
+    shift: Shift | None = None
+    """Lasting conditions that training does not have."""
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -96,6 +100,8 @@ class PlantVariation:
 
 
 PAYLOAD_RADIUS_M = 0.05
+_SPRING_LENGTH_M = 1e4  # Of the spring that exerts a steady force.
+_LOCKED_DAMPING = 1e5  # [N·m·s/rad]. Drake 1.51 crashes when a joint with a servo is locked.
 _FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
@@ -172,6 +178,9 @@ def add_robot(
     """
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
+    if variation.shift is not None:
+        _check_shifted_joints(plant, robot, variation.shift)
+        _add_base_force(plant, robot, variation.shift)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
     ends = [limb.body for limb in robot.limbs()]
@@ -197,14 +206,19 @@ def add_robot(
             actuated[name] = actuator
         elif limit is not None and np.isinf(actuator.effort_limit()):
             actuator.set_effort_limit(limit)
+        shift = _joint_shift(robot, variation, name)
+        if shift.effort_scale != 1.0:
+            actuator.set_effort_limit(shift.effort_scale * actuator.effort_limit())
         gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
         if gains is not None and servos:
-            actuator.set_controller_gains(PdControllerGains(p=gains.stiffness, d=gains.damping))
+            p, d = shift.stiffness_scale * gains.stiffness, shift.stiffness_scale * gains.damping
+            actuator.set_controller_gains(PdControllerGains(p=p, d=d))
         speed = by_pattern(robot.velocity_limits, name, "velocity limit", robot.name)
         if speed is not None:
             joint.set_velocity_limits([-speed], [speed])
-        if variation.joint_damping:
-            joint.set_default_damping(joint.default_damping() + variation.joint_damping)
+        damping = variation.joint_damping + (_LOCKED_DAMPING if shift.is_locked else 0.0)
+        if damping:
+            joint.set_default_damping(joint.default_damping() + damping)
     if variation.joint_friction_nm:
         for name in actuated:
             friction = plant.AddJointActuator(
@@ -220,6 +234,40 @@ def add_robot(
     for joint_name, position in posture_positions(plant, robot).items():
         plant.GetJointByName(joint_name, instance).set_default_positions([position])
     return instance
+
+
+def _joint_shift(robot: RobotModel, variation: PlantVariation, joint: str) -> JointShift:
+    shifts = {} if variation.shift is None else variation.shift.joints
+    return by_pattern(shifts, joint, "shift", robot.name) or JointShift()
+
+
+def _check_shifted_joints(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
+    names = servo_joints(plant, robot)
+    for pattern in shift.joints:
+        if not any(re.fullmatch(pattern, name) for name in names):
+            _require(robot, "joint for shift", pattern, names)
+
+
+def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
+    """Adds a steady force: a spring so long that motion hardly changes its force or direction."""
+    force_n = np.linalg.norm(shift.base_force_n)
+    if force_n == 0.0:
+        return
+    far = _SPRING_LENGTH_M * np.array(shift.base_force_n) / force_n
+    base = plant.GetBodyByName(robot.base, plant.GetModelInstanceByName(robot.name))
+    rest_m = 1e-3 * _SPRING_LENGTH_M
+    stiffness = force_n / (_SPRING_LENGTH_M - rest_m)
+    plant.AddForceElement(
+        LinearSpringDamper(
+            bodyA=plant.world_body(),
+            p_AP=far,
+            bodyB=base,
+            p_BQ=np.zeros(3),
+            free_length=rest_m,
+            stiffness=stiffness,
+            damping=0.0,
+        )
+    )
 
 
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:

@@ -16,6 +16,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.robots.robot import ObservationNoise
+from drake_safety.robots.shift import InputShift
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
@@ -126,9 +127,14 @@ class LeggedLoop(PlannedLoop):
             **options,
         )
         self._observer = self._observers.add("observer", noise)
-        self._assessor_observer = self._observers.add(
-            "assessor_observer", combined(noise, self.variation.input_noise)
-        )
+        seen_noise = combined(noise, self.variation.input_noise)
+        shift = InputShift() if self.variation.shift is None else self.variation.shift.inputs
+        if shift == InputShift():
+            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
+        else:
+            self._assessor_observer = self._observers.add_shifted(
+                "assessor_observer", seen_noise, shift
+            )
         self._true_observer = self._observers.add("true_observer", ObservationNoise())
         self.state_names = self._assessor_observer.state_names
         self.output_names = self._assessor_observer.output_names

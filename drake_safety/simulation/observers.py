@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import RandomSource
+from pydrake.systems.primitives import AffineSystem, RandomSource
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.robot import ObservationNoise
+from drake_safety.robots.shift import InputShift
 from drake_safety.systems.state_observer import StateObserver
 
 
@@ -65,6 +67,31 @@ class Observers:
             self._builder.Connect(source.get_output_port(), noise_port)
             self._sources.append(source)
         self._observers[key] = observer
+        return observer
+
+    def add_shifted(self, name: str, noise: ObservationNoise, shift: InputShift) -> StateObserver:
+        """Adds an observer whose measurement has a fault.
+
+        Args:
+            name: Name of the system.
+            noise: Standard deviations.
+            shift: The fault.
+        """
+        measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
+        n_q, n_v = self._kinematics.num_positions, self._kinematics.num_velocities
+        scale, bias = np.ones(n_q + n_v), np.zeros(n_q + n_v)
+        bias[7:n_q] = shift.joint_bias_rad
+        scale[n_q:] = shift.velocity_scale
+        delay = SampledDelay(
+            len(scale), shift.delay_s, period_s=self._period_s, frozen_at_s=shift.frozen_at_s
+        )
+        fault = AffineSystem(D=np.diag(scale), y0=bias)
+        observer = StateObserver(self._kinematics, **self._options)
+        parts = [(f"{name}_delay", delay), (f"{name}_fault", fault), (name, observer)]
+        for part_name, system in parts:
+            self._builder.AddNamedSystem(part_name, system)
+            self._builder.Connect(measured, system.get_input_port(0))
+            measured = system.get_output_port(0)
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
