@@ -81,7 +81,7 @@ class Balancing(LeggedLoop):
         names = ("desired_output", "desired_preview", "desired_outlook")
         desired = {name: planner.GetOutputPort(name) for name in names}
 
-        self._recovery_switch = None
+        self._recovery_switch = recovery_active = None
         if recovery:
             switch = builder.AddNamedSystem(
                 "recovery_switch",
@@ -103,7 +103,8 @@ class Balancing(LeggedLoop):
                 switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
             )
             desired = {name: switch.GetOutputPort(name) for name in names}
-            builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
+            recovery_active = switch.GetOutputPort("recovery_active")
+            builder.ExportOutput(recovery_active, "recovery_active")
 
         robot = self.robot
         stiffness = [
@@ -136,6 +137,7 @@ class Balancing(LeggedLoop):
             assessment_period_s=parameters.recovery.assessment_period_s,
             desired_output=desired["desired_output"],
             desired_preview=desired["desired_preview"],
+            hold=recovery_active,
             meshcat=meshcat,
         )
         if assessor is not None and recovery:

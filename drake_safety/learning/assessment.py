@@ -26,11 +26,12 @@ from drake_safety.learning.feedback import (
     used_episodes,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import check_width, input_names, inputs
+from drake_safety.learning.innovation import Innovation
+from drake_safety.learning.inputs import check_width, input_names, inputs, used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
-from drake_safety.learning.segments import Episodes, EpisodesInfo, split
+from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.training import learned_maps, segments_for
 
@@ -54,6 +55,7 @@ class SafetyAssessment:
     - `info_`: the `EpisodesInfo` of the training episodes.
     - `grid_`: the `Grid` of the embedding space.
     - `embedding_`: the maps Psi, an immutable `Embedding`.
+    - `innovation_`: the `Innovation`, the error of predicting the next state, for a monitor.
     - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
       predictions take other beliefs as an argument.
     - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
@@ -96,7 +98,8 @@ class SafetyAssessment:
 
         Args:
             episodes: Nominal episodes with the parameters' horizon.
-            progress: Called with a stage ("distances", "t-SNE", "training", "beliefs") and the
+            progress: Called with a stage ("distances", "t-SNE", "training",
+                "innovation", "beliefs") and the
                 fraction done.
 
         Returns:
@@ -117,7 +120,7 @@ class SafetyAssessment:
         segments, has_target = segments_for(episodes, parameters)
         self.info_ = info
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-        x = self._inputs(
+        x = self.inputs_of(
             segments.state if parameters.is_sharpened else segments.true_state,
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
@@ -128,11 +131,20 @@ class SafetyAssessment:
         every = split(episodes, stride=1, discount=1.0, shortest=1)
         self.novelty_ = Novelty.fit(
             # With noise in either mode, as on a robot.
-            self._inputs(every.state, every.desired_preview, every.features),
+            self.inputs_of(every.state, every.desired_preview, every.features),
             every.episode,
             every.is_unsafe,
             parameters.novelty_rate,
         )
+        self.innovation_ = Innovation.fit(
+            [self._rows(one)[one.first_step :] for one in episodes if one.is_safe]
+            or [self._rows(one) for one in episodes],
+            num_states=int(used_states(info, parameters).sum()),
+            step_s=info.step_s,
+            novelty=self.novelty_,
+        )
+        if progress is not None:
+            progress("innovation", 1.0)
         output = self.embedding_.evaluate(x)
         self.training_points_ = output.embedding.astype(np.float32)
         self.training_score_ = assessment_file.single(segments.score)
@@ -213,11 +225,14 @@ class SafetyAssessment:
         drawn = used_episodes(feedback)
         self.check_unused(*{one.seed for one in drawn}, purpose="adaptation")
         segments = self.feedback_segments(feedback)
-        x = self._inputs(segments.state, segments.desired_preview, segments.features)
+        x = self.inputs_of(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
         adapted.novelty_ = self.novelty_.with_feedback(
             self._feedback_inputs(feedback), self.parameters.novelty_rate
+        )
+        adapted.innovation_ = self.innovation_.with_feedback(
+            [self._rows(one) for one in feedback], adapted.novelty_
         )
         adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
@@ -234,7 +249,7 @@ class SafetyAssessment:
             if any(one.differs for one in feedback):
                 change, hidden, hidden_range = recalibration.fitted_change(
                     *recalibration.outcomes(
-                        feedback, self._inputs, self.embedding_, self.base_logit_
+                        feedback, self.inputs_of, self.embedding_, self.base_logit_
                     ),
                     self.base_logit_,
                     self.parameters.adaptation,
@@ -305,12 +320,21 @@ class SafetyAssessment:
 
     def _feedback_inputs(self, feedback: Sequence[FeedbackSet]) -> np.ndarray:
         """Returns the inputs of all rows of the actual robot, (N, n_x)."""
-        rows = [self._inputs(one.state, one.desired_preview, one.features) for one in feedback]
-        return np.concatenate(rows)
+        return np.concatenate([self._rows(one) for one in feedback])
 
-    def _inputs(
+    def _rows(self, motion: Episode | FeedbackSet) -> np.ndarray:
+        return self.inputs_of(motion.state, motion.desired_preview, motion.features)
+
+    @property
+    def state_names(self) -> list[str]:
+        """Names of the states in x, which are its first columns."""
+        is_used = used_states(self.info_, self.parameters)
+        return [n for n, used in zip(self.info_.state_names, is_used, strict=True) if used]
+
+    def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
+        """Returns x, (..., n_x); the arguments are those of `predict`."""
         return inputs(state, desired_preview, features, self.info_, self.parameters)
 
     def _check_fitted(self) -> None:
@@ -362,7 +386,7 @@ class SafetyAssessment:
         """
         self._check_fitted()
         beliefs, correction = self._or_own(beliefs, correction)
-        x = self._inputs(state, desired_preview, features)
+        x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
         check_width(x.shape[1], self.info_, self.parameters)
@@ -416,7 +440,7 @@ class SafetyAssessment:
             say, in standard deviations of training.
         """
         self._check_fitted()
-        found = self.novelty_.contradictions(self._inputs(state, desired_preview, features))
+        found = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(found)))
         return input_names(self.info_, self.parameters)[column], float(found[column])
 
@@ -437,7 +461,7 @@ class SafetyAssessment:
         Raises:
             ValueError: The maps have no safety head, as in the paper's mode.
         """
-        x = self._inputs(state, desired_preview, features)
+        x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)
 
     def save(self, path: str | os.PathLike[str]) -> None:

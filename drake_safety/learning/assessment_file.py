@@ -21,7 +21,8 @@ from drake_safety.learning.assessment_parameters import (
 )
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import num_inputs
+from drake_safety.learning.innovation import Innovation
+from drake_safety.learning.inputs import num_inputs, used_states
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
@@ -29,9 +30,10 @@ from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 
 _MAPS, _CORRECTION = "embedding.", "correction."
+_INNOVATION = "innovation."
 _NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
     "training_points": (np.float32, np.float32),
@@ -65,6 +67,10 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     for prefix, one in moments.items():
         if one is not None:
             tensors[f"{prefix}mean"], tensors[f"{prefix}covariance"] = one.mean, one.covariance
+    # The network in single precision, all else as it is.
+    for name, value in learned["innovation_"].arrays().items():
+        is_layer = name.startswith("layer.")
+        tensors[f"{_INNOVATION}{name}"] = value.astype(np.float32) if is_layer else value
     for name, (stored, _) in _TRAINING.items():
         if learned[f"{name}_"] is not None:
             tensors[name] = learned[f"{name}_"].astype(stored)
@@ -163,6 +169,15 @@ def _learned(
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
         "novelty_": _novelty(numbers, tensors, expected_inputs),
+        "innovation_": Innovation.from_arrays(
+            {
+                k.removeprefix(_INNOVATION): v.astype(float)
+                for k, v in tensors.items()
+                if k.startswith(_INNOVATION)
+            },
+            num_inputs=expected_inputs,
+            num_states=int(used_states(info, parameters).sum()),
+        ),
         "calibrations_": {one.kind: one for one in calibrations},
         "used_": _used(info, calibrations, numbers.get("used")),
         "adaptation_": None if adaptation is None else Adaptation(**adaptation),

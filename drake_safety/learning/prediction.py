@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,6 +73,35 @@ class Assessment:
     predicted_margins: np.ndarray
     calibrated: float
     novelty: float
+
+    def unknown(self) -> Assessment:
+        """The assessment with the empty belief."""
+        return replace(
+            self,
+            safety_probability=0.0,
+            normalized=0.0,
+            calibrated=0.0,
+            belief=np.array([0.0, 0.0, 1.0]),
+            cause_probability=np.zeros_like(self.cause_probability),
+        )
+
+    def outside(self, cause: int) -> Assessment:
+        """The assessment of a state outside the safe set: what was safe is unsafe.
+
+        Args:
+            cause: Number of the violated constraint.
+        """
+        safe, unsafe, uncertainty = self.belief
+        cause_probability = self.cause_probability.copy()
+        cause_probability[cause] += safe
+        return replace(
+            self,
+            safety_probability=0.0,
+            normalized=0.0,
+            calibrated=0.0,
+            belief=np.array([0.0, unsafe + safe, uncertainty]),
+            cause_probability=cause_probability,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

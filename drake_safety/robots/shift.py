@@ -1,4 +1,4 @@
-"""Shift: a lasting difference between training and deployment, of a plant or of what is measured."""
+"""Shift: lasting conditions of a plant or its sensors that training does not have."""
 
 import math
 from dataclasses import dataclass, field
@@ -62,9 +62,7 @@ class Shift:
 
     def __post_init__(self) -> None:
         if not abs(self.slope_rad) < 0.5 * math.pi:
-            raise ValueError(
-                f"shift: slope_rad must be within a right angle; got {self.slope_rad}"
-            )
+            raise ValueError(f"shift: slope_rad must be within a right angle; got {self.slope_rad}")
         if len(self.base_force_n) != 3 or not all(map(math.isfinite, self.base_force_n)):
             raise ValueError(f"shift: base_force_n is three numbers [N]; got {self.base_force_n}")
         if not self.command_delay_s >= 0:

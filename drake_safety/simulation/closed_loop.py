@@ -44,6 +44,7 @@ class LoopScenario(Protocol):
     step_s: float
     time_step_s: float
     control_period_s: float
+    on_alarm: str
     assessment: AssessmentParameters
     parameters: Any
 
@@ -86,6 +87,7 @@ class ClosedLoop(FloatSystem, Diagram):
     ``safe``               1       1 while the state is inside the safe set
     ``safety_probability`` 1       Γ, with an assessment (also ``normalized_…``)
     ``belief``             3       (safe, unsafe, unknown), with an assessment
+    ``alarm``              1       1 since the monitor's alarm (also ``alarm_cause``, ``levels``)
     ``recovery_active``    1       1 during recovery, with recovery
     ====================== ======= ============================================================
 
@@ -150,10 +152,13 @@ class ClosedLoop(FloatSystem, Diagram):
         state: OutputPort,
         desired_preview: OutputPort,
         features: OutputPort,
+        margins: OutputPort | None = None,
+        hold: OutputPort | None = None,
     ) -> SafetyAssessor | None:
-        """Adds an assessor and exports its outputs, if there is an assessment.
+        """Adds an assessor and a monitor, if there is an assessment, and exports their outputs.
 
-        The names of the ports' entries must have been set.
+        The names of the ports' entries must have been set. The scenario says what an alarm of the
+        monitor does.
 
         Args:
             builder: The diagram's builder.
@@ -161,6 +166,8 @@ class ClosedLoop(FloatSystem, Diagram):
             state: Port of the state.
             desired_preview: Port of the desired preview.
             features: Port of the features.
+            margins: Port of the margins of the measured state, outside of which nothing is safe.
+            hold: Port that is 1 while the monitor waits, as during recovery.
 
         Returns:
             The assessor; None without an assessment.
@@ -170,20 +177,33 @@ class ClosedLoop(FloatSystem, Diagram):
         """
         if self.assessment is None:
             return None
+        from drake_safety.systems.novelty_monitor import NoveltyMonitor
         from drake_safety.systems.safety_assessor import AddSafetyAssessor
 
         self._check_assessment(self.assessment)
+        monitor = builder.AddNamedSystem("novelty_monitor", NoveltyMonitor(self.assessment))
+        is_binding = self.scenario.on_alarm == "unknown"
         assessor = AddSafetyAssessor(
             builder,
             self.assessment,
             state=state,
             desired_preview=desired_preview,
             features=features,
+            margins=margins,
+            alarm=monitor.GetOutputPort("alarm") if is_binding else None,
             period_s=period_s,
         )
-        for i in range(assessor.num_output_ports()):
-            port = assessor.get_output_port(i)
-            builder.ExportOutput(port, port.get_name())
+        watched = {"state": state, "desired_preview": desired_preview, "hold": hold}
+        watched["novelty"] = assessor.GetOutputPort("novelty")
+        if monitor.reads_features:
+            watched["features"] = features
+        for name, port in watched.items():
+            if port is not None:
+                builder.Connect(port, monitor.GetInputPort(name))
+        for system in (assessor, monitor):
+            for i in range(system.num_output_ports()):
+                port = system.get_output_port(i)
+                builder.ExportOutput(port, port.get_name())
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:

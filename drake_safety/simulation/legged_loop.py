@@ -167,6 +167,7 @@ class LeggedLoop(PlannedLoop):
         assessment_period_s: float,
         desired_output: OutputPort | None = None,
         desired_preview: OutputPort | None = None,
+        hold: OutputPort | None = None,
         meshcat: Meshcat | None,
     ) -> SafetyAssessor | None:
         """Adds the optional assessor and visualiser, and exports ports; see :meth:`_export`."""
@@ -178,6 +179,7 @@ class LeggedLoop(PlannedLoop):
             output=self._observer.GetOutputPort("output"),
             desired_output=desired_output,
             desired_preview=desired_preview,
+            hold=hold,
         )
         if self._physics.ball_state is not None:
             builder.ExportOutput(self._physics.ball_state, "ball_state")

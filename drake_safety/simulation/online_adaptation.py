@@ -12,6 +12,7 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import feedback_of_windows, run_twins
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
+from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 
@@ -35,6 +36,7 @@ class OnlineAdaptation:
         prior: The assessment before feedback.
         recorder: The recorder, a system of the diagram.
         assessor: The assessor, a system of the diagram.
+        monitor: The monitor, if the diagram has one.
         method: Method of `SafetyAssessment.adapt`.
         run: Function that simulates the twins; see `feedback_of_windows`.
 
@@ -50,11 +52,13 @@ class OnlineAdaptation:
         recorder: FeedbackRecorder,
         assessor: SafetyAssessor,
         *,
+        monitor: NoveltyMonitor | None = None,
         method: str | None = None,
         run: Callable[..., Episodes] = run_twins,
     ):
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor, self._run = recorder, assessor, run
+        self._monitor = monitor
         self._num_used = 0
         self.feedback: list[FeedbackSet] = []
         self.adapted: list[SafetyAssessment] = []
@@ -77,6 +81,10 @@ class OnlineAdaptation:
         self._assessor.adopt(
             self._assessor.GetMyMutableContextFromRoot(root_context), self.adapted[-1]
         )
+        if self._monitor is not None:
+            own_context = self._monitor.GetMyMutableContextFromRoot(root_context)
+            self._monitor.adopt(own_context, self.adapted[-1])
+            self._monitor.reset(own_context)
         return EventStatus.Succeeded()
 
     def _num_available(self) -> int:

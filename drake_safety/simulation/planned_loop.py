@@ -125,6 +125,11 @@ class PlannedLoop(ClosedLoop):
         self._plant_state = plant_state
         self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
         builder.Connect(plant_state, self._monitor.GetInputPort("plant_state"))
+        self._seen_margins = self._monitor.GetOutputPort("margins")
+        if seen_state is not None and self.assessment is not None:
+            seen = builder.AddNamedSystem("seen_margins", SafetyMonitor(safe_set, *sizes))
+            builder.Connect(seen_state, seen.GetInputPort("plant_state"))
+            self._seen_margins = seen.GetOutputPort("margins")
         self._features = builder.AddNamedSystem(
             "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
         )
@@ -145,6 +150,7 @@ class PlannedLoop(ClosedLoop):
         output: OutputPort,
         desired_output: OutputPort | None = None,
         desired_preview: OutputPort | None = None,
+        hold: OutputPort | None = None,
     ) -> SafetyAssessor | None:
         """Adds the assessor, if there is an assessment, and exports the ports of the contract.
 
@@ -156,6 +162,7 @@ class PlannedLoop(ClosedLoop):
             output: The measured output.
             desired_output: The planner's by default.
             desired_preview: The planner's by default.
+            hold: See :meth:`~ClosedLoop.add_assessor`.
 
         Returns:
             The assessor; None without an assessment.
@@ -168,6 +175,8 @@ class PlannedLoop(ClosedLoop):
             state=state,
             desired_preview=desired_preview,
             features=features,
+            margins=self._seen_margins,
+            hold=hold,
         )
         for name, port in {
             "state": state,

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
 
 
+ON_ALARM = ("unknown", "report")
+"""What an alarm of the monitor may do."""
+
+
 @dataclass(kw_only=True)
 class Scenario:
     """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
@@ -48,6 +52,9 @@ class Scenario:
     """Step of the discrete plant [s]."""
     control_period_s: float = 0.01
     """Period of the controller and of the safety monitor [s]."""
+    on_alarm: str = "unknown"
+    """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that the
+    robot recovers or refuses plans; ``report`` only reports it."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
     """Plants by name; training episodes are those of ``nominal``."""
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
@@ -61,6 +68,11 @@ class Scenario:
                 raise ValueError(
                     f"scenario '{self.name}': {name} must be positive; got {getattr(self, name)}"
                 )
+        if self.on_alarm not in ON_ALARM:
+            raise ValueError(
+                f"scenario '{self.name}': on_alarm must be one of {list(ON_ALARM)}; got "
+                f"'{self.on_alarm}'"
+            )
         if self.assessment.horizon * self.assessment.preview_stride > self.num_steps:
             raise ValueError(
                 f"scenario '{self.name}': the assessment horizon of {self.assessment.horizon} "
@@ -145,6 +157,7 @@ class Scenario:
         if variation != "nominal":
             self.variation(variation)
         text = yaml.safe_load(self.to_yaml())
+        del text["on_alarm"]  # No episode depends on it.
         text["assessment"] = {
             name: getattr(self.assessment, name) for name in ("horizon", "preview_stride")
         }

@@ -34,6 +34,8 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         - state
         - desired_preview
         - features (read in the sharpened mode only)
+        - margins (optional)
+        - alarm (optional)
         output_ports:
         - safety_probability
         - normalized_safety_probability
@@ -49,8 +51,11 @@ class SafetyAssessor(FloatSystem, LeafSystem):
     b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
     heads with the correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the
     distance of the inputs from those of training, novel above 1. The belief of inputs that are
-    novel or not finite is (0, 0, 1). The beliefs of the grid, the correction and the novelty are
-    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
+    novel or not finite is (0, 0, 1). So is every belief while ``alarm`` is above 0.5, as that of a
+    :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. With ``margins``, those of the
+    measured state, no belief is safe while one is negative: its mass for "safe" then counts as
+    unsafe by the most violated constraint. The beliefs of the grid, the correction and the novelty
+    are parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
     between simulations and during them. The embedding is immutable.
 
     Args:
@@ -82,6 +87,8 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             "desired_preview", info.horizon * len(info.output_names)
         )
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._margins_port = self.DeclareVectorInputPort("margins", n_c)
+        self._alarm_port = self.DeclareVectorInputPort("alarm", 1)
         sizes = {
             "safety_probability": 1,
             "normalized_safety_probability": 1,
@@ -178,6 +185,12 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             correction=self.get_correction(context) if self._has_heads else None,
             novelty=context.get_abstract_parameter(self._novelty_index).get_value(),
         )
+        if self._alarm_port.HasValue(context) and self._alarm_port.Eval(context)[0] > 0.5:
+            prediction = prediction.unknown()
+        elif self._margins_port.HasValue(context):
+            margins = self._margins_port.Eval(context)
+            if margins.min(initial=0.0) < 0.0:
+                prediction = prediction.outside(int(np.argmin(margins)))
         # In the order of the ports.
         discrete_state.set_value(
             np.concatenate(
@@ -200,6 +213,8 @@ def AddSafetyAssessor(
     state: OutputPort,
     desired_preview: OutputPort,
     features: OutputPort | None = None,
+    margins: OutputPort | None = None,
+    alarm: OutputPort | None = None,
     period_s: float | None = None,
 ) -> SafetyAssessor:
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
@@ -210,6 +225,8 @@ def AddSafetyAssessor(
         state: Port of the state, as in the training episodes.
         desired_preview: Port of the desired preview, as in the training episodes.
         features: Port of the features; not needed if the assessment reads none.
+        margins: Port of the measured state's margins, if any.
+        alarm: Port of an alarm that makes every belief unknown, if any.
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
 
     Returns:
@@ -221,7 +238,13 @@ def AddSafetyAssessor(
     """
     info = assessment.info_
     assessor = SafetyAssessor(assessment, period_s=info.step_s if period_s is None else period_s)
-    given = {"state": state, "desired_preview": desired_preview, "features": features}
+    given = {
+        "state": state,
+        "desired_preview": desired_preview,
+        "features": features,
+        "margins": margins,
+        "alarm": alarm,
+    }
     ports = {name: port for name, port in given.items() if port is not None}
     if assessor.reads_features and features is None:
         raise ValueError(

@@ -1,0 +1,568 @@
+"""Γ under shifts: what it is confident of and wrong, and when the monitor gives an alarm.
+
+Confident error (CE) is the share of rows that are called safe with at least 0.9, with a belief that
+is not "don't know", in motions that end unsafely. DK is the share of "don't know".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
+from drake_safety.evaluation.monitoring_study import rate_per_hour
+from drake_safety.evaluation.scorers import Scorer, StageProgress
+from drake_safety.evaluation.shifts import PLANS, POSTURES, PlantShift
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import PLAN
+from drake_safety.learning.novelty import Novelty
+from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes
+from drake_safety.simulation.capabilities import CanStartAnywhere
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.rollouts import (
+    episode_rng,
+    run_batches,
+    run_episode,
+    worker_loop,
+)
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.watched_motion import SEEN
+
+CONFIDENT = 0.9
+"""Least safety probability of a confident verdict."""
+SPANS_S = (10.0, 60.0)
+"""Times since a shift over which confident errors with the monitor are counted [s]."""
+_MOST_STARTS = 100  # Sequences of motions per shift.
+_BOOTSTRAP = Bootstrap(num_resamples=200)
+_NUM_TREES = 100
+_NEIGHBOURS, _MOST_REFERENCES = 10, 10_000
+
+
+@dataclass(kw_only=True, eq=False)
+class Motion:
+    """The inputs of one motion, in the order of time, and its outcome.
+
+    Attributes:
+        state: (N, n_s).
+        desired_preview: (N, H n_z).
+        features: (N, n_f).
+        is_outside: Whether the state is outside the safe set, (N,).
+        is_unsafe: Whether it ends unsafely.
+    """
+
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    is_outside: np.ndarray
+    is_unsafe: bool
+
+    @classmethod
+    def of_episode(cls, episode: Episode) -> Motion:
+        """The rows of an episode from its first undisturbed one."""
+        rows = slice(episode.first_step, None)
+        return cls(
+            **{name: getattr(episode, name)[rows] for name in SEEN},
+            is_outside=np.any(episode.margins[rows] < 0.0, axis=1),
+            is_unsafe=not episode.is_safe,
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class ShiftedSet:
+    """Motions under a shift.
+
+    Attributes:
+        kind: "nominal", "plant", "sensor", "plan", "posture" or "junk".
+        motions: The motions; those of postures and junk are single rows.
+    """
+
+    kind: str
+    motions: list[Motion]
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether the motions can follow each other."""
+        return self.kind in ("nominal", "plant", "sensor")
+
+
+def of_episodes(kind: str, episodes: Episodes) -> ShiftedSet:
+    """The motions of episodes; those that diverged are left out."""
+    motions = [Motion.of_episode(one) for one in episodes if one.cause != DIVERGED]
+    return ShiftedSet(kind=kind, motions=[one for one in motions if len(one.state)])
+
+
+def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenario:
+    """The scenario with a shift as a further variation."""
+    variations = {**scenario.variations, name: shift.variation}
+    return dataclasses.replace(_copy_of(scenario), variations=variations)
+
+
+def _copy_of(scenario: Scenario) -> Scenario:
+    # The parameters are no field, because their schema is that of the task.
+    copied = dataclasses.replace(scenario)
+    copied.parameters = scenario.parameters
+    return copied
+
+
+def run_changed_starts(
+    scenario: Scenario, num_motions: int, seed: int, num_workers: int | None = None
+) -> dict[str, ShiftedSet]:
+    """Simulates plans outside the range of training, and evaluates postures outside of it.
+
+    Postures are single rows, unsafe by definition. "falling" has the rows of nominal episodes after
+    they have left the safe set.
+
+    Args:
+        scenario: The scenario; its task can start anywhere, or nothing is returned.
+        num_motions: Number of motions of each kind.
+        seed: Seed of their starts.
+        num_workers: Number of processes.
+    """
+    if not isinstance(scenario.make_loop(), CanStartAnywhere):
+        return {}
+    found = {}
+    names = [*PLANS, *POSTURES, "falling"]
+    for name in names:
+        results = run_batches(
+            _changed_batch,
+            list(range(num_motions)),
+            lambda batch, name=name: (scenario, name, seed, batch),
+            num_workers=num_workers,
+        )
+        motions = [motion for motion in results if len(motion.state)]
+        kind = "plan" if name in PLANS else "posture"
+        if motions:
+            found[name] = ShiftedSet(kind=kind, motions=motions)
+    return found
+
+
+def _changed_batch(scenario: Scenario, name: str, seed: int, indices: list[int]) -> list[Motion]:
+    loop = worker_loop(scenario, "nominal", {})
+    return [_changed_motion(loop, name, seed, index) for index in indices]
+
+
+def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motion:
+    assert isinstance(loop, CanStartAnywhere)
+    if name == "falling":
+        return _fall(loop, seed, index)
+    context = loop.CreateDefaultContext()
+    loop.reset(context, episode_rng(seed, index))
+    start = loop.start_of(context)
+    kinematics = loop.kinematics  # type: ignore[attr-defined]
+    if name in PLANS:
+        start = PLANS[name](start, kinematics)
+        return Motion.of_episode(run_episode(loop, index, seed=seed, start=start))
+    loop.reset_to(context, episode_rng(seed, index), POSTURES[name](start, kinematics))
+    return _rows_of(loop, [context])
+
+
+def _fall(loop: ClosedLoop, seed: int, index: int) -> Motion:
+    """The rows of a nominal episode after it has left the safe set."""
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, episode_rng(seed, index))
+    simulator.Initialize()
+    rows, has_left = [], False
+    for step in range(loop.scenario.num_steps + 1):
+        try:
+            simulator.AdvanceTo(step * loop.scenario.step_s)
+        except RuntimeError:
+            break
+        has_left = has_left or bool(loop.GetOutputPort("margins").Eval(context).min() < 0.0)
+        if has_left:
+            rows.append(context.Clone())
+    return _rows_of(loop, rows)
+
+
+def _rows_of(loop: ClosedLoop, contexts: Sequence) -> Motion:
+    def stacked(name: str) -> np.ndarray:
+        port = loop.GetOutputPort(name)
+        rows = [port.Eval(context).copy() for context in contexts]
+        return np.stack(rows) if rows else np.empty((0, port.size()))
+
+    return Motion(
+        **{name: stacked(name) for name in SEEN},
+        is_outside=np.any(stacked("margins") < 0.0, axis=1),
+        is_unsafe=True,
+    )
+
+
+def junk(motions: Sequence[Motion], seed: int) -> dict[str, ShiftedSet]:
+    """Inputs that contradict themselves, in which no robot can be.
+
+    Args:
+        motions: Nominal motions.
+        seed: Seed of the permutations.
+    """
+    rng = np.random.default_rng(seed)
+    rows = {name: np.concatenate([getattr(one, name) for one in motions]) for name in SEEN}
+    motion = np.concatenate([np.full(len(one.state), i) for i, one in enumerate(motions)])
+
+    def permuted(values: np.ndarray) -> np.ndarray:
+        return values[rng.permutation(len(values))]
+
+    changed: dict[str, Mapping[str, np.ndarray]] = {
+        "columns shuffled": {
+            name: np.stack([permuted(column) for column in values.T], axis=1)
+            for name, values in rows.items()
+            if values.shape[1]
+        },
+        "gaussian": {
+            name: rng.normal(values.mean(axis=0), values.std(axis=0), values.shape)
+            for name, values in rows.items()
+        },
+    }
+    order = rng.permutation(len(motion))
+    for name, what in zip(SEEN, ("state", "plan", "features"), strict=True):
+        if rows[name].shape[1]:
+            changed[f"{what} of another row"] = {name: rows[name][order]}
+    found = {}
+    for name, replaced in changed.items():
+        values = {**rows, **replaced}
+        found[name] = ShiftedSet(
+            kind="junk",
+            motions=[
+                Motion(
+                    **{key: values[key][motion == i] for key in SEEN},
+                    is_outside=np.zeros(int((motion == i).sum()), dtype=bool),
+                    is_unsafe=True,
+                )
+                for i in range(len(motions))
+            ],
+        )
+    return found
+
+
+@dataclass(kw_only=True, eq=False)
+class Verdicts:
+    """Verdicts of one method on the rows of a shift.
+
+    Attributes:
+        probability: Safety probability, 0 for "don't know", (N,).
+        is_unknown: Whether the row is "don't know", (N,).
+    """
+
+    probability: np.ndarray
+    is_unknown: np.ndarray
+
+
+Judge = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Verdicts]
+"""Maps states, previews, features and whether a row is outside the safe set to verdicts."""
+
+
+def assessment_judge(assessment: SafetyAssessment, *, is_novelty_used: bool = True) -> Judge:
+    """Γ as a :class:`SafetyAssessor` with the port ``margins`` gives it, without the monitor."""
+    novelty = assessment.novelty_
+    if not is_novelty_used:
+        novelty = Novelty(training=novelty.training, limits=np.full(2, np.inf))
+
+    def judge(
+        state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray
+    ) -> Verdicts:
+        found = assessment.predict(
+            state, preview, features if assessment.uses_features else None, novelty=novelty
+        )
+        unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
+        known = (
+            found.calibrated if not is_novelty_used else np.where(is_outside, 0, found.calibrated)
+        )
+        return Verdicts(probability=known, is_unknown=unknown)
+
+    return judge
+
+
+def classifier_judge(scorer: Scorer) -> Judge:
+    """A classifier, which knows no "don't know"."""
+
+    def judge(
+        state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray
+    ) -> Verdicts:
+        del is_outside
+        probability = scorer.probability(state, preview, features)
+        return Verdicts(probability=probability, is_unknown=np.isnan(probability))
+
+    return judge
+
+
+def detector_judges(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Judge]:
+    """Published detectors of unknown inputs in place of the novelty: the same Γ, another limit.
+
+    Isolation forest (Liu et al. 2008), and the distance to the k-th nearest training input in the
+    last hidden layer of the first map (Sun et al. 2022). Each limit is exceeded in the same share
+    of safe training episodes as the novelty's.
+
+    Args:
+        assessment: Γ.
+        episodes: Its training episodes.
+    """
+    from sklearn.ensemble import IsolationForest
+    from sklearn.neighbors import NearestNeighbors
+    from threadpoolctl import threadpool_limits
+
+    safe = [one for one in episodes if one.is_safe]
+    x = [
+        assessment.inputs_of(one.state, one.desired_preview, one.features)[one.first_step :]
+        for one in safe
+    ]
+    half = len(x) // 2
+    reference, held_out = np.concatenate(x[:half]), x[half:]
+    rng = np.random.default_rng(0)
+    reference = reference[rng.permutation(len(reference))[:_MOST_REFERENCES]]
+
+    def activations(values: np.ndarray) -> np.ndarray:
+        hidden = assessment.embedding_.activations(values)[0]
+        return hidden / np.maximum(np.linalg.norm(hidden, axis=1, keepdims=True), 1e-9)
+
+    with threadpool_limits(1):
+        forest = IsolationForest(n_estimators=_NUM_TREES, random_state=0).fit(reference)
+        neighbours = NearestNeighbors(n_neighbors=_NEIGHBOURS, algorithm="brute")
+        neighbours.fit(activations(reference))
+
+    def distance(values: np.ndarray) -> np.ndarray:
+        found: np.ndarray = neighbours.kneighbors(activations(values))[0][:, -1]
+        return found
+
+    def strangeness(values: np.ndarray) -> np.ndarray:
+        found: np.ndarray = -forest.score_samples(values)
+        return found
+
+    plain = assessment_judge(assessment, is_novelty_used=False)
+    judges: dict[str, Judge] = {}
+    for name, score in {"isolation_forest": strangeness, "deep_knn": distance}.items():
+        worst = np.array([score(one).max() for one in held_out])
+        limit = np.quantile(worst, 1.0 - assessment.parameters.novelty_rate, method="higher")
+
+        def judge(
+            state: np.ndarray,
+            preview: np.ndarray,
+            features: np.ndarray,
+            is_outside: np.ndarray,
+            score: Callable[[np.ndarray], np.ndarray] = score,
+            limit: float = float(limit),
+        ) -> Verdicts:
+            found = plain(state, preview, features, is_outside)
+            values = assessment.inputs_of(state, preview, features)
+            is_strange = np.concatenate(
+                [score(part) for part in np.array_split(values, len(values) // 4096 + 1)]
+            )
+            unknown = found.is_unknown | (is_strange > limit)
+            return Verdicts(
+                probability=np.where(unknown, 0.0, found.probability), is_unknown=unknown
+            )
+
+        judges[name] = judge
+    return judges
+
+
+@dataclass(kw_only=True, eq=False)
+class ShiftResult:
+    """What a shift does.
+
+    Attributes:
+        kind: That of the :class:`ShiftedSet`.
+        estimates: By key.
+    """
+
+    kind: str
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+
+
+def evaluate_shift(
+    shifted: ShiftedSet, assessment: SafetyAssessment, judges: Mapping[str, Judge]
+) -> ShiftResult:
+    """Evaluates all methods and the monitor on a shift.
+
+    Args:
+        shifted: The motions.
+        assessment: Γ, with the monitor's innovation.
+        judges: Methods by name; "gamma" is Γ.
+    """
+    motions = shifted.motions
+    rows = {
+        name: np.concatenate([getattr(one, name) for one in motions])
+        for name in (*SEEN, "is_outside")
+    }
+    sizes = np.array([len(one.state) for one in motions])
+    motion = np.repeat(np.arange(len(motions)), sizes)
+    is_unsafe = np.array([one.is_unsafe for one in motions])
+    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    result = ShiftResult(kind=shifted.kind)
+    found = result.estimates
+    found["unsafe"] = proportion(int(is_unsafe.sum()), len(motions))
+
+    def share(mask: np.ndarray, of: np.ndarray = motion) -> Estimate:
+        def mean(weight: np.ndarray) -> float:
+            return float(np.average(mask, weights=weight)) if weight.any() else np.nan
+
+        return _BOOTSTRAP.over_episodes(mean, of)
+
+    for name, judge in judges.items():
+        verdicts = judge(*rows.values())
+        is_wrong = (verdicts.probability >= CONFIDENT) & ~verdicts.is_unknown & is_unsafe[motion]
+        found[f"{name}.confident_error"] = share(is_wrong)
+        found[f"{name}.unknown"] = share(verdicts.is_unknown)
+        found[f"{name}.first.confident_error"] = proportion(
+            int(is_wrong[first].sum()), len(motions)
+        )
+        if 0 < is_unsafe.sum() < len(motions):
+            score = 1.0 - np.nan_to_num(verdicts.probability)
+            found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
+        if name == "gamma":
+            gamma, is_confident = verdicts, is_wrong
+    promise = assessment.calibrations_.get(PLAN)
+    if promise is not None and is_unsafe.any():
+        is_missed = (gamma.probability[first] >= promise.threshold) & is_unsafe
+        found["missed"] = proportion(int(is_missed.sum()), int(is_unsafe.sum()))
+    if shifted.is_lasting:
+        found |= _monitored(shifted, assessment, is_confident, first)
+    return result
+
+
+def _monitored(
+    shifted: ShiftedSet,
+    assessment: SafetyAssessment,
+    is_confident: np.ndarray,
+    first: np.ndarray,
+) -> dict[str, Estimate]:
+    """The monitor on motions one after another, begun at each of them."""
+    motions, innovation = shifted.motions, assessment.innovation_
+    x = [assessment.inputs_of(m.state, m.desired_preview, m.features) for m in motions]
+    distances = [assessment.novelty_.of(one) for one in x]
+    step_s = innovation.step_s
+    promise = assessment.calibrations_.get(PLAN)
+    accepted = np.zeros(len(motions), dtype=bool)
+    if promise is not None:
+        accepted = _first_probability(assessment, motions) >= promise.threshold
+    delay, errors = [], {span: [] for span in SPANS_S}  # type: ignore[var-annotated]
+    missed = num_unsafe = 0
+    starts = np.linspace(0, len(motions), min(_MOST_STARTS, len(motions)), endpoint=False)
+    for start in starts.astype(int):
+        order, rows = [], 0
+        for i in range(len(motions)):
+            order.append((start + i) % len(motions))
+            rows += len(x[order[-1]])
+            if rows * step_s > max(SPANS_S):
+                break
+        levels = innovation.levels([x[i] for i in order], [distances[i] for i in order])
+        is_alarm = levels.max(axis=1) > 1.0
+        alarm = int(np.argmax(is_alarm)) if is_alarm.any() else len(is_alarm)
+        delay.append((alarm + 1) * step_s if is_alarm.any() else np.inf)
+        wrong = np.concatenate([is_confident[first[i] : first[i] + len(x[i])] for i in order]) & (
+            np.arange(rows) < alarm
+        )
+        for span in SPANS_S:
+            errors[span].append(wrong[: round(span / step_s)].mean())
+        begins = np.concatenate([[0], np.cumsum([len(x[i]) for i in order])[:-1]])
+        for i, begin in zip(order, begins, strict=True):
+            if motions[i].is_unsafe:
+                num_unsafe += 1
+                missed += bool(accepted[i] and begin < alarm)
+    found = {
+        f"monitor.confident_error_{span:g}s": _mean(np.array(values))
+        for span, values in errors.items()
+    }
+    found["monitor.delay_s"] = _quantile(np.array(delay), 0.5)
+    found["monitor.delay_95_s"] = _quantile(np.array(delay), 0.95)
+    found["monitor.alarmed"] = proportion(int(np.isfinite(delay).sum()), len(delay))
+    if promise is not None and num_unsafe:
+        found["monitor.missed"] = Estimate.exact(missed / num_unsafe, len(starts))
+    return found
+
+
+def _first_probability(assessment: SafetyAssessment, motions: Sequence[Motion]) -> np.ndarray:
+    features = np.stack([one.features[0] for one in motions])
+    found = assessment.predict(
+        np.stack([one.state[0] for one in motions]),
+        np.stack([one.desired_preview[0] for one in motions]),
+        features if assessment.uses_features else None,
+    )
+    return found.calibrated
+
+
+def _mean(values: np.ndarray) -> Estimate:
+    return _BOOTSTRAP.over_episodes(
+        lambda weight: float(np.average(values, weights=weight)), np.arange(len(values))
+    )
+
+
+def _quantile(values: np.ndarray, quantile: float) -> Estimate:
+    def of(weight: np.ndarray) -> float:
+        drawn = np.sort(np.repeat(values, weight.astype(int)))
+        return float(drawn[min(int(quantile * len(drawn)), len(drawn) - 1)])
+
+    value = of(np.ones(len(values)))
+    rng = np.random.default_rng(0)
+    drawn = [
+        of(np.bincount(rng.integers(len(values), size=len(values)), minlength=len(values)))
+        for _ in range(_BOOTSTRAP.num_resamples)
+    ]
+    low, high = np.quantile(drawn, _BOOTSTRAP.quantiles, method="nearest")
+    return Estimate(value, float(low), float(high), len(values))
+
+
+def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Estimate:
+    """False alarms of the monitor per hour, on nominal motions one after another.
+
+    Motions that end unsafely are left out; the charts begin anew after an alarm.
+
+    Args:
+        motions: Nominal motions.
+        assessment: Γ, with the monitor's innovation.
+    """
+    innovation = assessment.innovation_
+    waiting = [
+        assessment.inputs_of(one.state, one.desired_preview, one.features)
+        for one in motions
+        if not one.is_unsafe
+    ]
+    num_motions, count, rows = len(waiting), 0, sum(map(len, waiting))
+    distances = [assessment.novelty_.of(one) for one in waiting]
+    ends = np.cumsum([len(one) for one in waiting])
+    begin = 0
+    while begin < num_motions:
+        levels = innovation.levels(waiting[begin:], distances[begin:])
+        is_alarm = levels.max(axis=1) > 1.0
+        if not is_alarm.any():
+            break
+        count += 1
+        row = int(np.argmax(is_alarm)) + (ends[begin - 1] if begin else 0)
+        begin = int(np.searchsorted(ends, row, side="right")) + 1
+    return rate_per_hour(count, rows * innovation.step_s, num_motions)
+
+
+def evaluate_shifts(
+    sets: Mapping[str, ShiftedSet],
+    assessment: SafetyAssessment,
+    classifiers: Sequence[Scorer],
+    training: Episodes | None,
+    progress: StageProgress | None = None,
+) -> dict[str, ShiftResult]:
+    """Evaluates Γ, its monitor and the baselines on every shift.
+
+    Args:
+        sets: Motions by shift.
+        assessment: Γ.
+        classifiers: Baseline classifiers.
+        training: Training episodes, for the published detectors; None to leave these out.
+        progress: Called with a stage, the number done and the number wanted.
+    """
+    judges = {
+        "gamma": assessment_judge(assessment),
+        "without_novelty": assessment_judge(assessment, is_novelty_used=False),
+        **{scorer.name: classifier_judge(scorer) for scorer in classifiers},
+    }
+    if training is not None:
+        judges |= detector_judges(assessment, training)
+    results = {}
+    for i, (name, shifted) in enumerate(sets.items()):
+        if progress is not None:
+            progress("shifts", i, len(sets))
+        results[name] = evaluate_shift(shifted, assessment, judges)
+    if progress is not None:
+        progress("shifts", len(sets), len(sets))
+    return results

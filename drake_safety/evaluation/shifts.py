@@ -1,0 +1,179 @@
+"""Catalogue of shifts: conditions that training does not have, scaled to the robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RotationMatrix
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
+from drake_safety.robots.robot_model import by_pattern
+from drake_safety.robots.shift import InputShift, JointShift, Shift
+from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.scenario import Scenario
+
+_SLOPE_RAD = math.radians(10.0)
+_SIDE_FORCE_SHARE = 0.1  # Of the weight.
+_PAYLOAD_SHARE = 0.3  # Of the mass.
+_MASS_SCALE = 1.5
+_WEAK_SHARE = 0.9  # Of the joint's static torque in the standing posture.
+_LOW_FRICTION = 0.1
+_DELAY_PERIODS = 5  # Of the controller.
+_HOLE_SHARE = 0.07  # Of the standing height.
+_JOINT_BIAS_RAD = 0.05
+_NOISE_FACTOR = 10.0
+_FROZEN_AT_S = 0.4
+_STALE_S = 0.2
+_FARTHER, _FASTER = 1.5, 2.0
+_LIFT_SHARE = 0.25  # Of the standing height.
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantShift:
+    """A plant, or a fault of its sensors, that training does not have.
+
+    Attributes:
+        kind: "plant" or "sensor".
+        variation: The plant, with its sensors.
+    """
+
+    kind: str
+    variation: PlantVariation
+
+
+def plant_shifts(scenario: Scenario, kinematics: RobotKinematics) -> dict[str, PlantShift]:
+    """Shifts of plant and sensors, each from the nominal plant, and the scenario's variations.
+
+    Args:
+        scenario: The scenario.
+        kinematics: The nominal robot.
+
+    Returns:
+        The shifts by name.
+    """
+    nominal = scenario.variation("nominal")
+    robot, mass_kg = kinematics.robot, kinematics.total_mass
+    q = kinematics.standing_positions()
+    is_stance = np.ones(kinematics.num_contacts, dtype=bool)
+    torques = np.abs(kinematics.gravity_torques(q, is_stance))
+    loaded = int(np.argmax(torques))
+    joint = kinematics.joint_names[loaded]
+    foot = kinematics.foot_names[0]
+    weak_scale = _WEAK_SHARE * torques[loaded] / _effort_limit(kinematics, joint)
+    lateral_n = _SIDE_FORCE_SHARE * mass_kg * 9.81
+    lasting = {
+        "slope": Shift(slope_rad=_SLOPE_RAD),
+        "side_force": Shift(base_force_n=[0.0, lateral_n, 0.0]),
+        "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
+        "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
+        "late_command": Shift(command_delay_s=_DELAY_PERIODS * scenario.control_period_s),
+        "hole": Shift(holes_m={foot: _HOLE_SHARE * kinematics.standing_height}),
+    }
+    if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
+        lasting["soft_joint"] = Shift(joints={joint: JointShift(stiffness_scale=0.5)})
+    faults = {
+        "joint_bias": InputShift(joint_bias_rad=_JOINT_BIAS_RAD),
+        "dead_velocities": InputShift(velocity_scale=0.0),
+        "stale": InputShift(delay_s=_STALE_S),
+        "frozen": InputShift(frozen_at_s=0.0),
+        "frozen_later": InputShift(frozen_at_s=_FROZEN_AT_S),
+    }
+    noise = nominal.input_noise
+    noisy = ObservationNoise(position=noise.position, velocity=_NOISE_FACTOR * noise.velocity)
+    plants = {
+        **{name: dataclasses.replace(nominal, shift=shift) for name, shift in lasting.items()},
+        "payload": dataclasses.replace(nominal, payload=Payload(mass_kg=_PAYLOAD_SHARE * mass_kg)),
+        "heavy": dataclasses.replace(nominal, mass_scale=_MASS_SCALE * nominal.mass_scale),
+        "slippery": dataclasses.replace(nominal, foot_friction=_LOW_FRICTION),
+    }
+    sensors = {
+        **{
+            name: dataclasses.replace(nominal, shift=Shift(inputs=fault))
+            for name, fault in faults.items()
+        },
+        "noisy_velocities": dataclasses.replace(nominal, input_noise=noisy),
+    }
+    own = {
+        f"variation {name}": variation
+        for name, variation in scenario.variations.items()
+        if name != "nominal"
+    }
+    return {
+        **{name: PlantShift(kind="plant", variation=one) for name, one in plants.items()},
+        **{name: PlantShift(kind="plant", variation=one) for name, one in own.items()},
+        **{name: PlantShift(kind="sensor", variation=one) for name, one in sensors.items()},
+    }
+
+
+def _effort_limit(kinematics: RobotKinematics, joint: str) -> float:
+    limit = by_pattern(kinematics.robot.effort_limits, joint, "effort limit", kinematics.robot.name)
+    if limit is None:
+        plant = kinematics.plant
+        limit = next(
+            plant.get_joint_actuator(i).effort_limit()
+            for i in plant.GetJointActuatorIndices()
+            if plant.get_joint_actuator(i).joint().name() == joint
+        )
+    return float(limit)
+
+
+Reshape = Callable[[EpisodeStart, RobotKinematics], EpisodeStart]
+"""Changes a start of an episode."""
+
+
+def _scaled_plan(
+    plan: PiecewisePolynomial, *, distance: float, speed: float
+) -> PiecewisePolynomial:
+    """A plan whose points are farther from its start, and reached earlier."""
+    start_s = plan.start_time()
+    origin = plan.value(start_s)
+    scaled = PiecewisePolynomial(origin) if plan.get_number_of_segments() == 0 else plan
+    times = np.array(scaled.get_segment_times())
+    samples = np.linspace(times[0], times[-1], 41)
+    points = origin + distance * (np.hstack([scaled.value(t) for t in samples]) - origin)
+    return PiecewisePolynomial.FirstOrderHold(start_s + (samples - start_s) / speed, points)
+
+
+def _farther(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
+    del kinematics
+    return dataclasses.replace(start, plan=_scaled_plan(start.plan, distance=_FARTHER, speed=1.0))
+
+
+def _faster(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
+    del kinematics
+    return dataclasses.replace(start, plan=_scaled_plan(start.plan, distance=1.0, speed=_FASTER))
+
+
+PLANS: Mapping[str, Reshape] = {"farther": _farther, "faster": _faster}
+"""Plans outside the range of training, by name."""
+
+
+def _lifted(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
+    q = start.q.copy()
+    q[6] += _LIFT_SHARE * kinematics.standing_height
+    return dataclasses.replace(start, q=q)
+
+
+def _lying(roll_rad: float) -> Reshape:
+    def reshape(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
+        del kinematics
+        q = start.q.copy()
+        R = RotationMatrix.MakeXRotation(roll_rad).ToQuaternion()
+        q[:4], q[6] = R.wxyz(), 0.3 * q[6]
+        return dataclasses.replace(start, q=q, v=np.zeros_like(start.v))
+
+    return reshape
+
+
+POSTURES: Mapping[str, Reshape] = {
+    "lifted": _lifted,
+    "on_its_side": _lying(0.5 * math.pi),
+    "on_its_back": _lying(math.pi),
+}
+"""Postures in which no episode of training is, by name; all are unsafe."""

@@ -1,0 +1,535 @@
+"""Innovation: the error of a one-step prediction, and its charts over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_safety.learning.novelty import Moments, Novelty
+
+TIME_CONSTANTS_S = (0.8, 4.0)
+"""Memory of the charts."""
+FALSE_ALARMS_PER_HOUR = 0.1
+"""Rate of false alarms of each chart on the nominal plant, by extrapolation."""
+KINDS = ("", "frozen", "distance", "fast", "slow")
+"""What raises an alarm, "" for none: repeated inputs, the distance of x, and the two charts."""
+_NUM_FOLDS = 3
+_HIDDEN = (128, 128)
+_SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
+_CLIP_SHARE = 0.99  # Of innovations that are not clipped, so that one impact is no lasting change.
+_BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
+_TAIL = 0.1  # Share of the blocks in the tail.
+_ALLOWANCE = 0.5  # Of the CUSUM of the distance, in standard deviations.
+_LARGEST_STEP = 5.0  # Of the CUSUM, in standard deviations.
+_LEAST_ROWS = 10  # Rows for each state, below which there is no alarm.
+_FREE_REPEATS = 2  # Beyond the longest run of repeated inputs in training.
+_RIDGE = 1.0
+_LEAST_EARLY_STOPPING = 100  # Rows, of which a tenth is held out.
+_MOST_ROWS = 40_000  # For the network.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Predictor:
+    """Predicts the change of the measured state in one step from x.
+
+    A linear regression with a network of two hidden layers on its residual.
+
+    Attributes:
+        mean, scale: Standardisation of x, (n_x,).
+        linear, bias: The regression, (n_x, n_s), (n_s,).
+        layers: Weights and biases of the network.
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    linear: np.ndarray
+    bias: np.ndarray
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+    @classmethod
+    def fit(cls, x: np.ndarray, change: np.ndarray) -> Predictor:
+        """Fits the change (N, n_s) to inputs (N, n_x)."""
+        from sklearn.linear_model import Ridge
+        from sklearn.neural_network import MLPRegressor
+        from threadpoolctl import threadpool_limits
+
+        mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), _SMALLEST_SPREAD)
+        z = (x - mean) / scale
+        with threadpool_limits(1):
+            ridge = Ridge(alpha=_RIDGE).fit(z, change)
+            residual = change - ridge.predict(z)
+            unit = np.maximum(residual.std(axis=0), 1e-12)
+            rows = np.random.default_rng(0).permutation(len(x))[:_MOST_ROWS]
+            network = MLPRegressor(
+                hidden_layer_sizes=_HIDDEN,
+                alpha=1e-3,
+                batch_size=min(256, len(rows)),
+                early_stopping=len(rows) >= _LEAST_EARLY_STOPPING,
+                n_iter_no_change=4,
+                max_iter=40,
+                tol=1e-3,
+                random_state=0,
+            )
+            _fit_quietly(network, z[rows], residual[rows] / unit)
+        layers = [*zip(network.coefs_, network.intercepts_, strict=True)]
+        layers[-1] = (layers[-1][0] * unit, layers[-1][1] * unit)
+        # Files store the network in single precision.
+        layers = [tuple(np.float32(part).astype(float) for part in layer) for layer in layers]
+        return cls(
+            mean=mean,
+            scale=scale,
+            linear=ridge.coef_.T,
+            bias=ridge.intercept_,
+            layers=tuple(layers),
+        )
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Returns the predicted changes (N, n_s) at inputs (N, n_x)."""
+        z = (x - self.mean) / self.scale
+        hidden = z
+        for weight, bias in self.layers[:-1]:
+            hidden = np.maximum(hidden @ weight + bias, 0.0)
+        weight, bias = self.layers[-1]
+        return z @ self.linear + self.bias + (hidden @ weight + bias)
+
+    def corrected(self, x: np.ndarray, change: np.ndarray) -> Predictor:
+        """Returns the predictor with the regression fitted to another plant's changes."""
+        from sklearn.linear_model import Ridge
+
+        z = (x - self.mean) / self.scale
+        # Few rows: what they do not determine stays as it was.
+        ridge = Ridge(alpha=len(x) / 10.0).fit(z, change - self(x))
+        return Predictor(
+            mean=self.mean,
+            scale=self.scale,
+            linear=self.linear + ridge.coef_.T,
+            bias=self.bias + ridge.intercept_,
+            layers=self.layers,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chart:
+    """A multivariate chart of the exponentially weighted mean of whitened innovations (MEWMA).
+
+    Attributes:
+        time_constant_s: Memory [s].
+        whitening: Whitens the mean on the nominal plant, (n_s, n_s).
+        limit: Largest norm of the whitened mean; infinite if training had too little motion.
+    """
+
+    time_constant_s: float
+    whitening: np.ndarray
+    limit: float
+
+
+class Innovation:
+    """The error of predicting the next measured state, on the nominal plant and since.
+
+    A plant that changed cannot be seen in one input: it lies among those of training. It is seen in
+    how the state follows from the last one. The innovation is whitened, limited in norm, and
+    averaged by two charts with memory; a third chart sums the distance of x (CUSUM), a fourth
+    counts inputs that repeat the last one to the last bit. It is learned from the nominal episodes
+    that stay safe, and needs no failure. The object is immutable.
+
+    Args:
+        predictor: The prediction.
+        offset: Mean of its errors, (n_s,).
+        whitening: Whitens them, (n_s, n_s).
+        clip: Largest norm of a whitened innovation.
+        charts: The charts, a fast and a slow one.
+        distance: Mean, standard deviation and limit of the CUSUM of the distance, (3,).
+        longest_repeat: Longest known run of repeated inputs.
+        step_s: Time between two inputs [s].
+    """
+
+    def __init__(
+        self,
+        *,
+        predictor: Predictor,
+        offset: np.ndarray,
+        whitening: np.ndarray,
+        clip: float,
+        charts: Sequence[Chart],
+        distance: np.ndarray,
+        longest_repeat: int,
+        step_s: float,
+    ):
+        self.predictor, self.offset, self.whitening = predictor, offset, whitening
+        self.clip, self.charts, self.distance = float(clip), tuple(charts), np.asarray(distance)
+        self.longest_repeat, self.step_s = int(longest_repeat), float(step_s)
+        self.num_inputs, self.num_states = len(predictor.mean), len(offset)
+        self.rates = tuple(min(1.0, step_s / chart.time_constant_s) for chart in self.charts)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Innovation:
+        return self
+
+    @classmethod
+    def fit(
+        cls, x: Sequence[np.ndarray], num_states: int, step_s: float, novelty: Novelty
+    ) -> Innovation:
+        """Learns from nominal motions, each judged by a prediction learned from others.
+
+        Args:
+            x: Inputs of each motion in the order of time, (K + 1, n_x); the state is first.
+            num_states: n_s.
+            step_s: Time between two rows [s].
+            novelty: Its limits scale the distance.
+        """
+        x = [one for one in x if len(one) > 1]
+        if not x:
+            raise ValueError("Innovation: no motion has two inputs")
+        errors: list[np.ndarray] = [np.empty(0)] * len(x)
+        distances = list(errors)
+        for part in range(_NUM_FOLDS):
+            own = range(part, len(x), _NUM_FOLDS)
+            others = [one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x
+            predictor = Predictor.fit(*_steps(others, num_states))
+            known = Novelty(training=Moments.of(np.concatenate(others)), limits=novelty.limits)
+            for i in own:
+                errors[i] = _errors(predictor, x[i], num_states)
+                distances[i] = known.of(x[i][1:])
+        whole = np.concatenate(errors)
+        offset, whitening = _whitening(whole)
+        norm = np.linalg.norm((whole - offset) @ whitening, axis=1)
+        spread = max(float(np.concatenate(distances).std()), 1e-6)
+        unlimited = cls(
+            predictor=Predictor.fit(*_steps(x, num_states)),
+            offset=offset,
+            whitening=whitening,
+            clip=float(np.quantile(norm, _CLIP_SHARE)),
+            charts=[
+                Chart(time_constant_s=t, whitening=np.eye(num_states), limit=np.inf)
+                for t in TIME_CONSTANTS_S
+            ],
+            distance=np.array([np.concatenate(distances).mean(), spread, np.inf]),
+            longest_repeat=max(_longest_repeat(one) for one in x) + _FREE_REPEATS,
+            step_s=step_s,
+        )
+        if len(whole) < _LEAST_ROWS * num_states:
+            return unlimited
+        order = np.random.default_rng(0).permutation(len(x))
+        shuffled = [errors[i] for i in order]
+        charts = []
+        for rate, chart in zip(unlimited.rates, unlimited.charts, strict=True):
+            means = _averaged(unlimited.limited(np.concatenate(shuffled)), rate)
+            whitening = _whitening(means, is_centred=True)[1]
+            limit = _limit(np.linalg.norm(means @ whitening, axis=1), step_s)
+            charts.append(
+                Chart(time_constant_s=chart.time_constant_s, whitening=whitening, limit=limit)
+            )
+        sums = unlimited.summed(np.concatenate([distances[i] for i in order]))
+        return unlimited._with(charts, np.append(unlimited.distance[:2], _limit(sums, step_s)))
+
+    def with_feedback(self, x: Sequence[np.ndarray], novelty: Novelty) -> Innovation:
+        """Returns the innovation of an actual robot: corrected prediction, no lower limits.
+
+        Args:
+            x: Inputs of each motion of the robot, (K + 1, n_x).
+            novelty: The novelty adapted to them.
+        """
+        x = [one for one in x if len(one) > 1]
+        if not x:
+            return self
+        errors: list[np.ndarray] = [np.empty(0)] * len(x)
+        for part in range(_NUM_FOLDS):
+            others = [one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x
+            predictor = self.predictor.corrected(*_steps(others, self.num_states))
+            for i in range(part, len(x), _NUM_FOLDS):
+                errors[i] = _errors(predictor, x[i], self.num_states)
+        limited = self.limited(np.concatenate(errors))
+        charts = []
+        for rate, chart in zip(self.rates, self.charts, strict=True):
+            norm = np.linalg.norm(_averaged(limited, rate) @ chart.whitening, axis=1)
+            limit = max(chart.limit, _limit(norm, self.step_s))
+            charts.append(
+                Chart(time_constant_s=chart.time_constant_s, whitening=chart.whitening, limit=limit)
+            )
+        distances = np.concatenate([novelty.of(one[1:]) for one in x])
+        distance = self.distance.copy()
+        distance[0] = max(distance[0], distances.mean())
+        distance[1] = max(distance[1], distances.std())
+        adapted = Innovation(
+            predictor=self.predictor.corrected(*_steps(x, self.num_states)),
+            offset=self.offset,
+            whitening=self.whitening,
+            clip=self.clip,
+            charts=charts,
+            distance=distance,
+            longest_repeat=max(self.longest_repeat, *map(_longest_repeat, x)),
+            step_s=self.step_s,
+        )
+        limit = max(distance[2], _limit(adapted.summed(distances), self.step_s))
+        return adapted._with(charts, np.append(distance[:2], limit))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns all that `from_arrays` needs, by name."""
+        predictor = self.predictor
+        found = {
+            "mean": predictor.mean,
+            "scale": predictor.scale,
+            "linear": predictor.linear,
+            "bias": predictor.bias,
+            "offset": self.offset,
+            "whitening": self.whitening,
+            "distance": self.distance,
+            "chart_limits": np.array([chart.limit for chart in self.charts]),
+            "chart_whitenings": np.stack([chart.whitening for chart in self.charts]),
+            "settings": np.array([self.clip, self.longest_repeat, self.step_s]),
+        }
+        for i, (weight, bias) in enumerate(predictor.layers):
+            found |= {f"layer.{i}.weight": weight, f"layer.{i}.bias": bias}
+        return found
+
+    @classmethod
+    def from_arrays(
+        cls, arrays: Mapping[str, np.ndarray], *, num_inputs: int, num_states: int
+    ) -> Innovation:
+        """Makes the innovation of arrays written by `arrays`.
+
+        Args:
+            arrays: The arrays by name.
+            num_inputs: n_x.
+            num_states: n_s.
+
+        Raises:
+            KeyError: One is missing.
+            ValueError: A shape is wrong, or a number is not finite.
+        """
+        widths = (num_inputs, *_HIDDEN, num_states)
+        square, n_charts = (num_states, num_states), len(TIME_CONSTANTS_S)
+        shapes: dict[str, tuple[int, ...]] = {
+            "mean": (num_inputs,),
+            "scale": (num_inputs,),
+            "linear": (num_inputs, num_states),
+            "bias": (num_states,),
+            "offset": (num_states,),
+            "whitening": square,
+            "distance": (3,),
+            "chart_limits": (n_charts,),
+            "chart_whitenings": (n_charts, *square),
+            "settings": (3,),
+        }
+        for i in range(len(_HIDDEN) + 1):
+            shapes[f"layer.{i}.weight"] = (widths[i], widths[i + 1])
+            shapes[f"layer.{i}.bias"] = (widths[i + 1],)
+        for name, shape in shapes.items():
+            array = arrays[name]
+            # A limit may be infinite.
+            if array.shape != shape or np.isnan(array).any():
+                raise ValueError(
+                    f"the shape of its innovation.{name} is {array.shape}, expected {shape} of "
+                    "numbers"
+                )
+        layers = [
+            (arrays[f"layer.{i}.weight"], arrays[f"layer.{i}.bias"])
+            for i in range(len(_HIDDEN) + 1)
+        ]
+        clip, longest_repeat, step_s = arrays["settings"]
+        return cls(
+            predictor=Predictor(
+                layers=tuple(layers),
+                **{name: arrays[name] for name in ("mean", "scale", "linear", "bias")},
+            ),
+            offset=arrays["offset"],
+            whitening=arrays["whitening"],
+            clip=clip,
+            charts=[
+                Chart(time_constant_s=t, whitening=whitening, limit=float(limit))
+                for t, whitening, limit in zip(
+                    TIME_CONSTANTS_S,
+                    arrays["chart_whitenings"],
+                    arrays["chart_limits"],
+                    strict=True,
+                )
+            ],
+            distance=arrays["distance"],
+            longest_repeat=int(longest_repeat),
+            step_s=step_s,
+        )
+
+    def _with(self, charts: Sequence[Chart], distance: np.ndarray) -> Innovation:
+        return Innovation(
+            predictor=self.predictor,
+            offset=self.offset,
+            whitening=self.whitening,
+            clip=self.clip,
+            charts=charts,
+            distance=distance,
+            longest_repeat=self.longest_repeat,
+            step_s=self.step_s,
+        )
+
+    def of(self, x: np.ndarray, next_state: np.ndarray) -> np.ndarray:
+        """Returns whitened innovations of limited norm, (N, n_s).
+
+        Args:
+            x: Inputs, (N, n_x).
+            next_state: State one step later, (N, n_s).
+        """
+        return self.limited(next_state - x[:, : self.num_states] - self.predictor(x))
+
+    def limited(self, errors: np.ndarray) -> np.ndarray:
+        """Whitens errors of prediction (N, n_s) and limits their norm."""
+        whitened = (errors - self.offset) @ self.whitening
+        norm = np.sqrt(np.einsum("ij,ij->i", whitened, whitened))
+        return whitened * np.minimum(1.0, self.clip / np.maximum(norm, 1e-12))[:, None]
+
+    def summed(self, distances: np.ndarray) -> np.ndarray:
+        """Returns the CUSUM of distances of consecutive inputs, (N,)."""
+        sums, total = np.empty(len(distances)), 0.0
+        for i, distance in enumerate(distances):
+            total = self.next_sum(total, float(distance))
+            sums[i] = total
+        return sums
+
+    def next_sum(self, total: float, distance: float) -> float:
+        """Returns the CUSUM after one more distance."""
+        mean, spread = self.distance[:2]
+        return max(0.0, total + min((distance - mean) / spread, _LARGEST_STEP) - _ALLOWANCE)
+
+    def levels(self, motions: Sequence[np.ndarray], distances: Sequence[np.ndarray]) -> np.ndarray:
+        """Returns what the charts say at each row of consecutive motions, in units of their limits.
+
+        Between motions the charts keep their values.
+
+        Args:
+            motions: Inputs of each motion, (K + 1, n_x).
+            distances: Novelty of each input, (K + 1,).
+
+        Returns:
+            (sum of K + 1, 4), in the order of ``KINDS[1:]``.
+        """
+        found = np.zeros((sum(map(len, motions)), len(KINDS) - 1))
+        is_step = np.concatenate([np.arange(len(one)) > 0 for one in motions])
+        if is_step.any():
+            innovations = np.concatenate(
+                [self.of(one[:-1], one[1:, : self.num_states]) for one in motions if len(one) > 1]
+            )
+            repeats = np.concatenate([_repeats(one) for one in motions])
+            found[is_step, 0] = repeats / self.longest_repeat
+            sums = self.summed(np.concatenate([one[1:] for one in distances]))
+            found[is_step, 1] = sums / self.distance[2]
+            for column, (chart, rate) in enumerate(zip(self.charts, self.rates, strict=True), 2):
+                averages = _averaged(innovations, rate)
+                found[is_step, column] = (
+                    np.linalg.norm(averages @ chart.whitening, axis=1) / chart.limit
+                )
+        # The first row of a motion shows the last values.
+        last = np.maximum.accumulate(np.where(is_step, np.arange(len(found)), 0))
+        return found[last]
+
+    def deviations(self, kind: str, average: np.ndarray) -> np.ndarray:
+        """Returns the mean error of each state, in its standard deviations on the nominal plant.
+
+        Args:
+            kind: The chart, "fast" or "slow".
+            average: The chart's mean of whitened innovations, (n_s,).
+
+        Returns:
+            (n_s,), positive where the state grows more than predicted.
+        """
+        chart = self.charts[("fast", "slow").index(kind)]
+        unwhitening = np.linalg.inv(self.whitening)
+        root = np.linalg.inv(chart.whitening) @ unwhitening
+        return (average @ unwhitening) / np.linalg.norm(root, axis=0)
+
+
+def describe(kind: str, deviations: np.ndarray, state_names: Sequence[str]) -> str:
+    """Says what an alarm saw, as far as the errors tell; "" without one.
+
+    Args:
+        kind: One of ``KINDS``.
+        deviations: Mean error of each state in standard deviations, (n_s,); for charts only.
+        state_names: Names of the states.
+    """
+    if kind == "frozen":
+        return "input frozen"
+    if kind == "distance":
+        return "inputs unlike those of training"
+    if not kind:
+        return ""
+    strangest = int(np.argmax(np.abs(deviations)))
+    name, deviation = state_names[strangest], deviations[strangest]
+    joint = name.removesuffix("_rate")
+    if joint in state_names and f"{joint}_rate" in state_names:
+        seen = f"joint {joint} answers unlike the learned one"
+    elif name.startswith(("velocity_", "base_")) and name[-1] in _SIDES:
+        seen = f"pushed steadily {_SIDES[name[-1]][int(deviation < 0.0)]}"
+    else:
+        seen = f"{name} changes unlike what was learned"
+    return f"{seen} ({name} {deviation:+.0f} standard deviations)"
+
+
+_SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
+
+
+def _fit_quietly(network: Any, z: np.ndarray, target: np.ndarray) -> None:
+    import warnings
+
+    with warnings.catch_warnings():
+        # The number of epochs is limited on purpose.
+        warnings.simplefilter("ignore")
+        network.fit(z, target)
+
+
+def _steps(x: Sequence[np.ndarray], num_states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs of all motions but the last ones, and the changes of the state after them."""
+    changes = [np.diff(one[:, :num_states], axis=0) for one in x]
+    return np.concatenate([one[:-1] for one in x]), np.concatenate(changes)
+
+
+def _errors(predictor: Predictor, x: np.ndarray, num_states: int) -> np.ndarray:
+    return np.diff(x[:, :num_states], axis=0) - predictor(x[:-1])
+
+
+def _whitening(values: np.ndarray, *, is_centred: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and W with (values - mean) W of unit covariance, by shrinkage."""
+    from sklearn.covariance import LedoitWolf
+
+    # Constant states have no covariance to invert.
+    scale = np.maximum(values.std(axis=0), 1e-9)
+    found = LedoitWolf(assume_centered=is_centred).fit(values / scale)
+    ridge = 1e-6 * np.eye(len(scale))
+    root = np.linalg.cholesky(np.linalg.inv(found.covariance_ + ridge))
+    mean = np.zeros(len(scale)) if is_centred else found.location_ * scale
+    return mean, root / scale[:, None]
+
+
+def _averaged(values: np.ndarray, rate: float) -> np.ndarray:
+    """Exponentially weighted means of consecutive rows, from zero."""
+    from scipy.signal import lfilter
+
+    averaged: np.ndarray = lfilter([rate], [1.0, rate - 1.0], values, axis=0)
+    return averaged
+
+
+def _limit(statistic: np.ndarray, step_s: float) -> float:
+    """A limit for the rate of false alarms, by an exponential tail (peaks over threshold)."""
+    size = max(1, round(_BLOCK_S / step_s))
+    blocks = statistic[: max(1, len(statistic) // size) * size]
+    if len(blocks) >= size:
+        blocks = blocks.reshape(-1, size).max(axis=1)
+    threshold = float(np.quantile(blocks, 1.0 - _TAIL))
+    excess = blocks[blocks > threshold] - threshold
+    if not len(excess):
+        return 2.0 * float(statistic.max())
+    per_hour = _TAIL * 3600.0 / (size * step_s)
+    extrapolated = threshold + excess.mean() * np.log(per_hour / FALSE_ALARMS_PER_HOUR)
+    return float(max(extrapolated, statistic.max()))
+
+
+def _repeats(x: np.ndarray) -> np.ndarray:
+    """Length of the run of inputs that repeat the one before, from the second input on, (K,)."""
+    runs, run = np.zeros(len(x) - 1), 0
+    for i, is_same in enumerate(np.all(x[1:] == x[:-1], axis=1)):
+        run = run + 1 if is_same else 0
+        runs[i] = run
+    return runs
+
+
+def _longest_repeat(x: np.ndarray) -> int:
+    return int(_repeats(x).max(initial=0.0))

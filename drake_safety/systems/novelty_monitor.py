@@ -1,0 +1,155 @@
+"""NoveltyMonitor: an alarm when plant or sensors no longer behave as in training."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.innovation import KINDS, describe
+from drake_safety.systems.float_system import FloatSystem
+
+LEVELS = KINDS[1:]
+"""What the monitor watches, in the order of its port ``levels``."""
+
+
+class NoveltyMonitor(FloatSystem, LeafSystem):
+    """Watches how each measured state follows from the last one.
+
+    .. pydrake_system::
+
+        name: NoveltyMonitor
+        input_ports:
+        - state
+        - desired_preview
+        - features (read in the sharpened mode only)
+        - novelty (optional)
+        - hold (optional)
+        output_ports:
+        - alarm
+        - levels
+        - alarm_cause
+
+    Every step of training it predicts the state from the last inputs, and updates the charts of
+    :class:`~drake_safety.learning.innovation.Innovation`. ``levels`` has four numbers in units of
+    their limits: repeated inputs, the sum of the distance of x, the fast and the slow chart. When
+    one exceeds 1, ``alarm`` becomes 1 and stays so until the Context is reset, and ``alarm_cause``
+    says what was seen. ``novelty`` is that of a
+    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`. While ``hold`` is above 0.5, as
+    during a recovery step that training does not have, the charts wait. The innovation is a
+    parameter of the Context, see :meth:`adopt`.
+
+    Args:
+        assessment: A fitted assessment.
+    """
+
+    def __init__(self, assessment: SafetyAssessment):
+        super().__init__()
+        info, innovation = assessment.info_, assessment.innovation_
+        self._assessment = assessment
+        self.reads_features = assessment.uses_features and bool(info.feature_names)
+        self._state_names = assessment.state_names
+        self._parameter = self.DeclareAbstractParameter(Value(innovation))
+        self._inputs = {
+            "state": self.DeclareVectorInputPort("state", len(info.state_names)),
+            "desired_preview": self.DeclareVectorInputPort(
+                "desired_preview", info.horizon * len(info.output_names)
+            ),
+            "features": self.DeclareVectorInputPort("features", len(info.feature_names)),
+        }
+        self._novelty_port = self.DeclareVectorInputPort("novelty", 1)
+        self._hold_port = self.DeclareVectorInputPort("hold", 1)
+        n_s, sizes = innovation.num_states, {}
+        sizes["x"] = innovation.num_inputs
+        sizes |= {"fast": n_s, "slow": n_s, "sum": 1, "repeats": 1, "levels": len(LEVELS)}
+        sizes |= {"kind": 1, "seen": n_s}
+        starts = np.cumsum([0, *sizes.values()]).tolist()
+        self._places = {
+            name: slice(start, start + size)
+            for (name, size), start in zip(sizes.items(), starts, strict=False)
+        }
+        initial = np.zeros(starts[-1])
+        initial[self._places["x"]] = np.nan
+        state = self.DeclareDiscreteState(initial)
+        self.DeclarePeriodicDiscreteUpdateEvent(info.step_s, 0.0, self._update)
+        ticket = {self.discrete_state_ticket(state)}
+        self.DeclareVectorOutputPort("alarm", BasicVector(1), self._calc_alarm, ticket)
+        self.DeclareVectorOutputPort("levels", BasicVector(len(LEVELS)), self._calc_levels, ticket)
+        self.DeclareAbstractOutputPort(
+            "alarm_cause", lambda: Value(""), self._calc_alarm_cause, ticket
+        )
+
+    def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
+        """Takes over the innovation of an assessment adapted from this system's own.
+
+        Args:
+            context: This system's Context.
+            adapted: The result of ``adapt``.
+        """
+        context.get_mutable_abstract_parameter(self._parameter).set_value(adapted.innovation_)
+
+    def reset(self, context: Context) -> None:
+        """Ends the alarm and empties the charts.
+
+        Args:
+            context: This system's Context.
+        """
+        state = context.get_mutable_discrete_state_vector()
+        initial = np.zeros(state.size())
+        initial[self._places["x"]] = np.nan
+        state.SetFromVector(initial)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        innovation = context.get_abstract_parameter(self._parameter).get_value()
+        values = context.get_discrete_state_vector().get_value().copy()
+        part = {name: values[place] for name, place in self._places.items()}  # Views.
+        x = self._assessment.inputs_of(
+            self._inputs["state"].Eval(context),
+            self._inputs["desired_preview"].Eval(context),
+            self._inputs["features"].Eval(context) if self.reads_features else None,
+        )
+        is_held = self._hold_port.HasValue(context) and self._hold_port.Eval(context)[0] > 0.5
+        # Compares false for inputs that are not finite.
+        is_usable = bool(x @ x < math.inf) and not is_held
+        previous = part["x"].copy()
+        part["x"][:] = x if is_usable else np.nan
+        if is_usable and not math.isnan(previous[0]):
+            is_repeated = np.array_equal(x, previous)
+            part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
+            error = innovation.of(previous[None], x[None, : innovation.num_states])[0]
+            levels = part["levels"]
+            for i, (chart, rate) in enumerate(
+                zip(innovation.charts, innovation.rates, strict=True), LEVELS.index("fast")
+            ):
+                average = part[LEVELS[i]]
+                average += rate * (error - average)
+                whitened = average @ chart.whitening
+                levels[i] = math.sqrt(whitened @ whitened) / chart.limit
+            if self._novelty_port.HasValue(context):
+                novelty = float(self._novelty_port.Eval(context)[0])
+                part["sum"][0] = innovation.next_sum(float(part["sum"][0]), novelty)
+            levels[LEVELS.index("frozen")] = part["repeats"][0] / innovation.longest_repeat
+            levels[LEVELS.index("distance")] = part["sum"][0] / innovation.distance[2]
+            if part["kind"][0] == 0.0 and levels.max() > 1.0:
+                kind = 1 + int(np.argmax(levels > 1.0))
+                part["kind"][0] = kind
+                if KINDS[kind] in ("fast", "slow"):
+                    part["seen"][:] = innovation.deviations(KINDS[kind], part[KINDS[kind]])
+        discrete_state.set_value(values)
+
+    def _of(self, context: Context, name: str) -> np.ndarray:
+        values: np.ndarray = context.get_discrete_state_vector().get_value()[self._places[name]]
+        return values
+
+    def _calc_alarm(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self._of(context, "kind")[0] > 0.0))
+
+    def _calc_levels(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._of(context, "levels"))
+
+    def _calc_alarm_cause(self, context: Context, output: Value) -> None:
+        kind = KINDS[int(self._of(context, "kind")[0])]
+        output.set_value(describe(kind, self._of(context, "seen"), self._state_names))
