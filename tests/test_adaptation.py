@@ -43,7 +43,7 @@ def paper(fitted):
 def feedback_cells(assessment, feedback, is_wanted):
     """Cells of each map that hold feedback segments which `is_wanted(segments)` chooses."""
     segments = assessment.feedback_segments(feedback)
-    x = assessment._inputs(segments.state, segments.desired_preview, segments.features)
+    x = assessment.inputs_of(segments.state, segments.desired_preview, segments.features)
     points = assessment.embedding_.embed(x)
     return [assessment.grid_.locate(p[is_wanted(segments)]) for p in points]
 
@@ -99,7 +99,7 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
     least, most = correction.hidden_range
     assert least < 0.0 < most
     one = worse()[0]
-    x = sharpened._inputs(one.state, one.desired_preview, one.features)
+    x = sharpened.inputs_of(one.state, one.desired_preview, one.features)
     for factor in (1.0, -30.0, 30.0):
         added = correction.residual(sharpened.embedding_, factor * x)
         assert np.all((added >= least) & (added <= most))
@@ -179,9 +179,9 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
 def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prior(paper):
     feedback = worse()[:1]
     segments = paper.feedback_segments(feedback)
-    points = paper.embedding_.embed(paper._inputs(segments.state, segments.desired_preview, None))[
-        0
-    ]
+    points = paper.embedding_.embed(
+        paper.inputs_of(segments.state, segments.desired_preview, None)
+    )[0]
     difference = np.abs(segments.score - segments.nominal_score)
     _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_points_[0])
     cells = paper.grid_.locate(paper.training_points_[0])
@@ -196,7 +196,7 @@ def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prio
 def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper):
     feedback = worse()
     segments = paper.feedback_segments(feedback)
-    x = paper._inputs(segments.state, segments.desired_preview, None)
+    x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     discrepancy = DiscrepancyFunction().fit(points, np.abs(segments.score - segments.nominal_score))
     mean, deviation = discrepancy.predict(paper.training_points_[0])

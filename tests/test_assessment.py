@@ -199,7 +199,7 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
     save_file(load_file(path), tmp_path / "old", metadata)
     with pytest.raises(ValueError, match="schema version 0, this version reads 6"):
         SafetyAssessment.load(tmp_path / "old")
-    metadata["schema_version"] = "6"
+    metadata["schema_version"] = "7"
     save_file(load_file(path), tmp_path / "hollow", metadata)
     with pytest.raises(ValueError, match="damaged safety assessment"):
         SafetyAssessment.load(tmp_path / "hollow")

@@ -27,6 +27,7 @@ from drake_safety.cli.evaluate_plans import (
     check_options,
     evaluate_plans,
 )
+from drake_safety.cli.evaluate_shifts import evaluate_shifts_command
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import (
     MODES,
@@ -89,6 +90,14 @@ def evaluate(
             min=0,
         ),
     ] = 0,
+    shifts: Annotated[
+        int,
+        typer.Option(
+            help="Motions of each shift of plant, sensors and plans: evaluates Γ's \"don't know\" "
+            "and the monitor instead of all else.",
+            min=0,
+        ),
+    ] = 0,
     baselines: Annotated[
         bool,
         typer.Option(
@@ -108,7 +117,8 @@ def evaluate(
 
     For plans with a goal, verdicts on fresh targets at k = 0 are evaluated, beside inverse
     kinematics. Episodes are kept in ASSESSMENT: a stopped evaluation continues. With throws, or
-    --pushes, Γ is evaluated as an alarm too, beside margins and tracking errors.
+    --pushes, Γ is evaluated as an alarm too, beside margins and tracking errors. With --shifts,
+    only motions under conditions that training does not have are evaluated.
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
@@ -126,6 +136,18 @@ def evaluate(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
+    if shifts:
+        evaluate_shifts_command(
+            loaded,
+            assessment,
+            shifts,
+            episodes,
+            baselines=baselines,
+            seed=None if seed == EVALUATION.first else seed,
+            folder=out or assessment,
+            workers=workers,
+        )
+        return
     loop = loaded.make_loop()
     has_goals, has_recovery = isinstance(loop, HasGoals), isinstance(loop, HasBall)
     if throws is None:

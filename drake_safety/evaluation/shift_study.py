@@ -6,7 +6,7 @@ is not "don't know", in motions that end unsafely. DK is the share of "don't kno
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -22,8 +22,8 @@ from drake_safety.learning.calibration import PLAN
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
-from drake_safety.simulation.capabilities import CanStartAnywhere
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import (
     episode_rng,
     run_batches,
@@ -37,6 +37,8 @@ CONFIDENT = 0.9
 """Least safety probability of a confident verdict."""
 SPANS_S = (10.0, 60.0)
 """Times since a shift over which confident errors with the monitor are counted [s]."""
+_LASTING = ("plant", "sensor")
+"""Kinds whose motions follow each other."""
 _MOST_STARTS = 100  # Sequences of motions per shift.
 _BOOTSTRAP = Bootstrap(num_resamples=200)
 _NUM_TREES = 100
@@ -84,11 +86,6 @@ class ShiftedSet:
     kind: str
     motions: list[Motion]
 
-    @property
-    def is_lasting(self) -> bool:
-        """Whether the motions can follow each other."""
-        return self.kind in ("nominal", "plant", "sensor")
-
 
 def of_episodes(kind: str, episodes: Episodes) -> ShiftedSet:
     """The motions of episodes; those that diverged are left out."""
@@ -98,15 +95,9 @@ def of_episodes(kind: str, episodes: Episodes) -> ShiftedSet:
 
 def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenario:
     """The scenario with a shift as a further variation."""
-    variations = {**scenario.variations, name: shift.variation}
-    return dataclasses.replace(_copy_of(scenario), variations=variations)
-
-
-def _copy_of(scenario: Scenario) -> Scenario:
-    # The parameters are no field, because their schema is that of the task.
-    copied = dataclasses.replace(scenario)
-    copied.parameters = scenario.parameters
-    return copied
+    shifted = copy.copy(scenario)
+    shifted.variations = {**scenario.variations, name: shift.variation}
+    return shifted
 
 
 def run_changed_starts(
@@ -118,21 +109,22 @@ def run_changed_starts(
     they have left the safe set.
 
     Args:
-        scenario: The scenario; its task can start anywhere, or nothing is returned.
+        scenario: The scenario; if its robot has no legs, nothing is returned.
         num_motions: Number of motions of each kind.
         seed: Seed of their starts.
         num_workers: Number of processes.
     """
-    if not isinstance(scenario.make_loop(), CanStartAnywhere):
+    if not isinstance(scenario.make_loop(), LeggedLoop):
         return {}
     found = {}
     names = [*PLANS, *POSTURES, "falling"]
     for name in names:
+
+        def arguments(batch: list[int], name: str = name) -> tuple:
+            return scenario, name, seed, batch
+
         results = run_batches(
-            _changed_batch,
-            list(range(num_motions)),
-            lambda batch, name=name: (scenario, name, seed, batch),
-            num_workers=num_workers,
+            _changed_batch, list(range(num_motions)), arguments, num_workers=num_workers
         )
         motions = [motion for motion in results if len(motion.state)]
         kind = "plan" if name in PLANS else "posture"
@@ -147,13 +139,13 @@ def _changed_batch(scenario: Scenario, name: str, seed: int, indices: list[int])
 
 
 def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motion:
-    assert isinstance(loop, CanStartAnywhere)
+    assert isinstance(loop, LeggedLoop)
     if name == "falling":
         return _fall(loop, seed, index)
     context = loop.CreateDefaultContext()
     loop.reset(context, episode_rng(seed, index))
     start = loop.start_of(context)
-    kinematics = loop.kinematics  # type: ignore[attr-defined]
+    kinematics = loop.kinematics
     if name in PLANS:
         start = PLANS[name](start, kinematics)
         return Motion.of_episode(run_episode(loop, index, seed=seed, start=start))
@@ -268,10 +260,8 @@ def assessment_judge(assessment: SafetyAssessment, *, is_novelty_used: bool = Tr
             state, preview, features if assessment.uses_features else None, novelty=novelty
         )
         unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
-        known = (
-            found.calibrated if not is_novelty_used else np.where(is_outside, 0, found.calibrated)
-        )
-        return Verdicts(probability=known, is_unknown=unknown)
+        is_refused = is_outside & is_novelty_used
+        return Verdicts(probability=np.where(is_refused, 0.0, found.calibrated), is_unknown=unknown)
 
     return judge
 
@@ -418,7 +408,7 @@ def evaluate_shift(
     if promise is not None and is_unsafe.any():
         is_missed = (gamma.probability[first] >= promise.threshold) & is_unsafe
         found["missed"] = proportion(int(is_missed.sum()), int(is_unsafe.sum()))
-    if shifted.is_lasting:
+    if shifted.kind in _LASTING:
         found |= _monitored(shifted, assessment, is_confident, first)
     return result
 

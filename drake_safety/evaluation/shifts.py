@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pydrake.math import RotationMatrix
@@ -15,7 +16,10 @@ from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.shift import InputShift, JointShift, Shift
+from drake_safety.simulation.capabilities import pairing_options
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 
 _SLOPE_RAD = math.radians(10.0)
@@ -31,7 +35,7 @@ _NOISE_FACTOR = 10.0
 _FROZEN_AT_S = 0.4
 _STALE_S = 0.2
 _FARTHER, _FASTER = 1.5, 2.0
-_LIFT_SHARE = 0.25  # Of the standing height.
+_LIFT_SHARE = 0.5  # Of the standing height.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,23 +45,34 @@ class PlantShift:
     Attributes:
         kind: "plant" or "sensor".
         variation: The plant, with its sensors.
+        options: Options of the diagram.
     """
 
     kind: str
     variation: PlantVariation
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
-def plant_shifts(scenario: Scenario, kinematics: RobotKinematics) -> dict[str, PlantShift]:
+def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     """Shifts of plant and sensors, each from the nominal plant, and the scenario's variations.
 
     Args:
         scenario: The scenario.
-        kinematics: The nominal robot.
+        loop: Its diagram; that of a robot with legs has shifts besides the scenario's variations.
 
     Returns:
         The shifts by name.
     """
-    nominal = scenario.variation("nominal")
+    own = {
+        f"variation {name}": PlantShift(
+            kind="plant", variation=variation, options=pairing_options(scenario, name)
+        )
+        for name, variation in scenario.variations.items()
+        if name != "nominal"
+    }
+    if not isinstance(loop, LeggedLoop):
+        return own
+    kinematics, nominal = loop.kinematics, scenario.variation("nominal")
     robot, mass_kg = kinematics.robot, kinematics.total_mass
     q = kinematics.standing_positions()
     is_stance = np.ones(kinematics.num_contacts, dtype=bool)
@@ -99,14 +114,9 @@ def plant_shifts(scenario: Scenario, kinematics: RobotKinematics) -> dict[str, P
         },
         "noisy_velocities": dataclasses.replace(nominal, input_noise=noisy),
     }
-    own = {
-        f"variation {name}": variation
-        for name, variation in scenario.variations.items()
-        if name != "nominal"
-    }
     return {
         **{name: PlantShift(kind="plant", variation=one) for name, one in plants.items()},
-        **{name: PlantShift(kind="plant", variation=one) for name, one in own.items()},
+        **own,
         **{name: PlantShift(kind="sensor", variation=one) for name, one in sensors.items()},
     }
 

@@ -45,7 +45,9 @@ ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation",
 """Nominal twins have the seed of their actual episodes."""
 DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
 """For `run`, `play` and `check`."""
-BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION)
+SHIFTS = SeedBlock(8_000_000, ("shifts",))
+"""Conditions that training does not have."""
+BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION, SHIFTS)
 
 
 @dataclass(frozen=True, kw_only=True)
