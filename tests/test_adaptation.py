@@ -179,9 +179,8 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
 def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prior(paper):
     feedback = worse()[:1]
     segments = paper.feedback_segments(feedback)
-    points = paper.embedding_.embed(
-        paper.inputs_of(segments.state, segments.desired_preview, None)
-    )[0]
+    x = paper.inputs_of(segments.state, segments.desired_preview, None)
+    points = paper.embedding_.embed(x)[0]
     difference = np.abs(segments.score - segments.nominal_score)
     _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_points_[0])
     cells = paper.grid_.locate(paper.training_points_[0])

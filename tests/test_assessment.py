@@ -197,7 +197,7 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
         SafetyAssessment.load(tmp_path / "foreign")
     metadata = {"schema": "drake_safety.assessment", "schema_version": "0"}
     save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match="schema version 0, this version reads 6"):
+    with pytest.raises(ValueError, match="schema version 0, this version reads 7"):
         SafetyAssessment.load(tmp_path / "old")
     metadata["schema_version"] = "7"
     save_file(load_file(path), tmp_path / "hollow", metadata)
@@ -226,6 +226,7 @@ def test_progress_runs_through_the_stages(episodes):
         "distances",
         "t-SNE",
         "training",
+        "innovation",
         "beliefs",
     ]
     assert all(0.0 <= fraction <= 1.0 for _, fraction in seen)

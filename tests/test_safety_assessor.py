@@ -241,3 +241,30 @@ def test_it_is_usable_alone_in_any_diagram():
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.1)
     assert diagram.GetOutputPort("safety_probability").Eval(simulator.get_context())[0] == 0.25
+
+
+def test_an_alarm_makes_the_belief_unknown():
+    _, assessor, simulator, context = running()
+    assessor.GetInputPort("alarm").FixValue(context, [1.0])
+    simulator.Initialize()
+    np.testing.assert_array_equal(value(assessor, context, "belief"), [0.0, 0.0, 1.0])
+    for name in ("safety_probability", "normalized_safety_probability", "cause_probability"):
+        assert not value(assessor, context, name).any()
+    assert value(assessor, context, "calibrated_safety_probability") == 0.0
+    assert value(assessor, context, "novelty") == NOVELTY
+
+
+@pytest.mark.parametrize("margins", [[0.1, -0.02], [-1.0, -2.0]])
+def test_outside_the_safe_set_nothing_is_safe_until_it_has_been_entered_again(margins):
+    _, assessor, simulator, context = running()
+    port = assessor.GetInputPort("margins")
+    port.FixValue(context, margins)
+    simulator.Initialize()
+    np.testing.assert_allclose(value(assessor, context, "belief"), [0.0, 0.9, 0.1])
+    # The mass goes to the most violated constraint.
+    np.testing.assert_allclose(value(assessor, context, "cause_probability"), [0.2, 0.55])
+    assert value(assessor, context, "safety_probability") == 0.0
+    assert value(assessor, context, "calibrated_safety_probability") == 0.0
+    port.FixValue(context, [0.1, 0.2])
+    simulator.AdvanceTo(PERIOD_S)
+    np.testing.assert_allclose(value(assessor, context, "belief"), [0.25, 0.65, 0.1])

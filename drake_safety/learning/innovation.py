@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,18 +13,19 @@ from drake_safety.learning.novelty import Moments, Novelty
 
 TIME_CONSTANTS_S = (0.8, 4.0)
 """Memory of the charts."""
-FALSE_ALARMS_PER_HOUR = 0.1
+FALSE_ALARMS_PER_HOUR = 0.02
 """Rate of false alarms of each chart on the nominal plant, by extrapolation."""
-KINDS = ("", "frozen", "distance", "fast", "slow")
-"""What raises an alarm, "" for none: repeated inputs, the distance of x, and the two charts."""
+KINDS = ("", "frozen", "distance", "scatter", "fast", "slow")
+"""What raises an alarm, "" for none: repeated inputs, the distance of x, the norm of the
+innovations, and their two charts."""
 _NUM_FOLDS = 3
 _HIDDEN = (128, 128)
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
 _CLIP_SHARE = 0.99  # Of innovations that are not clipped, so that one impact is no lasting change.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL = 0.1  # Share of the blocks in the tail.
-_ALLOWANCE = 0.5  # Of the CUSUM of the distance, in standard deviations.
-_LARGEST_STEP = 5.0  # Of the CUSUM, in standard deviations.
+_ALLOWANCE = 0.5  # Of the sums, in standard deviations.
+_LARGEST_STEP = 5.0  # Of the sums, in standard deviations.
 _LEAST_ROWS = 10  # Rows for each state, below which there is no alarm.
 _FREE_REPEATS = 2  # Beyond the longest run of repeated inputs in training.
 _RIDGE = 1.0
@@ -131,9 +133,9 @@ class Innovation:
 
     A plant that changed cannot be seen in one input: it lies among those of training. It is seen in
     how the state follows from the last one. The innovation is whitened, limited in norm, and
-    averaged by two charts with memory; a third chart sums the distance of x (CUSUM), a fourth
-    counts inputs that repeat the last one to the last bit. It is learned from the nominal episodes
-    that stay safe, and needs no failure. The object is immutable.
+    averaged by two charts with memory. Two further charts sum the distance of x and the norm of the
+    innovation (CUSUM), another counts inputs that repeat the last one to the last bit. It is
+    learned from the nominal episodes that stay safe, and needs no failure. The object is immutable.
 
     Args:
         predictor: The prediction.
@@ -141,7 +143,8 @@ class Innovation:
         whitening: Whitens them, (n_s, n_s).
         clip: Largest norm of a whitened innovation.
         charts: The charts, a fast and a slow one.
-        distance: Mean, standard deviation and limit of the CUSUM of the distance, (3,).
+        sums: Mean, standard deviation and limit of the CUSUM of the distance of x, and of the norm
+            of the innovation, (2, 3).
         longest_repeat: Longest known run of repeated inputs.
         step_s: Time between two inputs [s].
     """
@@ -154,12 +157,12 @@ class Innovation:
         whitening: np.ndarray,
         clip: float,
         charts: Sequence[Chart],
-        distance: np.ndarray,
+        sums: np.ndarray,
         longest_repeat: int,
         step_s: float,
     ):
         self.predictor, self.offset, self.whitening = predictor, offset, whitening
-        self.clip, self.charts, self.distance = float(clip), tuple(charts), np.asarray(distance)
+        self.clip, self.charts, self.sums = float(clip), tuple(charts), np.asarray(sums)
         self.longest_repeat, self.step_s = int(longest_repeat), float(step_s)
         self.num_inputs, self.num_states = len(predictor.mean), len(offset)
         self.rates = tuple(min(1.0, step_s / chart.time_constant_s) for chart in self.charts)
@@ -195,7 +198,9 @@ class Innovation:
         whole = np.concatenate(errors)
         offset, whitening = _whitening(whole)
         norm = np.linalg.norm((whole - offset) @ whitening, axis=1)
-        spread = max(float(np.concatenate(distances).std()), 1e-6)
+        distance = np.concatenate(distances)
+        summed = np.stack([distance, np.minimum(norm, np.quantile(norm, _CLIP_SHARE))])
+        spreads = np.maximum(summed.std(axis=1), 1e-6)
         unlimited = cls(
             predictor=Predictor.fit(*_steps(x, num_states)),
             offset=offset,
@@ -205,24 +210,24 @@ class Innovation:
                 Chart(time_constant_s=t, whitening=np.eye(num_states), limit=np.inf)
                 for t in TIME_CONSTANTS_S
             ],
-            distance=np.array([np.concatenate(distances).mean(), spread, np.inf]),
+            sums=np.stack([summed.mean(axis=1), spreads, np.full(2, np.inf)], axis=1),
             longest_repeat=max(_longest_repeat(one) for one in x) + _FREE_REPEATS,
             step_s=step_s,
         )
         if len(whole) < _LEAST_ROWS * num_states:
             return unlimited
         order = np.random.default_rng(0).permutation(len(x))
-        shuffled = [errors[i] for i in order]
+        limited = unlimited.limited(np.concatenate([errors[i] for i in order]))
         charts = []
         for rate, chart in zip(unlimited.rates, unlimited.charts, strict=True):
-            means = _averaged(unlimited.limited(np.concatenate(shuffled)), rate)
+            means = _averaged(limited, rate)
             whitening = _whitening(means, is_centred=True)[1]
             limit = _limit(np.linalg.norm(means @ whitening, axis=1), step_s)
             charts.append(
                 Chart(time_constant_s=chart.time_constant_s, whitening=whitening, limit=limit)
             )
-        sums = unlimited.summed(np.concatenate([distances[i] for i in order]))
-        return unlimited._with(charts, np.append(unlimited.distance[:2], _limit(sums, step_s)))
+        distance = np.concatenate([distances[i] for i in order])
+        return unlimited._with(charts, unlimited._sums_with_limits(distance, limited))
 
     def with_feedback(self, x: Sequence[np.ndarray], novelty: Novelty) -> Innovation:
         """Returns the innovation of an actual robot: corrected prediction, no lower limits.
@@ -248,22 +253,31 @@ class Innovation:
             charts.append(
                 Chart(time_constant_s=chart.time_constant_s, whitening=chart.whitening, limit=limit)
             )
-        distances = np.concatenate([novelty.of(one[1:]) for one in x])
-        distance = self.distance.copy()
-        distance[0] = max(distance[0], distances.mean())
-        distance[1] = max(distance[1], distances.std())
+        distance = np.concatenate([novelty.of(one[1:]) for one in x])
+        summed = np.stack([distance, np.linalg.norm(limited, axis=1)])
+        sums = self.sums.copy()
+        sums[:, 0] = np.maximum(sums[:, 0], summed.mean(axis=1))
+        sums[:, 1] = np.maximum(sums[:, 1], summed.std(axis=1))
         adapted = Innovation(
             predictor=self.predictor.corrected(*_steps(x, self.num_states)),
             offset=self.offset,
             whitening=self.whitening,
             clip=self.clip,
             charts=charts,
-            distance=distance,
+            sums=sums,
             longest_repeat=max(self.longest_repeat, *map(_longest_repeat, x)),
             step_s=self.step_s,
         )
-        limit = max(distance[2], _limit(adapted.summed(distances), self.step_s))
-        return adapted._with(charts, np.append(distance[:2], limit))
+        limited_sums = adapted._sums_with_limits(distance, limited)
+        limited_sums[:, 2] = np.maximum(limited_sums[:, 2], self.sums[:, 2])
+        return adapted._with(charts, limited_sums)
+
+    def _sums_with_limits(self, distance: np.ndarray, limited: np.ndarray) -> np.ndarray:
+        norm = np.linalg.norm(limited, axis=1)
+        limits = [
+            _limit(self._summed(i, one), self.step_s) for i, one in enumerate((distance, norm))
+        ]
+        return np.column_stack([self.sums[:, :2], limits])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
@@ -275,7 +289,7 @@ class Innovation:
             "bias": predictor.bias,
             "offset": self.offset,
             "whitening": self.whitening,
-            "distance": self.distance,
+            "sums": self.sums,
             "chart_limits": np.array([chart.limit for chart in self.charts]),
             "chart_whitenings": np.stack([chart.whitening for chart in self.charts]),
             "settings": np.array([self.clip, self.longest_repeat, self.step_s]),
@@ -308,7 +322,7 @@ class Innovation:
             "bias": (num_states,),
             "offset": (num_states,),
             "whitening": square,
-            "distance": (3,),
+            "sums": (2, 3),
             "chart_limits": (n_charts,),
             "chart_whitenings": (n_charts, *square),
             "settings": (3,),
@@ -346,19 +360,19 @@ class Innovation:
                     strict=True,
                 )
             ],
-            distance=arrays["distance"],
+            sums=arrays["sums"],
             longest_repeat=int(longest_repeat),
             step_s=step_s,
         )
 
-    def _with(self, charts: Sequence[Chart], distance: np.ndarray) -> Innovation:
+    def _with(self, charts: Sequence[Chart], sums: np.ndarray) -> Innovation:
         return Innovation(
             predictor=self.predictor,
             offset=self.offset,
             whitening=self.whitening,
             clip=self.clip,
             charts=charts,
-            distance=distance,
+            sums=sums,
             longest_repeat=self.longest_repeat,
             step_s=self.step_s,
         )
@@ -378,18 +392,27 @@ class Innovation:
         norm = np.sqrt(np.einsum("ij,ij->i", whitened, whitened))
         return whitened * np.minimum(1.0, self.clip / np.maximum(norm, 1e-12))[:, None]
 
-    def summed(self, distances: np.ndarray) -> np.ndarray:
-        """Returns the CUSUM of distances of consecutive inputs, (N,)."""
-        sums, total = np.empty(len(distances)), 0.0
-        for i, distance in enumerate(distances):
-            total = self.next_sum(total, float(distance))
-            sums[i] = total
-        return sums
+    def next_sums(self, sums: np.ndarray, distance: float, innovation: np.ndarray) -> np.ndarray:
+        """Returns both CUSUMs (2,) after one more step.
 
-    def next_sum(self, total: float, distance: float) -> float:
-        """Returns the CUSUM after one more distance."""
-        mean, spread = self.distance[:2]
-        return max(0.0, total + min((distance - mean) / spread, _LARGEST_STEP) - _ALLOWANCE)
+        Args:
+            sums: The CUSUMs before it, (2,).
+            distance: Novelty of the input.
+            innovation: Whitened innovation of limited norm, (n_s,).
+        """
+        found = np.array([distance, math.sqrt(innovation @ innovation)])
+        step = np.minimum((found - self.sums[:, 0]) / self.sums[:, 1], _LARGEST_STEP)
+        added: np.ndarray = np.maximum(sums + step - _ALLOWANCE, 0.0)
+        return added
+
+    def _summed(self, which: int, values: np.ndarray) -> np.ndarray:
+        """One CUSUM of consecutive values, (N,)."""
+        mean, spread = self.sums[which, :2]
+        steps = np.minimum((values - mean) / spread, _LARGEST_STEP) - _ALLOWANCE
+        walk = np.concatenate([[0.0], np.cumsum(steps)])
+        # The sum since its last reset to zero is the walk above its lowest value.
+        summed: np.ndarray = (walk - np.minimum.accumulate(walk))[1:]
+        return summed
 
     def levels(self, motions: Sequence[np.ndarray], distances: Sequence[np.ndarray]) -> np.ndarray:
         """Returns what the charts say at each row of consecutive motions, in units of their limits.
@@ -401,7 +424,7 @@ class Innovation:
             distances: Novelty of each input, (K + 1,).
 
         Returns:
-            (sum of K + 1, 4), in the order of ``KINDS[1:]``.
+            (sum of K + 1, 5), in the order of ``KINDS[1:]``.
         """
         found = np.zeros((sum(map(len, motions)), len(KINDS) - 1))
         is_step = np.concatenate([np.arange(len(one)) > 0 for one in motions])
@@ -411,9 +434,11 @@ class Innovation:
             )
             repeats = np.concatenate([_repeats(one) for one in motions])
             found[is_step, 0] = repeats / self.longest_repeat
-            sums = self.summed(np.concatenate([one[1:] for one in distances]))
-            found[is_step, 1] = sums / self.distance[2]
-            for column, (chart, rate) in enumerate(zip(self.charts, self.rates, strict=True), 2):
+            norm = np.linalg.norm(innovations, axis=1)
+            watched = (np.concatenate([one[1:] for one in distances]), norm)
+            for i, values in enumerate(watched):
+                found[is_step, 1 + i] = self._summed(i, values) / self.sums[i, 2]
+            for column, (chart, rate) in enumerate(zip(self.charts, self.rates, strict=True), 3):
                 averages = _averaged(innovations, rate)
                 found[is_step, column] = (
                     np.linalg.norm(averages @ chart.whitening, axis=1) / chart.limit
@@ -450,6 +475,8 @@ def describe(kind: str, deviations: np.ndarray, state_names: Sequence[str]) -> s
         return "input frozen"
     if kind == "distance":
         return "inputs unlike those of training"
+    if kind == "scatter":
+        return "inputs noisier, or the motion less regular, than learned"
     if not kind:
         return ""
     strangest = int(np.argmax(np.abs(deviations)))

@@ -315,7 +315,6 @@ def _dig_holes(
     """Lowers the ground under some feet."""
     if not depths_m:
         return
-    ground = plant.GetCollisionGeometriesForBody(plant.world_body())
     holes = {}
     for name, depth_m in depths_m.items():
         if name not in robot.feet:
@@ -328,6 +327,9 @@ def _dig_holes(
         holes[name] = plant.RegisterCollisionGeometry(
             plant.world_body(), X_WH, HalfSpace(), shape, material
         )
+    # After the registrations, which invalidate earlier lists of identifiers.
+    everything = plant.GetCollisionGeometriesForBody(plant.world_body())
+    ground = [one for one in everything if one not in holes.values()]
     filters = scene_graph.collision_filter_manager()
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)

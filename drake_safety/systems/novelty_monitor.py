@@ -34,8 +34,9 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
         - alarm_cause
 
     Every step of training it predicts the state from the last inputs, and updates the charts of
-    :class:`~drake_safety.learning.innovation.Innovation`. ``levels`` has four numbers in units of
-    their limits: repeated inputs, the sum of the distance of x, the fast and the slow chart. When
+    :class:`~drake_safety.learning.innovation.Innovation`. ``levels`` has five numbers in units of
+    their limits: repeated inputs, the sums of the distance of x and of the innovation's norm, the
+    fast and the slow chart. When
     one exceeds 1, ``alarm`` becomes 1 and stays so until the Context is reset, and ``alarm_cause``
     says what was seen. ``novelty`` is that of a
     :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`. While ``hold`` is above 0.5, as
@@ -64,7 +65,7 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
         n_s, sizes = innovation.num_states, {}
         sizes["x"] = innovation.num_inputs
-        sizes |= {"fast": n_s, "slow": n_s, "sum": 1, "repeats": 1, "levels": len(LEVELS)}
+        sizes |= {"fast": n_s, "slow": n_s, "sums": 2, "repeats": 1, "levels": len(LEVELS)}
         sizes |= {"kind": 1, "seen": n_s}
         starts = np.cumsum([0, *sizes.values()]).tolist()
         self._places = {
@@ -128,11 +129,15 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
                 average += rate * (error - average)
                 whitened = average @ chart.whitening
                 levels[i] = math.sqrt(whitened @ whitened) / chart.limit
-            if self._novelty_port.HasValue(context):
-                novelty = float(self._novelty_port.Eval(context)[0])
-                part["sum"][0] = innovation.next_sum(float(part["sum"][0]), novelty)
+            novelty = (
+                float(self._novelty_port.Eval(context)[0])
+                if self._novelty_port.HasValue(context)
+                else 0.0
+            )
+            part["sums"][:] = innovation.next_sums(part["sums"], novelty, error)
             levels[LEVELS.index("frozen")] = part["repeats"][0] / innovation.longest_repeat
-            levels[LEVELS.index("distance")] = part["sum"][0] / innovation.distance[2]
+            first = LEVELS.index("distance")
+            levels[first : first + 2] = part["sums"] / innovation.sums[:, 2]
             if part["kind"][0] == 0.0 and levels.max() > 1.0:
                 kind = 1 + int(np.argmax(levels > 1.0))
                 part["kind"][0] = kind

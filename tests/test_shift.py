@@ -1,0 +1,207 @@
+"""Shifts: lasting conditions of plant and sensors, as data of a plant variation."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from drake_safety import load_scenario
+from drake_safety.models import load_robot
+from drake_safety.robots.robot import PlantVariation
+from drake_safety.robots.shift import InputShift, JointShift, Shift
+from drake_safety.simulation.rollouts import run_episode
+
+SCENARIO = "laikago_balancing"
+KNEE = "FR_calf_joint"
+
+
+def loop_with(shift, name=SCENARIO, **options):
+    scenario = load_scenario(name)
+    nominal = scenario.variations["nominal"]
+    scenario.variations["shifted"] = dataclasses.replace(nominal, shift=shift)
+    return scenario.make_loop("shifted", **options)
+
+
+def standing(shift, seconds, name=SCENARIO, **options):
+    """The diagram and its Context after standing for a while."""
+    loop = loop_with(shift, name, **options)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_to(context, None, loop.standing_start())
+    simulator.Initialize()
+    simulator.AdvanceTo(seconds)
+    return loop, context
+
+
+def positions(loop, context):
+    return loop.GetOutputPort("plant_state").Eval(context)[: loop.kinematics.num_positions]
+
+
+def test_a_slope_turns_the_gravity_and_keeps_its_magnitude():
+    shift = Shift(slope_rad=0.2, slope_direction_rad=0.5 * math.pi)
+    gravity = loop_with(shift).plant.gravity_field().gravity_vector()
+    expected = 9.81 * np.array([0.0, math.sin(0.2), -math.cos(0.2)])
+    np.testing.assert_allclose(gravity, expected, atol=1e-12)
+
+
+def test_a_steady_force_moves_the_base_in_its_direction():
+    plain = positions(*standing(None, 0.4))
+    for axis, sign in ((0, 1.0), (1, -1.0)):
+        force_n = [0.0, 0.0, 0.0]
+        force_n[axis] = 20.0 * sign
+        moved = positions(*standing(Shift(base_force_n=force_n), 0.4))
+        assert sign * (moved[4 + axis] - plain[4 + axis]) > 1e-3
+
+
+def test_the_steady_force_is_as_large_as_stated():
+    force_n = np.array([0.0, 3.0, 4.0])
+    heights = []
+    for shift in (None, Shift(base_force_n=force_n.tolist())):
+        loop = loop_with(shift)
+        simulator = Simulator(loop)
+        context = simulator.get_mutable_context()
+        start = loop.standing_start()
+        start.q[6] += 5.0  # In free fall.
+        loop.reset_to(context, None, start)
+        simulator.Initialize()
+        simulator.AdvanceTo(0.2)
+        plant_context = loop.plant.GetMyContextFromRoot(context)
+        momentum = loop.plant.CalcSpatialMomentumInWorldAboutPoint(plant_context, np.zeros(3))
+        heights.append(momentum.translational())
+    np.testing.assert_allclose((heights[1] - heights[0]) / 0.2, force_n, rtol=0.01, atol=0.02)
+
+
+def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
+    plain, shifted = (
+        loop_with(shift).plant
+        for shift in (
+            None,
+            Shift(joints={KNEE: JointShift(effort_scale=0.5, stiffness_scale=0.25)}),
+        )
+    )
+
+    def actuator(plant, joint):
+        found = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+        return next(one for one in found if one.joint().name() == joint)
+
+    weak, strong = actuator(shifted, KNEE), actuator(plain, KNEE)
+    assert weak.effort_limit() == 0.5 * strong.effort_limit()
+    assert weak.get_controller_gains().p == 0.25 * strong.get_controller_gains().p
+    assert weak.get_controller_gains().d == 0.25 * strong.get_controller_gains().d
+    other = "FL_calf_joint"
+    assert actuator(shifted, other).effort_limit() == actuator(plain, other).effort_limit()
+
+
+def test_a_locked_joint_does_not_move():
+    lock = Shift(joints={KNEE: JointShift(is_locked=True)})
+    index = 7 + loop_with(None).kinematics.joint_names.index(KNEE)
+    moves = []
+    for shift in (None, lock):
+        loop = loop_with(shift)
+        episode = run_episode(loop, 3, seed=11)
+        moves.append(np.ptp(episode.true_state[:, 12 + index - 7]))
+    assert moves[0] > 0.02
+    assert moves[1] < 1e-3
+
+
+def test_feet_over_holes_find_the_ground_lower():
+    feet = list(load_robot("laikago").feet)
+    plain = positions(*standing(None, 0.5))
+    all_lower = positions(*standing(Shift(holes_m=dict.fromkeys(feet, 0.03)), 0.5))
+    assert all_lower[6] - plain[6] == pytest.approx(-0.03, abs=0.004)
+    # A foot alone over a hole carries nothing: the robot leans to it.
+    rolls = [positions(*standing(Shift(holes_m={foot: 0.03}), 0.5))[1] for foot in ("FR", "FL")]
+    assert rolls[0] > 1e-3 > -1e-3 > rolls[1]
+
+
+def test_a_late_command_is_late():
+    plain, late = (
+        run_episode(loop_with(shift), 0, seed=5) for shift in (None, Shift(command_delay_s=0.1))
+    )
+    assert late.is_safe == plain.is_safe
+    knee = 12 + loop_with(None).kinematics.joint_names.index(KNEE)
+    difference = np.abs(late.true_state[:, knee] - plain.true_state[:, knee])
+    assert 1e-3 < difference.max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("fault", "seen"),
+    [
+        (InputShift(velocity_scale=0.0), lambda s, t: np.allclose(_rates(s), 0.0)),
+        (
+            InputShift(joint_bias_rad=0.05),
+            lambda s, t: np.allclose(s[:, 12:24] - t[:, 12:24], 0.05, atol=0.03),
+        ),
+        (InputShift(frozen_at_s=0.4), lambda s, t: len(np.unique(s[11:], axis=0)) == 1),
+        (InputShift(delay_s=0.2), lambda s, t: np.allclose(s[8:, 12], t[3:-5, 12], atol=0.02)),
+    ],
+)
+def test_a_faulty_input_does_not_change_the_motion(fault, seen):
+    plain = run_episode(loop_with(None), 0, seed=5)
+    episode = run_episode(loop_with(Shift(inputs=fault)), 0, seed=5)
+    np.testing.assert_array_equal(episode.true_state, plain.true_state)
+    assert seen(episode.state, episode.true_state)
+    assert not seen(plain.state, plain.true_state)
+
+
+def _rates(state):
+    return np.concatenate([state[:, 6:12], state[:, 24:]], axis=1)
+
+
+def test_a_plant_without_shift_has_the_hash_from_before_there_were_any():
+    scenario = load_scenario(SCENARIO)
+    assert "shift" not in scenario.to_yaml()
+    before = scenario.simulation_hash("nominal")
+    scenario.variations["nominal"].shift = Shift(slope_rad=0.1)
+    assert scenario.simulation_hash("nominal") != before
+
+
+def test_a_scenario_file_can_state_a_shift(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\nvariations:\n"
+        "  nominal: {}\n  icy: {shift: {slope_rad: 0.1, joints: {.*_calf_joint: {effort_scale: "
+        "0.5}}, inputs: {delay_s: 0.1}}}\n",
+        encoding="utf-8",
+    )
+    shift = load_scenario(path).variation("icy").shift
+    assert shift.slope_rad == 0.1
+    assert shift.joints[".*_calf_joint"].effort_scale == 0.5
+    assert shift.inputs.delay_s == 0.1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Shift(slope_rad=2.0), "slope_rad must be within a right angle; got 2.0"),
+        (lambda: Shift(base_force_n=[1.0]), "base_force_n is three numbers"),
+        (lambda: Shift(command_delay_s=-1.0), "command_delay_s must not be negative"),
+        (lambda: Shift(holes_m={"FR": 0.0}), "holes_m of foot 'FR' must be positive"),
+        (lambda: JointShift(effort_scale=0.0), "effort_scale must be positive"),
+        (lambda: InputShift(delay_s=-0.1), "delay_s must not be negative"),
+    ],
+)
+def test_a_shift_that_is_none_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("shift", "message"),
+    [
+        (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),
+        (Shift(holes_m={"tail": 0.1}), "no foot 'tail' for a hole; it has"),
+    ],
+)
+def test_a_shift_of_a_part_that_does_not_exist_is_refused(shift, message):
+    with pytest.raises(ValueError, match=message):
+        loop_with(shift)
+
+
+def test_another_engine_has_no_shifts():
+    scenario = load_scenario(SCENARIO)
+    scenario.variations["other"] = PlantVariation(engine="mujoco", shift=Shift(slope_rad=0.1))
+    with pytest.raises(ValueError, match="engine 'mujoco' has no shifts"):
+        scenario.make_loop("other", ball=False)
