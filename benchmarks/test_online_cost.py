@@ -1,6 +1,7 @@
 """Cost of an evaluation of Γ in a running diagram."""
 
 import copy
+import dataclasses
 import statistics
 import time
 from collections.abc import Callable
@@ -23,8 +24,10 @@ from threadpoolctl import threadpool_limits
 from drake_safety import SafetyAssessment, Scenario, run_episodes
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
+from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
+INPUT_NAMES = ("state", "desired_preview", "features")
 PERIOD_S = 0.01
 NUM_UPDATES = 2000  # Evaluations in a round.
 ROUNDS = 7
@@ -142,10 +145,9 @@ def test_one_evaluation_inside_a_diagram(
     for name, value in CASES[case].items():
         setattr(parameters, name, value)
     assessment = SafetyAssessment(parameters).fit(episodes)
-    input_names = ("state", "desired_preview", "features")
-    starts = [np.stack([getattr(e, name)[0] for e in episodes]) for name in input_names]
+    starts = [np.stack([getattr(e, name)[0] for e in episodes]) for name in INPUT_NAMES]
     safest = int(np.argmax(assessment.predict(*starts).belief[:, 0]))
-    inputs = {name: rows[safest] for name, rows in zip(input_names, starts, strict=True)}
+    inputs = {name: rows[safest] for name, rows in zip(INPUT_NAMES, starts, strict=True)}
     names = list(inputs) if assessment.uses_features else ["state", "desired_preview"]
     x = np.concatenate([inputs[name] for name in names]).astype(np.float32)
 
@@ -186,4 +188,50 @@ def test_one_evaluation_inside_a_diagram(
         at_most=MAX_US,
         peers={"empty LeafSystem": cost_us["empty"], "torch eager": cost_us["torch"]},
         note=f"{assessment.embedding_.num_members} maps, {len(x)} inputs, layers {widths}",
+    )
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_novelty_and_monitor_beside_an_evaluation(
+    benchmark: Any,
+    report: Callable[..., None],
+    scenario: Scenario,
+    episodes: Episodes,
+) -> None:
+    assessment = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes)
+    assessment.info_ = dataclasses.replace(assessment.info_, step_s=PERIOD_S)
+    inputs = {name: getattr(episodes[0], name)[0] for name in INPUT_NAMES}
+    x = assessment.inputs_of(*inputs.values())[None]
+    with threadpool_limits(1):
+        gamma = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
+        monitor = Running(NoveltyMonitor(assessment), {**inputs, "novelty": np.zeros(1)})
+
+        def novelty_us() -> float:
+            started = time.process_time()
+            for _ in range(NUM_UPDATES):
+                assessment.novelty_.of(x)
+            return 1e6 * (time.process_time() - started) / NUM_UPDATES
+
+        costs: dict[str, list[float]] = {"gamma": [], "ours": []}
+
+        def measure_gamma() -> None:
+            costs["gamma"].append(gamma.cost_us())
+
+        def measure() -> None:
+            costs["ours"].append(monitor.cost_us() + novelty_us())
+
+        for cost in (gamma.cost_us, monitor.cost_us):
+            cost()
+        # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
+        assert monitor.output("alarm")[0] == 1.0
+        assert monitor.output("levels")[2:].min() > 0.0
+        benchmark.pedantic(measure, setup=measure_gamma, rounds=ROUNDS)
+    gamma_us = statistics.median(costs["gamma"])
+    report(
+        "novelty and one step of the monitor",
+        statistics.median(costs["ours"]),
+        "us",
+        at_most=0.75 * gamma_us,
+        peers={"one Γ in a LeafSystem": gamma_us},
+        note=f"{x.shape[1]} inputs, {assessment.innovation_.num_states} states",
     )

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_safety.cli.console import TrainingOption, open_stages, print_path
+from drake_safety.cli.evaluate_shifts import SHIFTS_FILE
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.report.results import Results, read_evaluation
 from drake_safety.simulation.dataset import read_info
@@ -20,6 +21,11 @@ from studies.readings import READINGS_FILE
 from studies.readme import rewrite_readme
 from studies.shipping import ship as ship_assessments
 from studies.stored_results import store_results
+
+_DOCUMENTS = [
+    Path("README.md"),
+    *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts")),
+]
 
 
 def store(
@@ -39,7 +45,7 @@ def readme(
 
     They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->.
     """
-    for path in paths or [Path("README.md"), Path("docs/results.md"), Path("docs/paper.md")]:
+    for path in paths or _DOCUMENTS:
         for name in rewrite_readme(path):
             print_path(f"results of {name} in", path)
 
@@ -92,7 +98,7 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
             estimates=results.estimates | drawn.estimates,
             entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
         )
-    for name in (READINGS_FILE, CONVERGED_FILE):
+    for name in (READINGS_FILE, CONVERGED_FILE, SHIFTS_FILE):
         if (folder / name).is_file():
             studied = read_evaluation(folder / name)
             key = Path(name).stem

@@ -24,15 +24,17 @@ from drake_safety.evaluation.report.verdicts import (
     set_title,
     verdict_tables,
 )
+from studies.shift_table import shifts_text
 from studies.stored_results import read_results
 
 RESULTS_FOLDER = Path("docs/results")
 _BLOCK = re.compile(
-    r"(?P<start><!-- (?P<kind>results|summary|readings|converged): (?P<name>[\w-]+) -->\n).*?"
+    r"(?P<start><!-- (?P<kind>results|summary|readings|converged|shifts): "
+    r"(?P<name>[\w-]+) -->\n).*?"
     r"(?P<end><!-- end -->)",
     re.DOTALL,
 )
-_OPEN = re.compile(r"<!-- (?:results|summary|readings|converged): ([\w-]+) -->")
+_OPEN = re.compile(r"<!-- (?:results|summary|readings|converged|shifts): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
@@ -197,6 +199,7 @@ def converged_text(results: Results) -> str:
     rules = {
         "literal": "Γ < 0.6, before adaptation",
         "converged": "Γ < 0.6, after adaptation",
+        "shifts": shifts_text,
         "normalized": "b_safe / (1 − μ), balanced threshold",
         "conformal": "b_safe / (1 − μ), promised miss rate 1 %",
     }
@@ -250,6 +253,7 @@ _MAKE = {
     "summary": summary_text,
     "readings": readings_text,
     "converged": converged_text,
+    "shifts": shifts_text,
 }
 """Text of each kind of block."""
 

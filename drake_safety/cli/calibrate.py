@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from drake_safety.evaluation.calibration_study import PromiseKept
+    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.calibration import Calibration
 
 
@@ -49,16 +50,24 @@ def calibrate(
         float | None,
         typer.Option(help="Confidence of the promise, such as 0.95; on average by default."),
     ] = None,
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=2)] = 1000,
+    episodes: Annotated[int, typer.Option(help="Fresh episodes.", min=2)] = 1000,
     splits: Annotated[
         int, typer.Option(help="Number of splits that check the promises; 0 for none.", min=0)
     ] = 200,
+    variation: Annotated[
+        str | None,
+        typer.Option(
+            help="Plant of the episodes, for which the promise holds; by default that which the "
+            "assessment was adapted to, else nominal."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Choose thresholds with a promised miss rate on fresh episodes.
 
-    `ask`, `run` and `evaluate` use them. Episodes are kept in ASSESSMENT: a stopped calibration
+    The promise holds for the plant of the episodes: calibrate again after `adapt`. `ask`, `run` and
+    `evaluate` use the thresholds. Episodes are kept in ASSESSMENT: a stopped calibration
     continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
     copy is written to runs/SCENARIO-shipped.
     """
@@ -67,6 +76,7 @@ def calibrate(
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
     from drake_safety.learning.segments import split
+    from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -77,13 +87,23 @@ def calibrate(
         for mode in MODES
         if mode == MODES[0] or assessment_file(folder.path, mode).is_file()
     }
-    scenario_hash = loaded.simulation_hash()
+    plant = variation or _adapted_to(learned[MODES[0]]) or "nominal"
+    scenario_hash = loaded.simulation_hash(plant)
     for gamma in learned.values():
         check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
     with open_stages() as stages:
         progress = partial(stages, "calibration episodes")
-        fresh = run_fresh_episodes(loaded, folder.out, episodes, seed, progress, workers)
+        fresh = run_fresh_episodes(
+            loaded,
+            folder.out,
+            episodes,
+            seed,
+            progress,
+            workers,
+            plant,
+            **pairing_options(loaded, plant),
+        )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}
@@ -100,6 +120,7 @@ def calibrate(
                 confidence=confidence,
                 seed=seed,
                 scenario_hash=scenario_hash,
+                variation=plant,
             )
             found.setdefault(mode, []).append(one)
             if splits and mode == MODES[0]:
@@ -114,6 +135,10 @@ def calibrate(
         console.print(_splits_table(kind, promises, splits))
     for mode in learned:
         print_path("calibrated", assessment_file(folder.out, mode))
+
+
+def _adapted_to(assessment: SafetyAssessment) -> str:
+    return "" if assessment.adaptation_ is None else assessment.adaptation_.variation
 
 
 def _table(found: dict[str, list[Calibration]]) -> Table:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.scenario import Scenario
 
+SHIFTS_FILE = "shifts.json"
 _COLUMNS = {
     "unsafe": "unsafe",
     "without_novelty.confident_error": "CE by the grid alone",
@@ -93,19 +94,18 @@ def evaluate_shifts_command(
         results["nominal"].estimates["monitor.false_alarms_per_hour"] = false_alarms(
             sets["nominal"].motions, gamma
         )
-    file = folder / "shifts.json"
+    file = folder / SHIFTS_FILE
     content = {
         "command": command_line(),
         "scenario": scenario.name,
         "seed": seeds["shifts"],
         "assessment_sha256": file_hash(assessment_file(assessment, "sharpened")),
         "versions": versions(),
-        "shifts": {
-            name: {
-                "kind": result.kind,
-                **{key: estimate.to_json() for key, estimate in result.estimates.items()},
-            }
+        "kinds": {name: result.kind for name, result in results.items()},
+        **{
+            f"shifts.{name}.{key}": estimate.to_json()
             for name, result in results.items()
+            for key, estimate in result.estimates.items()
         },
     }
     file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

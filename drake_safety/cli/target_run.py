@@ -30,6 +30,8 @@ _MOTION_PORTS = (
     "belief",
     "cause_probability",
     "predicted_margins",
+    "alarm",
+    "alarm_cause",
 )
 _NUM_STILLS = 5
 _AFTER_PUSH_S = 0.15  # Time at which the effect of a push is visible.
@@ -201,6 +203,12 @@ def table_of_motion(
         events.append(
             (float(motion.time_s[alarm]), f"Γ below the threshold; expected violation: {expected}")
         )
+    is_changed = motion.extra["alarm"][:, 0] > 0.5
+    if is_changed.any():
+        row = int(np.argmax(is_changed))
+        seen = motion.extra["alarm_cause"][row]
+        withdrawn = " The promise is withdrawn" if assessment.calibrations_ else ""
+        events.append((float(motion.time_s[row]), f"monitor: {seen}.{withdrawn}"))
     if motion.has_left:
         events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
     if motion.has_fallen:

@@ -90,9 +90,10 @@ def run_fresh_episodes(
     seed: int,
     progress: Progress,
     num_workers: int | None = None,
+    variation: str = "nominal",
     **loop_options: str,
 ) -> Episodes:
-    """Simulates fresh nominal episodes, and keeps them; existing ones are reused.
+    """Simulates fresh episodes, and keeps them; existing ones are reused.
 
     Args:
         scenario: The scenario.
@@ -101,6 +102,7 @@ def run_fresh_episodes(
         seed: Seed of the set.
         progress: Called with the number done and the number wanted.
         num_workers: Number of worker processes; one a core by default.
+        variation: The plant.
         **loop_options: Options of the diagram, besides those of evaluations.
     """
     from drake_safety.simulation.capabilities import judging_options
@@ -110,9 +112,10 @@ def run_fresh_episodes(
     return run_episodes(
         scenario,
         num_episodes,
+        variation=variation,
         seed=seed,
         num_workers=num_workers,
-        path=fresh_episodes_folder(folder, scenario.simulation_hash(), seed, options),
+        path=fresh_episodes_folder(folder, scenario.simulation_hash(variation), seed, options),
         progress=progress,
         **options,
     )

@@ -51,6 +51,7 @@ class Calibration:
         num_accepted: Number of safe calibration episodes with the verdict "safe".
         seed: Seed of the episodes.
         scenario_hash: Hash of the simulation.
+        variation: The plant of the episodes, for which alone the rates are promised.
     """
 
     kind: str
@@ -65,6 +66,7 @@ class Calibration:
     num_accepted: int
     seed: int
     scenario_hash: str
+    variation: str = "nominal"
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -81,7 +83,10 @@ class Calibration:
     def promise(self) -> str:
         """The promised miss rate in words."""
         how = "on average" if self.confidence is None else f"{100 * self.confidence:g} % confidence"
-        return f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {how}"
+        return (
+            f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {how}, "
+            f"on the plant '{self.variation}' as long as it behaves as in its episodes"
+        )
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
         """Returns the verdicts for Γ (N,) as strings; "don't know" for NaN."""
@@ -106,6 +111,7 @@ def calibrate(
     confidence: float | None = None,
     seed: int = 0,
     scenario_hash: str = "",
+    variation: str = "nominal",
 ) -> Calibration:
     """Chooses both thresholds on episodes that were not used for training.
 
@@ -118,6 +124,7 @@ def calibrate(
         confidence: Confidence of both rates, in (0, 1); None for rates on average.
         seed: Seed of the episodes.
         scenario_hash: Hash of the simulation.
+        variation: The plant of the episodes.
 
     Raises:
         ValueError: Too few unsafe or safe episodes for the promised rates; the message names the
@@ -141,6 +148,7 @@ def calibrate(
         num_accepted=int(np.sum(score[~label] <= above)),
         seed=seed,
         scenario_hash=scenario_hash,
+        variation=variation,
     )
 
 

@@ -45,7 +45,9 @@ class Recorder:
             context: The diagram's Context.
             time_s: Time of the row without rounding errors [s]; the Context's by default.
         """
-        self._rows.append({name: port.Eval(context).copy() for name, port in self._ports.items()})
+        self._rows.append(
+            {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
+        )
         self._times.append(context.get_time() if time_s is None else time_s)
 
     def arrays(self) -> dict[str, np.ndarray]:

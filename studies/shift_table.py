@@ -1,0 +1,58 @@
+"""The table of shifts in docs/shifts.md."""
+
+from __future__ import annotations
+
+import math
+
+from drake_safety.evaluation.report.results import Results
+
+_COLUMNS = {
+    "unsafe": "unsafe",
+    "without_novelty.confident_error": "CE, grid alone",
+    "gamma.confident_error": "CE",
+    "gamma.unknown": "DK",
+    "gamma.first.confident_error": "CE at k = 0",
+    "monitor.confident_error_10s": "CE, 10 s",
+    "monitor.confident_error_60s": "CE, 60 s",
+    "monitor.delay_s": "alarm [s]",
+    "monitor.delay_95_s": "95 % [s]",
+    "gradient_boosting.confident_error": "CE, boosting",
+    "mlp.confident_error": "CE, MLP",
+    "isolation_forest.confident_error": "CE, isolation forest",
+    "deep_knn.confident_error": "CE, deep kNN",
+}
+
+
+def shifts_text(results: Results) -> str:
+    """The command and the table of ``evaluate --shifts``, as Markdown.
+
+    Args:
+        results: Stored results with those of the shifts.
+    """
+    entries = results.entries["shifts"]
+    kinds: dict[str, str] = entries["kinds"]
+    shown = [key for key in _COLUMNS if any(results.has(f"shifts.{s}.{key}") for s in kinds)]
+    lines = [
+        f"```sh\n{entries['command']}\n```\n",
+        f"| shift | {' | '.join(_COLUMNS[key] for key in shown)} |",
+        "|---|" + "---|" * len(shown),
+    ]
+    for name, kind in kinds.items():
+        cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
+        lines.append(f"| {name.replace('_', ' ')} ({kind}) | {' | '.join(cells)} |")
+    false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
+    lines.append(
+        f"\nFalse alarms of the monitor: {false.value:.2f} ({false.low:.2f}–{false.high:.2f}) an "
+        f"hour on {false.n} safe nominal motions."
+    )
+    return "\n".join(lines)
+
+
+def _cell(results: Results, key: str) -> str:
+    estimate = results.estimates.get(key)
+    if estimate is None:
+        return ""
+    if key.endswith("_s"):
+        return "none" if math.isnan(estimate.value) else f"{estimate.value:.1f}"
+    value, low, high = (100.0 * x for x in (estimate.value, estimate.low, estimate.high))
+    return f"{value:.1f} ({low:.1f}–{high:.1f})"
