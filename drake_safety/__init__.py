@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.recording import record_episodes
     from drake_safety.simulation.rollouts import run_episode, run_episodes
     from drake_safety.simulation.scenario import Scenario, load_scenario
+    from drake_safety.systems.novelty_monitor import NoveltyMonitor
     from drake_safety.systems.recovery_switch import RecoverySwitch
     from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
@@ -26,6 +27,7 @@ __all__ = [
     "ClosedLoop",
     "Episode",
     "Episodes",
+    "NoveltyMonitor",
     "RecoverySwitch",
     "SafetyAssessment",
     "SafetyAssessor",
@@ -72,6 +74,7 @@ _HOMES = {
     "ClosedLoop": "drake_safety.simulation.closed_loop",
     "Episode": "drake_safety.learning.segments",
     "Episodes": "drake_safety.learning.segments",
+    "NoveltyMonitor": "drake_safety.systems.novelty_monitor",
     "RecoverySwitch": "drake_safety.systems.recovery_switch",
     "SafetyAssessment": "drake_safety.learning.assessment",
     "SafetyAssessor": "drake_safety.systems.safety_assessor",

@@ -105,8 +105,8 @@ def run_changed_starts(
 ) -> dict[str, ShiftedSet]:
     """Simulates plans outside the range of training, and evaluates postures outside of it.
 
-    Postures are single rows, unsafe by definition. "falling" has the rows of nominal episodes after
-    they have left the safe set.
+    Postures are single rows, unsafe by definition. "falling" has the rows outside the safe
+    set of nominal episodes in which the robot falls.
 
     Args:
         scenario: The scenario; if its robot has no legs, nothing is returned.
@@ -153,22 +153,25 @@ def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motio
     return _rows_of(loop, [context])
 
 
-def _fall(loop: ClosedLoop, seed: int, index: int) -> Motion:
-    """The rows of a nominal episode after it has left the safe set."""
+def _fall(loop: LeggedLoop, seed: int, index: int) -> Motion:
+    """The rows of a nominal episode outside the safe set, if the robot falls."""
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     loop.reset(context, episode_rng(seed, index))
     simulator.Initialize()
-    rows, has_left = [], False
+    margins_port = loop.GetOutputPort("margins")
+    fall_column = loop.constraint_names.index(loop.fall_name)
+    rows, has_fallen = [], False
     for step in range(loop.scenario.num_steps + 1):
         try:
             simulator.AdvanceTo(step * loop.scenario.step_s)
         except RuntimeError:
             break
-        has_left = has_left or bool(loop.GetOutputPort("margins").Eval(context).min() < 0.0)
-        if has_left:
+        margins = margins_port.Eval(context)
+        has_fallen = has_fallen or bool(margins[fall_column] < 0.0)
+        if margins.min() < 0.0:
             rows.append(context.Clone())
-    return _rows_of(loop, rows)
+    return _rows_of(loop, rows if has_fallen else [])
 
 
 def _rows_of(loop: ClosedLoop, contexts: Sequence) -> Motion:
