@@ -192,8 +192,13 @@ def test_too_few_safe_episodes_are_refused_as_well():
 
 
 def test_a_calibration_says_what_it_promises_and_refuses_what_cannot_be():
-    assert made().promise == "at most 5 % of unsafe episodes called safe, on average"
-    assert made(confidence=0.95).promise.endswith("called safe, 95 % confidence")
+    assert made().promise == (
+        "at most 5 % of unsafe episodes called safe, on average, "
+        "on the plant 'nominal' as long as it behaves as in its episodes"
+    )
+    assert made(confidence=0.95).promise.startswith(
+        "at most 5 % of unsafe episodes called safe, 95 % confidence, on the plant 'nominal'"
+    )
     with pytest.raises(ValueError, match="unknown kind 'walk'"):
         made(kind="walk")
     with pytest.raises(ValueError, match=r"unsafe_below is 0\.9, .* the threshold 0\.8"):

@@ -73,7 +73,7 @@ class PlaneAssessment(FieldAssessment):
 
     unsafe_logits = SafetyAssessment.unsafe_logits
 
-    def _inputs(self, *parts):
+    def inputs_of(self, *parts):
         return np.concatenate(parts, axis=1)
 
 
