@@ -98,7 +98,15 @@ def test_one_update(benchmark: Any, report: Callable[..., None], method: str) ->
             )
             residual = cell_means(hidden_sum(activations, hidden), points, grid)
             recalibrated_beliefs(
-                scores, base_logit, correction, residual, grid, parameters, NUM_CAUSES
+                scores,
+                base_logit,
+                correction,
+                segments,
+                points,
+                residual,
+                grid,
+                parameters,
+                NUM_CAUSES,
             )
         return time.process_time() - started
 

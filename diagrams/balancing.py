@@ -89,6 +89,7 @@ class Balancing(LeggedLoop):
                     kinematics,
                     parameters.recovery.step,
                     threshold=parameters.recovery.threshold,
+                    persistence_s=parameters.recovery.persistence_s,
                     period_s=scenario.control_period_s,
                     offset_s=tick_offset_s,
                     horizon=scenario.assessment.horizon,

@@ -36,9 +36,10 @@ from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import AdaptationStudy, TestSet, study, train_baselines
+from studies.adaptation_study import AdaptationStudy, Pool, TestSet, study, train_baselines
 
 _SCRATCH_SIZES = (40, 160, 400)
+_POOL_STRIDE = 10  # Between the first seeds of two pools.
 
 
 def adaptation(
@@ -51,7 +52,9 @@ def adaptation(
     evaluate: Annotated[
         int, typer.Option(help="Fresh actual episodes for evaluation.", min=1)
     ] = 600,
-    orders: Annotated[int, typer.Option(help="Orders of the feedback.", min=1)] = 5,
+    pools: Annotated[
+        int, typer.Option(help="Independent pools of feedback and test episodes.", min=1)
+    ] = 3,
     oracle: Annotated[
         int, typer.Option(help="Other actual episodes to train an oracle on.", min=0)
     ] = 0,
@@ -63,7 +66,7 @@ def adaptation(
     ] = ADAPTATION.first,
     workers: WorkersOption = None,
 ) -> None:
-    """Evaluate Γ before and after feedback of a simulated plant, in several orders of it.
+    """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
 
     Episodes are shared with `drake-safety adapt`; results and figures are written to
     ASSESSMENT/adapted-VARIATION.
@@ -71,32 +74,38 @@ def adaptation(
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
-    seeds = ADAPTATION.seeds(seed)
+    seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
     for prior in priors.values():
-        check_fresh(prior, loaded, seeds.values())
+        check_fresh(prior, loaded, [one for block in seeds for one in block.values()])
     print_shipped(learned)
     folder = adapted_folder(learned.out, variation)
     pictures = []
     with open_stages() as stages:
         common = (learned.out, workers, stages)
-        pairs = paired_episodes(loaded, feedback, variation, seeds["adaptation"], *common)
-        sets = pairs.feedback()
-        fresh = fresh_actual_episodes(
-            loaded, evaluate, variation, seeds["evaluation of the adaptation"], *common
-        )
+        drawn = [
+            paired_episodes(loaded, feedback, variation, block["adaptation"], *common)
+            for block in seeds
+        ]
+        sets = [pairs.feedback() for pairs in drawn]
+        fresh = [
+            fresh_actual_episodes(
+                loaded, evaluate, variation, block["evaluation of the adaptation"], *common
+            )
+            for block in seeds
+        ]
         learned_from = {}
         if oracle:
             learned_from["oracle"] = fresh_actual_episodes(
                 loaded,
                 oracle,
                 variation,
-                seeds["oracle"],
+                seeds[0]["oracle"],
                 *common,
                 what="episodes of the oracle",
             )
         if scratch:
             learned_from |= {
-                f"scratch.{n}": pairs.actual[:n] for n in _SCRATCH_SIZES if n <= len(pairs.actual)
+                f"scratch.{n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback
             }
         studies: dict[str, AdaptationStudy] = {}
         for mode, prior in priors.items():
@@ -105,33 +114,31 @@ def adaptation(
                 baselines = train_baselines(
                     prior, learned_from, num_workers=workers, progress=stages
                 )
-            test = TestSet.of(fresh, prior.parameters.shortest)
-            studies[mode] = study(
-                prior,
-                sets,
-                test,
-                num_orders=orders,
-                seed=seed,
-                baselines=baselines,
-                progress=stages,
-            )
+            judged = [
+                Pool(feedback=one, test=TestSet.of(episodes, prior.parameters.shortest))
+                for one, episodes in zip(sets, fresh, strict=True)
+            ]
+            studies[mode] = study(prior, judged, baselines=baselines, progress=stages)
             if mode == "paper" and oracle:
-                studies[mode].estimates |= losses(prior, sets, learned_from["oracle"], test)
-            if len(sets) >= prior.parameters.adaptation.update_interval:
-                pictures += save(adaptation_figure(prior, sets), folder / f"adaptation_{mode}")
+                studies[mode].estimates |= losses(
+                    prior, sets[0], learned_from["oracle"], judged[0].test
+                )
+            if len(sets[0]) >= prior.parameters.adaptation.update_interval:
+                picture = adaptation_figure(prior, sets[0])
+                pictures += save(picture, folder / f"adaptation_{mode}")
     for published in ("calibrated", "grid"):
         picture = study_figure(studies, published=published)
         pictures += save(picture, folder / f"study_{published}")
-    differing, num_pairs = pairs.gap
     report = {
         "command": command_line(),
         "scenario": loaded.name,
-        "scenario_hash": pairs.actual.info.scenario_hash,
-        "nominal_hash": pairs.nominal.info.scenario_hash,
+        "scenario_hash": drawn[0].actual.info.scenario_hash,
+        "nominal_hash": drawn[0].nominal.info.scenario_hash,
         "variation": variation,
         "seed": seed,
-        "feedback_sets": num_pairs,
-        "differing_pairs": differing,
+        "pools": pools,
+        "feedback_sets": [len(one) for one in sets],
+        "differing_pairs": [sum(pair.differs for pair in one) for one in sets],
         "versions": versions(),
         **{
             f"{mode}.{key}": estimate.to_json()
@@ -173,7 +180,7 @@ def _study_table(found: AdaptationStudy, mode: str, published: str, variation: s
         *columns,
         "better in",
         "gap closed",
-        title=f"{mode}, {published}: fresh episodes of '{variation}', {found.num_orders} orders of "
+        title=f"{mode}, {published}: fresh episodes of '{variation}', {found.num_pools} pools of "
         "feedback (mean, least and largest)",
     )
     names = {"prior": "before feedback"}
@@ -184,7 +191,7 @@ def _study_table(found: AdaptationStudy, mode: str, published: str, variation: s
         key = f"{who}.{published}"
         if f"{key}.brier" not in estimates:
             continue
-        won, closed = estimates.get(f"{key}.orders_won"), estimates.get(f"{key}.gap_closed")
+        won, closed = estimates.get(f"{key}.pools_won"), estimates.get(f"{key}.gap_closed")
         table.add_row(
             label,
             *(interval(estimates[f"{key}.{column}"]) for column in columns),

@@ -103,44 +103,52 @@ def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
     }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pool:
+    """Feedback and the test set on which it is judged, with seeds of their own.
+
+    Attributes:
+        feedback: Feedback sets.
+        test: Fresh actual episodes.
+    """
+
+    feedback: Sequence[FeedbackSet]
+    test: TestSet
+
+
 @dataclass(kw_only=True)
 class AdaptationStudy:
     """Results of the study of one plant.
 
     Attributes:
         estimates: By dotted key "ASSESSMENT.FORM.METRIC", where ASSESSMENT is "prior", "adapted.N"
-            or the name of a baseline; over orders it is the mean, with minimum and maximum as
-            interval.
+            or the name of a baseline; the mean over pools, with minimum and maximum as interval.
         sizes: The N.
-        num_orders: Number of orders of the feedback.
+        num_pools: Number of pools.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
-    num_orders: int = 1
+    num_pools: int = 1
 
 
 def study(
     assessment: SafetyAssessment,
-    feedback: Sequence[FeedbackSet],
-    test: TestSet,
+    pools: Sequence[Pool],
     *,
     sizes: Sequence[int] = SIZES,
-    num_orders: int = 5,
-    seed: int = 0,
     method: str | None = None,
     baselines: Mapping[str, SafetyAssessment] | None = None,
     progress: StageProgress | None = None,
 ) -> AdaptationStudy:
-    """Evaluates an assessment before and after feedback, in several orders of it.
+    """Evaluates an assessment before and after feedback, on independent pools.
+
+    Orders of one pool would vary less than other feedback of the same robot does.
 
     Args:
         assessment: The assessment before feedback.
-        feedback: All feedback sets, of which each order uses the first N.
-        test: Fresh actual episodes.
+        pools: Feedback, of which the first N sets are used, each with a test set.
         sizes: The N; those above the number of sets are left out.
-        num_orders: Number of orders.
-        seed: Seed of the orders.
         method: Method of adaptation, see `SafetyAssessment.adapt`.
         baselines: Other assessments by name.
         progress: Called with a stage, the number done and the number wanted.
@@ -148,52 +156,47 @@ def study(
     Raises:
         ValueError: There is less feedback than the smallest N.
     """
-    sizes = [size for size in sizes if size <= len(feedback)]
+    least = min(len(pool.feedback) for pool in pools)
+    sizes = [size for size in sizes if size <= least]
     if not sizes:
-        raise ValueError(f"adaptation study: there are only {len(feedback)} feedback sets")
-    found: dict[str, list[dict[str, dict[str, float]]]] = {"prior": [scores(assessment, test)]}
-    for name, baseline in (baselines or {}).items():
-        found[name] = [scores(baseline, test)]
-    total = num_orders * len(sizes)
-    for order in range(num_orders):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(order,)))
-        drawn = [feedback[i] for i in rng.permutation(len(feedback))]
-        for i, size in enumerate(sizes):
-            adapted = assessment.adapt(drawn[:size], method=method)
-            found.setdefault(f"adapted.{size}", []).append(scores(adapted, test))
+        raise ValueError(f"adaptation study: there are only {least} feedback sets")
+    found: dict[str, list[dict[str, dict[str, float]]]] = {}
+    stage = f"{assessment.parameters.mode}: pools of feedback"
+    for i, pool in enumerate(pools):
+        found.setdefault("prior", []).append(scores(assessment, pool.test))
+        for name, baseline in (baselines or {}).items():
+            found.setdefault(name, []).append(scores(baseline, pool.test))
+        for k, size in enumerate(sizes):
+            adapted = assessment.adapt(pool.feedback[:size], method=method)
+            found.setdefault(f"adapted.{size}", []).append(scores(adapted, pool.test))
             if progress is not None:
-                stage = f"{assessment.parameters.mode}: orders of feedback"
-                progress(stage, order * len(sizes) + i + 1, total)
+                progress(stage, i * len(sizes) + k + 1, len(pools) * len(sizes))
     estimates = {}
-    num_test = len(test.episodes)
-    for who, orders in found.items():
+    num_test = sum(len(pool.test.episodes) for pool in pools)
+    for who, of_pools in found.items():
         for published in PUBLISHED:
-            for metric in orders[0][published]:
-                values = [one[published][metric] for one in orders]
+            for metric in of_pools[0][published]:
+                values = [one[published][metric] for one in of_pools]
                 estimates[f"{who}.{published}.{metric}"] = Estimate(
                     float(np.mean(values)), min(values), max(values), num_test
                 )
-    differing = sum(one.differs for one in feedback)
-    estimates["gap"] = proportion(differing, len(feedback))
+    everything = [one for pool in pools for one in pool.feedback]
+    estimates["gap"] = proportion(sum(one.differs for one in everything), len(everything))
     for size in sizes:
-        # Number of orders in which the adapted assessment is better than the prior.
-        prior = found["prior"][0]
         for published in PUBLISHED:
-            won = sum(
-                one[published]["brier"] < prior[published]["brier"]
-                for one in found[f"adapted.{size}"]
+            before, after, oracle = (
+                np.array([one[published]["brier"] for one in found.get(who, [])])
+                for who in ("prior", f"adapted.{size}", "oracle")
             )
-            estimates[f"adapted.{size}.{published}.orders_won"] = proportion(won, num_orders)
-            if "oracle" in found:
-                gap = prior[published]["brier"] - found["oracle"][0][published]["brier"]
-                closed = prior[published]["brier"] - np.mean(
-                    [one[published]["brier"] for one in found[f"adapted.{size}"]]
-                )
-                share = float(closed / gap) if gap > 0.0 else math.nan
-                estimates[f"adapted.{size}.{published}.gap_closed"] = Estimate.exact(
-                    share, num_test
-                )
-    return AdaptationStudy(estimates=estimates, sizes=list(sizes), num_orders=num_orders)
+            key = f"adapted.{size}.{published}"
+            # Number of pools in which the adapted assessment is better than the prior.
+            won = int(np.sum(after < before))
+            estimates[f"{key}.pools_won"] = proportion(won, len(pools))
+            if len(oracle):
+                gap = np.mean(before) - np.mean(oracle)
+                share = float(np.mean(before - after) / gap) if gap > 0.0 else math.nan
+                estimates[f"{key}.gap_closed"] = Estimate.exact(share, num_test)
+    return AdaptationStudy(estimates=estimates, sizes=list(sizes), num_pools=len(pools))
 
 
 def train_baselines(

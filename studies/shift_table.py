@@ -40,12 +40,38 @@ def shifts_text(results: Results) -> str:
     for name, kind in kinds.items():
         cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
         lines.append(f"| {name.replace('_', ' ')} ({kind}) | {' | '.join(cells)} |")
+    lines += _promises(results, kinds)
     false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
     lines.append(
         f"\nFalse alarms of the monitor: {false.value:.2f} ({false.low:.2f}–{false.high:.2f}) an "
         f"hour on {false.n} safe nominal motions."
     )
     return "\n".join(lines)
+
+
+_PROMISE_COLUMNS = {
+    "fixed.missed": "missed",
+    "fixed.accepted": "safe accepted",
+    "monitor.missed": "missed before the alarm",
+    "adaptive.missed": "adaptive: missed",
+    "adaptive.accepted": "adaptive: safe accepted",
+}
+
+
+def _promises(results: Results, kinds: dict[str, str]) -> list[str]:
+    """The table of a promise under shifts: plans missed and accepted."""
+    names = [name for name in kinds if results.has(f"shifts.{name}.fixed.accepted")]
+    lines = [
+        "\nThe promise for plans: the stored threshold, and one that has followed the outcomes of "
+        "the first half of a shift's unsafe motions, both on the second half; with the monitor, "
+        "all motions until its alarm.\n",
+        f"| shift | {' | '.join(_PROMISE_COLUMNS.values())} |",
+        "|---|" + "---|" * len(_PROMISE_COLUMNS),
+    ]
+    for name in names:
+        cells = [_cell(results, f"shifts.{name}.{key}") for key in _PROMISE_COLUMNS]
+        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
+    return lines if names else []
 
 
 def _cell(results: Results, key: str) -> str:

@@ -1,5 +1,6 @@
 """Adaptation: what feedback of an actual robot may change, and what it must not."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -48,13 +49,43 @@ def feedback_cells(assessment, feedback, is_wanted):
     return [assessment.grid_.locate(p[is_wanted(segments)]) for p in points]
 
 
-def test_without_a_differing_pair_nothing_changes(sharpened):
+def test_without_a_differing_pair_no_learned_cell_changes(sharpened):
     feedback = pairs_with(lambda episode: False)
     adapted = sharpened.adapt(feedback)
-    np.testing.assert_array_equal(adapted.beliefs_, sharpened.beliefs_)
+    learned = sharpened.beliefs_[..., UNCERTAINTY] < 1.0
+    np.testing.assert_array_equal(adapted.beliefs_[learned], sharpened.beliefs_[learned])
     np.testing.assert_array_equal(adapted.correction_.change, 0.0)
     assert adapted.adaptation_.num_differing == 0
     assert adapted.adaptation_.num_sets == NUM_PAIRS
+
+
+@pytest.mark.parametrize("is_unsafe", [False, True])
+def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_did(
+    sharpened, is_unsafe
+):
+    assessment = copy.copy(sharpened)
+    feedback = pairs_with(lambda episode: episode.is_safe == is_unsafe)
+    cells = feedback_cells(assessment, feedback, lambda segments: slice(None))[0]
+    cells = cells[cells >= 0]
+    # Training that has not reached where the feedback is.
+    is_far = ~np.isin(assessment.grid_.locate(assessment.training_points_[0]), cells)
+    assessment.training_points_ = assessment.training_points_[:, is_far]
+    for name in ("heads", "score", "cause", "nearest"):
+        values = getattr(assessment, f"training_{name}_")
+        setattr(assessment, f"training_{name}_", values[is_far])
+    assessment.beliefs_ = assessment.prior_beliefs()
+    assert np.all(assessment.beliefs_[0, cells, UNCERTAINTY] == 1.0)
+    adapted = assessment.adapt(feedback).beliefs_[0]
+    count = np.bincount(cells, minlength=len(adapted))
+    is_filled = count >= assessment.parameters.min_count
+    assert is_filled.sum() > 3
+    np.testing.assert_allclose(
+        adapted[is_filled, UNCERTAINTY], assessment.parameters.initial_uncertainty
+    )
+    assert np.all(adapted[(count > 0) & ~is_filled, UNCERTAINTY] == 1.0)
+    known = adapted[is_filled, :2].sum(axis=0)
+    # The scores of unsafe episodes are discounted.
+    assert known[1 if is_unsafe else 0] > (0.7 if is_unsafe else 0.99) * known.sum()
 
 
 def test_gamma_falls_for_a_robot_that_fails_more_and_rises_for_one_that_fails_less(sharpened):
@@ -65,7 +96,7 @@ def test_gamma_falls_for_a_robot_that_fails_more_and_rises_for_one_that_fails_le
 
 
 @pytest.mark.parametrize("make", [worse, better])
-def test_gamma_never_rises_in_a_cell_whose_feedback_was_unsafe(sharpened, make):
+def test_gamma_never_rises_in_a_learned_cell_whose_feedback_was_unsafe(sharpened, make):
     feedback = make()
     adapted = sharpened.adapt(feedback)
     num_cells = sharpened.grid_.num_cells
@@ -82,7 +113,10 @@ def test_gamma_never_rises_in_a_cell_whose_feedback_was_unsafe(sharpened, make):
     ):
         is_held = unsafe > safe
         num_held += is_held.sum()
-        assert np.all(after[is_held, 0] <= before[is_held, 0] + 1e-12)
+        is_learned = before[:, UNCERTAINTY] < 1.0
+        rise = (after - before)[is_held & is_learned, 0]
+        assert len(rise) > 2
+        assert np.all(rise <= 1e-12)
         np.testing.assert_array_equal(guard, is_held)
     assert num_held > 5
     # What is published rises nowhere either where all that is read are such cells.
@@ -165,8 +199,11 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     segments = segments_of(worse(), stride=3, shortest=10, discount=0.99, plain=False)
     before = sharpened.predict(*inputs(segments))
     after = sharpened.adapt(worse()).predict(*inputs(segments))
+    # Rows that were unknown have no probability to move.
+    was_known = before.calibrated > 0.0
     published, grid = (
-        getattr(after, name) - getattr(before, name) for name in ("calibrated", "normalized")
+        (getattr(after, name) - getattr(before, name))[was_known]
+        for name in ("calibrated", "normalized")
     )
     assert published.mean() < -0.05
     assert grid.mean() < -0.05

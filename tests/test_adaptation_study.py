@@ -1,4 +1,4 @@
-"""The study of adaptation: figures by hand, orders of feedback, and its pictures."""
+"""The study of adaptation: figures by hand, independent pools, and its pictures."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
 from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import TestSet, scores, study, train_baselines
+from studies.adaptation_study import Pool, TestSet, scores, study, train_baselines
 
 
 @pytest.fixture(scope="module")
@@ -37,43 +37,51 @@ def test_scores_are_those_of_what_is_published(assessment, judged):
         assert found[name]["k0.brier"] == pytest.approx(squared.mean())
 
 
-def test_without_a_gap_every_order_leaves_every_figure_as_it_is(assessment, judged):
-    found = study(
-        assessment, pairs_with(lambda episode: False), judged, sizes=(20, 40, 400), num_orders=2
-    )
+def pool_of(flip, judged, seed=3):
+    return Pool(feedback=pairs_with(flip, seed=seed), test=judged)
+
+
+def test_without_a_gap_every_pool_leaves_every_figure_as_it_is(assessment, judged):
+    pools = [pool_of(lambda episode: False, judged, seed) for seed in (3, 4)]
+    found = study(assessment, pools, sizes=(20, 40, 400))
     assert found.sizes == [20, 40]
     assert found.estimates["gap"].value == 0.0
-    for published in ("calibrated", "grid"):
-        for metric in ("brier", "auc", "unsafe_recall"):
-            prior = found.estimates[f"prior.{published}.{metric}"]
-            for size in (20, 40):
-                estimate = found.estimates[f"adapted.{size}.{published}.{metric}"]
-                assert estimate.low == estimate.high == prior.value
-        assert found.estimates[f"adapted.40.{published}.orders_won"].value == 0.0
+    for metric in ("brier", "auc", "unsafe_recall"):
+        prior = found.estimates[f"prior.calibrated.{metric}"].value
+        for size in (20, 40):
+            # Only cells that training leaves empty are filled.
+            after = found.estimates[f"adapted.{size}.calibrated.{metric}"].value
+            assert after == pytest.approx(prior, abs=0.01)
 
 
-def test_orders_differ_until_all_feedback_is_given_and_the_oracle_bounds_the_gap(
-    assessment, judged
-):
-    feedback = worse()
+def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
+    other = TestSet.of(make_episodes(40, seed=10, noise=0.002), 10)
+    pools = [Pool(feedback=worse(), test=judged), Pool(feedback=worse()[:30], test=other)]
     found = study(
-        assessment,
-        feedback,
-        judged,
-        sizes=(10, 40),
-        num_orders=3,
-        baselines={"oracle": assessment.adapt(feedback)},
+        assessment, pools, sizes=(10, 30, 40), baselines={"oracle": assessment.adapt(worse())}
     )
-    few, many = (found.estimates[f"adapted.{n}.calibrated.brier"] for n in (10, 40))
-    assert few.low < few.high
-    assert many.low == pytest.approx(many.high)
-    differing = sum(one.differs for one in feedback)
-    assert found.estimates["gap"].value == pytest.approx(differing / len(feedback))
-    prior = found.estimates["prior.calibrated.brier"].value
-    if many.value < prior:
-        assert found.estimates["adapted.40.calibrated.gap_closed"].value == pytest.approx(1.0)
-    with pytest.raises(ValueError, match="only 40 feedback sets"):
-        study(assessment, feedback, judged, sizes=(41,))
+    assert found.sizes == [10, 30]
+    assert found.num_pools == 2
+    estimate = found.estimates["adapted.30.calibrated.brier"]
+    by_hand = [
+        scores(assessment.adapt(pool.feedback[:30]), pool.test)["calibrated"]["brier"]
+        for pool in pools
+    ]
+    assert (estimate.low, estimate.high) == (min(by_hand), max(by_hand))
+    before = [scores(assessment, pool.test)["calibrated"]["brier"] for pool in pools]
+    won = found.estimates["adapted.30.calibrated.pools_won"]
+    assert won.value == np.mean(np.array(by_hand) < before)
+    gap = np.mean(before) - found.estimates["oracle.calibrated.brier"].value
+    closed = found.estimates["adapted.30.calibrated.gap_closed"].value
+    assert (
+        np.isnan(closed)
+        if gap <= 0.0
+        else closed == pytest.approx(np.mean(np.array(before) - by_hand) / gap)
+    )
+    differing = sum(one.differs for pool in pools for one in pool.feedback)
+    assert found.estimates["gap"].value == pytest.approx(differing / 70)
+    with pytest.raises(ValueError, match="only 30 feedback sets"):
+        study(assessment, pools, sizes=(41,))
 
 
 def test_too_few_episodes_give_no_baseline(assessment):
@@ -93,7 +101,8 @@ def test_the_picture_says_which_cells_changed_and_on_what_evidence(assessment, j
     said = " ".join(axes.get_xlabel() for axes in fig.axes)
     assert "1: " in said
     assert "segments, twins" in said
-    found = study(assessment, worse(), judged, sizes=(10, 40), num_orders=2)
+    pools = [Pool(feedback=worse(), test=judged)]
+    found = study(assessment, pools, sizes=(10, 40))
     curves = study_figure({"sharpened": found}, published="calibrated").axes
     assert curves[0].get_title(loc="left") == "Brier score"
     (line,) = curves[0].lines

@@ -52,6 +52,22 @@ def test_it_fires_below_the_threshold_and_when_nothing_is_known(probability, fir
     assert Bench(probability).look() == fires
 
 
+def test_with_a_persistence_gamma_must_stay_below_for_that_long():
+    bench = Bench(0.0, persistence_s=2 * PERIOD_S)
+    assert [bench.look() for _ in range(3)] == [False, False, True]
+    bench = Bench(0.0, persistence_s=2 * PERIOD_S)
+    bench.look(2)
+    bench.set(1.0)
+    assert not bench.look()
+    bench.set(0.0)
+    assert [bench.look() for _ in range(3)] == [False, False, True]
+
+
+def test_a_negative_persistence_is_refused():
+    with pytest.raises(ValueError, match="persistence_s must not be negative"):
+        RecoveryTrigger(period_s=PERIOD_S, persistence_s=-0.1)
+
+
 def test_it_is_at_rest_before_its_first_look():
     assert not Bench(0.0).is_active()
 

@@ -94,6 +94,21 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely(a
     assert "monitor.delay_s" not in found
 
 
+def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less(assessment):
+    rng = np.random.default_rng(0)
+    is_unsafe = rng.random(400) < 0.5
+    # Under this shift unsafe plans look as safe as the threshold, and a little more.
+    probability = np.where(is_unsafe, rng.uniform(0.5, 0.9, 400), rng.uniform(0.7, 1.0, 400))
+    motions = [motion(1, p, is_unsafe=bool(u)) for p, u in zip(probability, is_unsafe, strict=True)]
+    shifted = ShiftedSet(kind="plan", motions=motions)
+    found = evaluate_shift(shifted, assessment, {"gamma": told}).estimates
+    assert found["fixed.missed"].value > 0.6
+    assert found["fixed.accepted"].value == 1.0
+    assert found["adaptive.missed"].value == pytest.approx(0.1, abs=0.05)
+    assert 0.2 < found["adaptive.accepted"].value < 0.6
+    assert found["adaptive.missed"].n == pytest.approx(is_unsafe.sum() / 2, abs=1)
+
+
 def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assessment, nominal):
     rows = nominal.motions[0]
     given = (rows.state, rows.desired_preview, rows.features)

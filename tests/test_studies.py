@@ -131,18 +131,18 @@ def test_sizes_of_a_learning_curve_are_numbers_between_commas():
 
 
 @pytest.mark.slow
-def test_adaptation_is_judged_in_several_orders_beside_its_baselines(monkeypatch, capsys, run):
+def test_adaptation_is_judged_on_several_pools_beside_its_baselines(monkeypatch, capsys, run):
     file, folder = run
     scenario = load_scenario(file)
     name = next(one for one in scenario.variations if one != "nominal")
     options = ("--assessment", folder, "--variation", name, "--feedback", 40, "--evaluate", 20)
-    options += ("--orders", 2, "--oracle", 40, "--scratch", "--workers", 1)
+    options += ("--pools", 2, "--oracle", 40, "--scratch", "--workers", 1)
     assert call(monkeypatch, "adaptation", file, *options) in (0, None)
     printed = capsys.readouterr().out
-    assert "2 orders of feedback" in " ".join(printed.split())
+    assert "2 pools of feedback" in " ".join(printed.split())
     study = folder / f"adapted-{name}"
     report = json.loads((study / "study.json").read_text())
-    assert report["feedback_sets"] == 40
+    assert report["feedback_sets"] == [40, 40]
     keys = {"prior", "adapted.40", "oracle", "scratch.40"}
     assert {f"sharpened.{key}.calibrated.brier" for key in keys} <= report.keys()
     for picture in ("study_calibrated", "study_grid", "adaptation_sharpened"):

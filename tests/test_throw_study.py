@@ -153,3 +153,20 @@ def test_a_probability_that_is_not_known_triggers():
     unknown = Scorer(name="lost", probability=lambda state, *_: np.full(len(state), np.nan))
     probability = throw_study.log_probability(log, unknown)
     assert throw_study.trigger_time(log, probability, 0.1) == TIME_S[0]
+
+
+def test_with_a_persistence_one_low_row_triggers_nothing_and_two_do():
+    log = log_of(0)
+
+    def trigger(low, persistence_s):
+        values = np.ones(len(TIME_S))
+        values[low] = np.nan
+        scorer = Scorer(name="given", probability=lambda *_: values)
+        probability = throw_study.log_probability(log, scorer, persistence_s)
+        return throw_study.trigger_time(log, probability, 0.6)
+
+    assert trigger([7], 0.0) == TIME_S[7]
+    assert math.isnan(trigger([7], 0.02))
+    assert trigger([7, 9, 10], 0.02) == TIME_S[10]
+    assert trigger([0, 1], 0.02) == TIME_S[1]
+    assert math.isnan(trigger([0, 1], 0.04))

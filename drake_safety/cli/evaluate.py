@@ -287,6 +287,7 @@ def _evaluate_throws(
     study = evaluate_throws(
         judged.scenario,
         rules,
+        persistence_s=recovery.persistence_s,
         num_throws=num_throws,
         num_calibration=num_calibration,
         seed=seeds["disturbances"],

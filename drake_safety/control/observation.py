@@ -11,6 +11,8 @@ from pydrake.math import RotationMatrix
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot import ObservationNoise
 
+_LEAST_FOOT_SPREAD_M = 0.005  # Root mean square extent of the feet that defines a plane.
+
 
 def quaternion_of(q: np.ndarray) -> Quaternion:
     """Returns the normalised quaternion of the base in a position vector."""
@@ -68,6 +70,35 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
             v[6:],
         ]
     )
+
+
+def gravity_in_foot_plane(
+    kinematics: RobotKinematics, q: np.ndarray, gravity: np.ndarray
+) -> np.ndarray:
+    """Returns the components of gravity's direction along the plane of the feet.
+
+    On level ground they are zero; on a slope, the sine of its inclination downhill. The plane is
+    fitted to the contact points; along a direction in which these do not extend it is level.
+
+    Args:
+        kinematics: The robot.
+        q: Positions (n_q,).
+        gravity: Gravity in the world, (3,) [m/s²].
+
+    Returns:
+        Along the x and the y axis of the stance frame, (2,); NaN if an argument is not finite.
+    """
+    if not q.dot(q) + gravity @ gravity < math.inf:
+        return np.full(2, np.nan)
+    p_WC = kinematics.contact_positions(q) - kinematics.foot_radii[:, None] * (0.0, 0.0, 1.0)
+    p = p_WC - p_WC.mean(axis=0)
+    regularization = len(p) * _LEAST_FOOT_SPREAD_M**2 * np.eye(2)
+    slope = np.linalg.solve(p[:, :2].T @ p[:, :2] + regularization, p[:, :2].T @ p[:, 2])
+    yaw = kinematics.stance_pose(q)[2]
+    axes = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    tangents = np.column_stack([axes, axes @ slope])
+    along = tangents @ gravity / math.sqrt(gravity @ gravity)
+    return along / np.linalg.norm(tangents, axis=1)
 
 
 def add_noise(

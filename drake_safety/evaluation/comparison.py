@@ -131,6 +131,7 @@ def compare_scenario(
         study = evaluate_throws(
             scenario,
             [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
+            persistence_s=recovery.persistence_s,
             num_throws=effort.num_throws,
             num_calibration=0,
             seed=seeds["disturbances"],

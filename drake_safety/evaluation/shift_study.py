@@ -17,8 +17,9 @@ from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.monitoring_study import rate_per_hour
 from drake_safety.evaluation.scorers import Scorer, StageProgress
 from drake_safety.evaluation.shifts import PLANS, POSTURES, PlantShift
+from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.calibration import PLAN
+from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
@@ -409,11 +410,31 @@ def evaluate_shift(
             gamma, is_confident = verdicts, is_wrong
     promise = assessment.calibrations_.get(PLAN)
     if promise is not None and is_unsafe.any():
-        is_missed = (gamma.probability[first] >= promise.threshold) & is_unsafe
-        found["missed"] = proportion(int(is_missed.sum()), int(is_unsafe.sum()))
+        found |= _promised(promise, gamma.probability[first], is_unsafe)
     if shifted.kind in _LASTING:
         found |= _monitored(shifted, assessment, is_confident, first)
     return result
+
+
+def _promised(
+    promise: Calibration, probability: np.ndarray, is_unsafe: np.ndarray
+) -> dict[str, Estimate]:
+    """Verdicts on the first rows by the promise's threshold, and by one that follows outcomes."""
+    adaptive = AdaptiveThreshold(promise)
+    is_accepted = np.zeros((2, len(probability)), dtype=bool)
+    for i, (gamma, ends_unsafely) in enumerate(zip(probability, is_unsafe, strict=True)):
+        is_accepted[:, i] = gamma >= promise.threshold, adaptive.is_safe(gamma)
+        adaptive.update(gamma, ends_unsafely)
+    # The outcomes of the first half; the figures are those of the second.
+    is_counted = np.cumsum(is_unsafe) > 0.5 * is_unsafe.sum()
+    found = {"missed": proportion(int((is_accepted[0] & is_unsafe).sum()), int(is_unsafe.sum()))}
+    for name, row in (("fixed", is_accepted[0]), ("adaptive", is_accepted[1])):
+        for what, of in (("missed", is_unsafe), ("accepted", ~is_unsafe)):
+            if (of & is_counted).any():
+                found[f"{name}.{what}"] = proportion(
+                    int((row & of & is_counted).sum()), int((of & is_counted).sum())
+                )
+    return found
 
 
 def _monitored(

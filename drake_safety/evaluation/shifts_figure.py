@@ -26,7 +26,16 @@ _SERIES = {
     "gamma.confident_error": ("with novelty", SAFE_COLOUR),
     "monitor.confident_error_60s": ("with monitor, first 60 s", RECOVERY_COLOUR),
 }
+_TITLES = {
+    "nominal": "as in training",
+    "plant": "another plant",
+    "sensor": "faulty measurements",
+    "plan": "plans beyond the range",
+    "posture": "postures beyond the range",
+    "junk": "contradictions",
+}
 _LONGEST_S = 60.0
+_GROUP_GAP = 0.5  # Between rows of different kinds, in rows.
 
 
 def shifts_figure(results: Mapping[str, ShiftResult]) -> Figure:
@@ -35,8 +44,10 @@ def shifts_figure(results: Mapping[str, ShiftResult]) -> Figure:
     Args:
         results: Results by shift.
     """
-    names = list(results)
-    places = np.arange(len(names))[::-1]
+    kinds = list(dict.fromkeys(result.kind for result in results.values()))
+    names = sorted(results, key=lambda name: kinds.index(results[name].kind))
+    groups = np.array([kinds.index(results[name].kind) for name in names])
+    places = (len(names) - np.arange(len(names)) + _GROUP_GAP * (groups[-1] - groups)).astype(float)
     with drawing_style():
         fig = new_figure(10.0, 1.6 + 0.32 * len(names))
         errors, delays = fig.subplots(1, 2, sharey=True, width_ratios=[1.6, 1.0])
@@ -56,17 +67,30 @@ def shifts_figure(results: Mapping[str, ShiftResult]) -> Figure:
                 error_kw={"elinewidth": 0.8, "ecolor": FAINT_INK},
             )
         errors.set_yticks(places, [name.replace("_", " ") for name in names])
-        errors.set_ylim(-0.6, len(names) - 0.4)
+        errors.set_ylim(0.4, places[0] + 0.6)
         errors.set_xlabel("confident errors [% of rows]")
         errors.set_title("Sure and wrong")
-        errors.legend(loc="lower right")
+        for group, kind in enumerate(kinds):
+            errors.text(
+                0.995,
+                places[groups == group].max() + 0.42,
+                _TITLES.get(kind, kind),
+                transform=errors.get_yaxis_transform(),
+                horizontalalignment="right",
+                verticalalignment="top",
+                color=FAINT_INK,
+                fontstyle="italic",
+            )
+        fig.legend(loc="outside lower left", ncols=len(_SERIES))
         errors.grid(axis="x", color="#eceef0", linewidth=0.7)
         errors.set_axisbelow(True)
         for place, name in zip(places, names, strict=True):
             _draw_delay(delays, place, results[name])
         delays.set_xscale("log")
         delays.set_xlim(0.08, 1.4 * _LONGEST_S)
-        delays.set_xticks([0.1, 1.0, 10.0, 60.0], ["0.1", "1", "10", "none in 60"])
+        delays.set_xticks([0.1, 1.0, 10.0, _LONGEST_S], ["0.1", "1", "10", "none"])
+        delays.minorticks_off()
+        delays.tick_params(axis="y", length=0)
         delays.set_xlabel("alarm after [s], median to 95 %")
         delays.set_title("Noticed")
         delays.grid(axis="x", color="#eceef0", linewidth=0.7)

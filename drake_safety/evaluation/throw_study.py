@@ -112,9 +112,20 @@ class ThrowStudy:
         return outcomes
 
 
-def log_probability(log: ThrowLog, scorer: Scorer) -> np.ndarray:
-    """Safety probability of a scorer at every row of a log, (N,)."""
-    return scorer.probability(log.state, log.desired_preview, log.features)
+def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
+    """Highest safety probability of a scorer within a time, at every row of a log, (N,).
+
+    Args:
+        log: The log.
+        scorer: The scorer.
+        persistence_s: The time up to each row [s]; before it has passed the probability is 1.
+    """
+    probability = scorer.probability(log.state, log.desired_preview, log.features)
+    if len(probability) < 2 or not persistence_s:
+        return probability
+    num_waited = math.ceil(persistence_s / (log.time_s[1] - log.time_s[0]) - 1e-6)
+    padded = np.concatenate([np.ones(num_waited), np.nan_to_num(probability, nan=0.0)])
+    return np.lib.stride_tricks.sliding_window_view(padded, num_waited + 1).max(axis=1)
 
 
 def choose_threshold(
@@ -160,6 +171,7 @@ def evaluate_throws(
     num_calibration: int,
     seed: int,
     calibration_seed: int,
+    persistence_s: float = 0.0,
     variation: str = "actual",
     num_workers: int | None = None,
     progress: StageProgress | None = None,
@@ -173,6 +185,7 @@ def evaluate_throws(
         num_calibration: Number of calibration throws, for thresholds that are None.
         seed: Seed of the test throws.
         calibration_seed: Seed of the calibration throws.
+        persistence_s: Time for which a probability must have been below the threshold [s].
         variation: Variation of the plant.
         num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
@@ -195,7 +208,9 @@ def evaluate_throws(
         )
         for rule in rules:
             if rule.threshold is None:
-                probabilities = [log_probability(log, rule.scorer) for log in calibration]
+                probabilities = [
+                    log_probability(log, rule.scorer, persistence_s) for log in calibration
+                ]
                 thresholds[rule.name] = choose_threshold(calibration, probabilities)
     logs = throw(
         list(range(num_throws)), seed=seed, progress=partial(report, "throws, balancing alone")
@@ -203,7 +218,11 @@ def evaluate_throws(
     triggers = {
         rule.name: np.array(
             [
-                trigger_time(log, log_probability(log, rule.scorer), thresholds[rule.name])
+                trigger_time(
+                    log,
+                    log_probability(log, rule.scorer, persistence_s),
+                    thresholds[rule.name],
+                )
                 for log in logs
             ]
         )

@@ -263,6 +263,8 @@ class SafetyAssessment:
                 self._training,
                 self.base_logit_,
                 adapted.correction_,
+                segments,
+                points,
                 recalibration.cell_means(residual, points, self.grid_),
                 *arguments,
             )

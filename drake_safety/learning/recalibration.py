@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -190,12 +191,16 @@ def recalibrated_beliefs(
     training: TrainingScores,
     base_logit: BaseLogit,
     correction: Correction,
+    feedback: FeedbackSegments,
+    points: np.ndarray,
     residual: np.ndarray,
     grid: Grid,
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> np.ndarray:
     """Computes beliefs from training scores shifted as the base logit is, (K, R*R, 3 + n_c).
+
+    Cells that training leaves empty are filled by the feedback.
 
     Departure: the paper raises the uncertainty where nominal scores are unreliable. That hardly
     changes the safe share of a cell, as F keeps the ratio of its masses and the discrepancy has no
@@ -207,6 +212,8 @@ def recalibrated_beliefs(
         training: The training segments.
         base_logit: The base logit.
         correction: The correction of the base logit.
+        feedback: Segments of all feedback so far.
+        points: Psi(x) of the feedback, (K, M, 2).
         residual: Mean contribution of the hidden layer in every map's cells, (K, R*R).
         grid: The grid.
         parameters: The assessment's parameters.
@@ -215,9 +222,16 @@ def recalibrated_beliefs(
     if training.heads is None or training.nearest is None:
         raise ValueError("recalibrated_beliefs: the maps have no heads")
     all_logit = base_logit.of_heads(training.heads)
+    actual = belief_masses.from_scores(
+        feedback.score, parameters.initial_uncertainty, feedback.cause, num_causes
+    )
+    fuse = partial(
+        belief_masses.fuse_cells, num_cells=grid.num_cells, min_count=parameters.min_count
+    )
     fused = []
-    for points, added, guard in zip(training.points, residual, correction.guard, strict=True):
-        cells = grid.locate(points)
+    members = zip(training.points, points, residual, correction.guard, strict=True)
+    for training_points, actual_points, added, guard in members:
+        cells = grid.locate(training_points)
         inside = cells >= 0
         logit, score = all_logit[inside], training.score[inside]
         here = cells[inside]
@@ -228,12 +242,11 @@ def recalibrated_beliefs(
         # Newly unsafe segments get the constraint with the smallest margin.
         cause = np.where(cause >= 0, cause, training.nearest[inside])
         masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
-        fused.append(
-            belief_masses.fuse_cells(
-                masses,
-                here,
-                num_cells=grid.num_cells,
-                min_count=parameters.min_count,
-            )
+        learned = fuse(masses, here)
+        both = fuse(
+            np.concatenate([masses, actual]),
+            np.concatenate([here, grid.locate(actual_points)]),
         )
+        is_empty = learned[:, belief_masses.UNCERTAINTY] == 1.0
+        fused.append(np.where(is_empty[:, None], both, learned))
     return np.stack(fused)

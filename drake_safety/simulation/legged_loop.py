@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
@@ -21,6 +22,7 @@ from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
+from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
@@ -159,6 +161,25 @@ class LeggedLoop(PlannedLoop):
             seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
             outlook=outlook,
         )
+        self._add_gravity(builder)
+
+    def _add_gravity(self, builder: DiagramBuilder) -> None:
+        """Appends gravity in the plane of the feet to the features."""
+        system = builder.AddNamedSystem(
+            "gravity_features", GravityFeatures(self.kinematics, mirror=self._observers.mirror)
+        )
+        gravity = builder.AddNamedSystem(
+            "gravity", ConstantVectorSource(self.plant.gravity_field().gravity_vector())
+        )
+        builder.Connect(gravity.get_output_port(), system.GetInputPort("gravity"))
+        measured = self._assessor_observer.GetOutputPort("measured_plant_state")
+        builder.Connect(measured, system.GetInputPort("plant_state"))
+        parts = (self._features, system.GetOutputPort("features"))
+        features = builder.AddNamedSystem("features", Multiplexer([port.size() for port in parts]))
+        for i, port in enumerate(parts):
+            builder.Connect(port, features.get_input_port(i))
+        self._features = features.get_output_port(0)
+        self.feature_names = self.feature_names + system.feature_names
 
     def _export_robot(
         self,

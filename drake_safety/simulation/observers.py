@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import AffineSystem, RandomSource
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.mirror import Mirror
 from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import InputShift
@@ -41,6 +42,7 @@ class Observers:
         self._plant_state = plant_state
         self._period_s = period_s
         self._options = options
+        self.mirror: Mirror | None = options.get("mirror")
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
 

@@ -130,14 +130,15 @@ class PlannedLoop(ClosedLoop):
             seen = builder.AddNamedSystem("seen_margins", SafetyMonitor(safe_set, *sizes))
             builder.Connect(seen_state, seen.GetInputPort("plant_state"))
             self._seen_margins = seen.GetOutputPort("margins")
-        self._features = builder.AddNamedSystem(
+        features = builder.AddNamedSystem(
             "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
         )
-        builder.Connect(seen_state or plant_state, self._features.GetInputPort("plant_state"))
+        builder.Connect(seen_state or plant_state, features.GetInputPort("plant_state"))
         # The features cover the whole plan: safety depends on its end, beyond the H steps.
         outlook = outlook or self._planner.GetOutputPort("desired_outlook")
-        builder.Connect(outlook, self._features.GetInputPort("desired_preview"))
-        self.feature_names = self._features.feature_names
+        builder.Connect(outlook, features.GetInputPort("desired_preview"))
+        self._features = features.GetOutputPort("features")
+        self.feature_names = features.feature_names
         self.constraint_names = self._monitor.constraint_names
 
     def _export(
@@ -167,7 +168,7 @@ class PlannedLoop(ClosedLoop):
         Returns:
             The assessor; None without an assessment.
         """
-        features = self._features.GetOutputPort("features")
+        features = self._features
         desired_preview = desired_preview or self._planner.GetOutputPort("desired_preview")
         assessor = self.add_assessor(
             builder,

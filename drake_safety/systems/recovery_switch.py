@@ -41,6 +41,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         kinematics: The controller's model of the robot.
         parameters: Parameters of the recovery steps.
         threshold: Γ_thre.
+        persistence_s: Time for which Γ must have been below it [s].
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].
             Simultaneous discrete updates would add a period of delay each.
@@ -54,6 +55,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         parameters: RecoveryStepParameters,
         *,
         threshold: float,
+        persistence_s: float = 0.0,
         period_s: float,
         offset_s: float,
         horizon: int,
@@ -63,7 +65,12 @@ class RecoverySwitch(FloatSystem, Diagram):
         builder = DiagramBuilder()
         trigger = builder.AddNamedSystem(
             "recovery_trigger",
-            RecoveryTrigger(threshold=threshold, period_s=period_s, offset_s=offset_s),
+            RecoveryTrigger(
+                threshold=threshold,
+                persistence_s=persistence_s,
+                period_s=period_s,
+                offset_s=offset_s,
+            ),
         )
         self.step_planner = builder.AddNamedSystem(
             "recovery_step_planner",

@@ -1,6 +1,8 @@
-"""RecoveryTrigger: a latch that is set when Γ falls below its threshold."""
+"""RecoveryTrigger: a latch that is set when Γ stays below its threshold."""
 
 from __future__ import annotations
+
+import math
 
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
@@ -27,21 +29,36 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6.
+        persistence_s: Time for which Γ must have been below Γ_thre [s]; none by default, as in the
+            paper. An impact can make a single assessment low or unknown.
         period_s: Update period [s].
         offset_s: Time of the first update [s].
 
     Raises:
-        ValueError: The threshold is outside [0, 1].
+        ValueError: The threshold is outside [0, 1], or the persistence negative.
     """
 
-    def __init__(self, *, threshold: float = 0.6, period_s: float, offset_s: float = 0.0):
+    def __init__(
+        self,
+        *,
+        threshold: float = 0.6,
+        persistence_s: float = 0.0,
+        period_s: float,
+        offset_s: float = 0.0,
+    ):
         super().__init__()
         if not 0 <= threshold <= 1:
             raise ValueError(f"recovery trigger: threshold must be in [0, 1]; got {threshold}")
+        if not persistence_s >= 0:
+            raise ValueError(
+                f"recovery trigger: persistence_s must not be negative; got {persistence_s}"
+            )
         self.threshold = threshold
+        self._num_waited = math.ceil(persistence_s / period_s - 1e-6)
         self._probability_port = self.DeclareVectorInputPort("safety_probability", 1)
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
+        self._num_below = self.DeclareDiscreteState(1)  # Updates with Γ below Γ_thre, up to now.
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self.DeclareAbstractOutputPort(
             "port_selector",
@@ -58,9 +75,14 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         if self._is_active(context):
             done = self._done_port
             active = not (done.HasValue(context) and done.Eval(context)[0] > 0)
+            num_below = 0.0
         else:
-            active = not self._probability_port.Eval(context)[0] >= self.threshold
+            is_below = not self._probability_port.Eval(context)[0] >= self.threshold
+            num_below = context.get_discrete_state(self._num_below).GetAtIndex(0)
+            num_below = num_below + 1.0 if is_below else 0.0
+            active = num_below > self._num_waited
         discrete_state.set_value(self._active, [float(active)])
+        discrete_state.set_value(self._num_below, [num_below])
 
     def _calc_selector(self, context: Context, output: Value) -> None:
         output.set_value(InputPortIndex(2 if self._is_active(context) else 1))

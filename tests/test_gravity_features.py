@@ -1,0 +1,95 @@
+"""GravityFeatures: a slope is seen before the first step."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_safety import load_scenario
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.observation import gravity_in_foot_plane
+from drake_safety.robots.shift import Shift
+from drake_safety.systems.gravity_features import GravityFeatures
+from legged_robots import ROBOT_NAMES, robot_kinematics
+
+DOWN = np.array([0.0, 0.0, -9.81])
+
+
+def downhill(slope, direction):
+    """Gravity on ground that falls in a direction."""
+    along = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
+    return 9.81 * np.append(along, -math.cos(slope))
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_a_slope_is_its_sine_downhill_in_the_stance_frame_wherever_the_robot_stands(name):
+    kinematics = robot_kinematics(name)
+    level = gravity_in_foot_plane(kinematics, kinematics.standing_positions(), DOWN)
+    np.testing.assert_allclose(level, 0.0, atol=1e-9)
+    for yaw, direction in ((0.0, 0.4), (2.5, -1.0)):
+        X_WB = RigidTransform(
+            RotationMatrix.MakeZRotation(yaw), [3.0, -2.0, kinematics.standing_height]
+        )
+        q = kinematics.positions_at(X_WB, kinematics.posture)
+        seen = gravity_in_foot_plane(kinematics, q, downhill(0.2, direction))
+        expected = math.sin(0.2) * np.array([math.cos(direction - yaw), math.sin(direction - yaw)])
+        np.testing.assert_allclose(seen, expected, atol=1e-9)
+
+
+def test_feet_on_tilted_ground_see_the_same_slope_as_gravity_that_is_tilted():
+    kinematics = robot_kinematics("laikago")
+    tilted = RotationMatrix(RollPitchYaw(0.0, 0.15, 0.0))
+    X_WB = RigidTransform(tilted) @ RigidTransform([0.0, 0.0, kinematics.standing_height])
+    q = kinematics.positions_at(X_WB, kinematics.posture)
+    seen = gravity_in_foot_plane(kinematics, q, DOWN)
+    np.testing.assert_allclose(seen, [math.sin(0.15), 0.0], atol=2e-3)
+
+
+def test_feet_in_a_line_define_no_slope_across_it():
+    kinematics = robot_kinematics("laikago")
+    q = kinematics.standing_positions()
+    q[:4] = RollPitchYaw(0.5 * math.pi, 0.0, 0.0).ToQuaternion().wxyz()  # On its side.
+    seen = gravity_in_foot_plane(kinematics, q, DOWN)
+    assert np.isfinite(seen).all() and np.abs(seen).max() <= 1.0
+
+
+def test_gravity_of_a_state_that_is_not_finite_is_nan():
+    kinematics = robot_kinematics("laikago")
+    q = np.full(kinematics.num_positions, np.nan)
+    assert np.isnan(gravity_in_foot_plane(kinematics, q, DOWN)).all()
+
+
+def test_the_mirrored_robot_sees_the_mirrored_slope():
+    kinematics = robot_kinematics("atlas")
+    seen = []
+    for mirror in (None, Mirror(kinematics)):
+        system = GravityFeatures(kinematics, mirror=mirror)
+        context = system.CreateDefaultContext()
+        state = np.concatenate(
+            [kinematics.standing_positions(), np.zeros(kinematics.num_velocities)]
+        )
+        system.GetInputPort("plant_state").FixValue(context, state)
+        system.GetInputPort("gravity").FixValue(context, downhill(0.1, 0.7))
+        seen.append(system.GetOutputPort("features").Eval(context))
+    assert system.feature_names == ["gravity_x", "gravity_y"]
+    np.testing.assert_allclose(seen[0], 0.1 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-3)
+    np.testing.assert_allclose(seen[1], seen[0] * (1.0, -1.0))
+
+
+@pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])
+def test_a_loop_on_a_slope_shows_it_before_the_first_step(name):
+    scenario = load_scenario(name)
+    slope = Shift(slope_rad=0.17, slope_direction_rad=1.0)
+    scenario.variations["sloped"] = dataclasses.replace(scenario.variation("nominal"), shift=slope)
+    seen = {}
+    for variation in ("nominal", "sloped"):
+        loop = scenario.make_loop(variation)
+        context = loop.CreateDefaultContext()
+        loop.reset_to(context, None, loop.standing_start())
+        first = loop.feature_names.index("gravity_x")
+        seen[variation] = loop.GetOutputPort("features").Eval(context)[first : first + 2]
+    np.testing.assert_allclose(seen["nominal"], 0.0, atol=1e-3)
+    expected = math.sin(0.17) * np.array([math.cos(1.0), math.sin(1.0)])
+    np.testing.assert_allclose(seen["sloped"], expected, atol=1e-3)
