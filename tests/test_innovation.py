@@ -33,7 +33,7 @@ def motions(num, seed, *, force=(0.0, 0.0), plant=A, noise=0.002):
 def novelty():
     x = np.concatenate(motions(200, 0))
     episode = np.repeat(np.arange(200), STEPS)
-    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.01)
+    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.01, plan=slice(0))
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_too_little_motion_gives_no_alarm(novelty):
 
 
 def test_a_motion_of_one_input_is_refused():
-    novelty = Novelty(training=Moments.of(np.eye(6)), limits=np.ones(2))
+    novelty = Novelty(training=Moments.of(np.eye(6)), limits=np.ones(3), plan=slice(0))
     with pytest.raises(ValueError, match="no motion has two inputs"):
         Innovation.fit([np.zeros((1, 6))], NUM_STATES, STEP_S, novelty)
 

@@ -12,6 +12,7 @@ from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.simulation.capabilities import judging_options
 
 ROWS, EPISODES = 20, 200
+NO_PLAN = slice(0)
 
 
 def redundant(rng, num_episodes=EPISODES):
@@ -24,25 +25,25 @@ def redundant(rng, num_episodes=EPISODES):
 @pytest.fixture(scope="module")
 def novelty():
     x, episode = redundant(np.random.default_rng(0))
-    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.05)
+    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.05, plan=NO_PLAN)
 
 
 def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
     x = np.random.default_rng(0).normal(size=(4000, 3)) @ [[1.0, 0.5, 0.0], [0, 1, 0.2], [0, 0, 1]]
-    distance = Novelty(training=Moments.of(x), limits=np.ones(2)).of(x)
+    distance = Novelty(training=Moments.of(x), limits=np.ones(3), plan=NO_PLAN).of(x)
     offset = x - x.mean(axis=0)
     inverse = np.linalg.inv(np.cov(x.T, bias=True))
     expected = np.sqrt(np.einsum("ij,jk,ik->i", offset, inverse, offset))
     np.testing.assert_allclose(distance, expected, rtol=1e-9)
     scaled = x * [1e3, 0.1, 1.0]
-    again = Novelty(training=Moments.of(scaled), limits=np.ones(2)).of(scaled)
+    again = Novelty(training=Moments.of(scaled), limits=np.ones(3), plan=NO_PLAN).of(scaled)
     np.testing.assert_allclose(again, distance, rtol=1e-6)
 
 
 def test_an_input_far_outside_the_range_is_novel_though_it_contradicts_nothing(novelty):
     along = np.array([[0.5, 50.0, 1.0, 0.0]])
     distances = novelty.distances(7.0 * np.eye(4)[3] + along * [[1.0], [20.0]]) / novelty.limits
-    np.testing.assert_array_equal(distances > 1.0, [[False, False], [True, False]])
+    np.testing.assert_array_equal(distances > 1.0, [[False, False, False], [True, False, False]])
 
 
 def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty):
@@ -51,6 +52,24 @@ def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty
     shuffled = np.random.default_rng(2).permuted(x, axis=0)
     assert (novelty.of(shuffled) > 1.0).mean() > 0.9
     assert np.all(shuffled.max(axis=0) == x.max(axis=0))
+
+
+def test_a_plan_unlike_those_of_training_is_novel_whatever_the_state():
+    rng = np.random.default_rng(0)
+    episode = np.repeat(np.arange(EPISODES), ROWS)
+    # A plan of five points is a line; one with a bend is within the range of every column.
+    slope, noise = rng.normal(size=(len(episode), 1)), rng.normal(size=(len(episode), 5))
+    state, bend = rng.normal(size=(len(episode), 30)), [0.3, -0.3, 0.3, -0.3, 0.3]
+    x = np.column_stack([state, slope * np.arange(1, 6) + 0.02 * noise])
+    is_unsafe = np.zeros(len(x), dtype=bool)
+    bent = x + np.r_[np.zeros(30), bend]
+    alone = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=NO_PLAN)
+    assert (alone.of(bent) > 1.0).mean() < 0.1
+    novelty = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=slice(30, 35))
+    assert (novelty.of(bent) > 1.0).mean() > 0.99
+    assert (novelty.of(x) > 1.0).mean() < 0.01
+    assert np.abs(novelty.contradictions(bent[0]))[:30].max() < 4.0
+    assert np.abs(novelty.contradictions(bent[0]))[30:].max() > 10.0
 
 
 def test_the_promised_share_of_other_safe_episodes_has_a_novel_input(novelty):
@@ -64,8 +83,8 @@ def test_unsafe_episodes_widen_the_gaussian_and_not_the_limit():
     x, episode = redundant(np.random.default_rng(0))
     is_unsafe = episode % 4 == 0
     x[is_unsafe, :3] *= 3.0
-    counted = Novelty.fit(x, episode, is_unsafe, rate=0.05)
-    every = Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05)
+    counted = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=NO_PLAN)
+    every = Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05, plan=NO_PLAN)
     assert counted.limits[0] < every.limits[0]
 
 
@@ -78,24 +97,24 @@ def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_z
 
 def test_one_episode_gives_no_limit_and_what_is_not_finite_is_novel_all_the_same():
     x, _ = redundant(np.random.default_rng(0), num_episodes=1)
-    alone = Novelty.fit(x, np.zeros(len(x)), np.zeros(len(x), dtype=bool), rate=0.05)
+    alone = Novelty.fit(x, np.zeros(len(x)), np.zeros(len(x), dtype=bool), rate=0.05, plan=NO_PLAN)
     assert np.isinf(alone.limits).all()
     np.testing.assert_array_equal(alone.of(np.array([[np.nan] * 4, [1e3] * 4])), [np.inf, 0.0])
 
 
 def test_inputs_that_are_all_alike_are_known_and_others_are_not():
     x = np.tile([1.0, 2.0], (40, 1))
-    alike = Novelty.fit(x, np.arange(40) // 2, np.zeros(40, dtype=bool), rate=0.05)
+    alike = Novelty.fit(x, np.arange(40) // 2, np.zeros(40, dtype=bool), rate=0.05, plan=NO_PLAN)
     np.testing.assert_array_equal(alike.of(x[:1]), [0.0])
     assert alike.of(np.array([[1.0, 3.0]]))[0] > 1.0
 
 
-@pytest.mark.parametrize("limits", [[1.0], [1.0, 0.0], [1.0, float("nan")]])
+@pytest.mark.parametrize("limits", [[1.0], [1.0, 1.0, 0.0], [1.0, 1.0, float("nan")]])
 def test_a_file_whose_limits_are_none_is_refused(robot, limits, tmp_path):
     assessment = load_assessment(robot[0], "paper")
     assessment.novelty_.limits = np.array(limits)
     assessment.save(tmp_path / "forged.safetensors")
-    with pytest.raises(ValueError, match=r"limits of novelty are .* expected two positive numbers"):
+    with pytest.raises(ValueError, match=r"limits of novelty are .* expected 3 positive numbers"):
         SafetyAssessment.load(tmp_path / "forged.safetensors")
 
 

@@ -42,7 +42,7 @@ class AssessmentDouble:
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
         self.correction_ = correction(0.0)
         self.base_logit_ = object()
-        self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limits=np.ones(2))
+        self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limits=np.ones(3), plan=slice(0))
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
         self.asked, self.novelties = [], []

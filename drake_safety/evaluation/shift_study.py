@@ -255,7 +255,11 @@ def assessment_judge(assessment: SafetyAssessment, *, is_novelty_used: bool = Tr
     """Γ as a :class:`SafetyAssessor` with the port ``margins`` gives it, without the monitor."""
     novelty = assessment.novelty_
     if not is_novelty_used:
-        novelty = Novelty(training=novelty.training, limits=np.full(2, np.inf))
+        novelty = Novelty(
+            training=novelty.training,
+            limits=np.full_like(novelty.limits, np.inf),
+            plan=novelty.plan,
+        )
 
     def judge(
         state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray

@@ -27,7 +27,13 @@ from drake_safety.learning.feedback import (
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.innovation import Innovation
-from drake_safety.learning.inputs import check_width, input_names, inputs, used_states
+from drake_safety.learning.inputs import (
+    check_width,
+    input_names,
+    inputs,
+    plan_columns,
+    used_states,
+)
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
@@ -135,6 +141,7 @@ class SafetyAssessment:
             every.episode,
             every.is_unsafe,
             parameters.novelty_rate,
+            plan=plan_columns(info, parameters),
         )
         self.innovation_ = Innovation.fit(
             [self._rows(one)[one.first_step :] for one in episodes if one.is_safe]

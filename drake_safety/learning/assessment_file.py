@@ -22,15 +22,15 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.innovation import Innovation
-from drake_safety.learning.inputs import num_inputs, used_states
-from drake_safety.learning.novelty import Moments, Novelty
+from drake_safety.learning.inputs import num_inputs, plan_columns, used_states
+from drake_safety.learning.novelty import NUM_DISTANCES, Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 
 _MAPS, _CORRECTION = "embedding.", "correction."
 _INNOVATION = "innovation."
@@ -168,7 +168,7 @@ def _learned(
         "base_logit_": base_logit,
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
-        "novelty_": _novelty(numbers, tensors, expected_inputs),
+        "novelty_": _novelty(numbers, tensors, expected_inputs, plan_columns(info, parameters)),
         "innovation_": Innovation.from_arrays(
             {
                 k.removeprefix(_INNOVATION): v.astype(float)
@@ -201,7 +201,9 @@ def _learned(
     return learned
 
 
-def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_columns: int) -> Novelty:
+def _novelty(
+    numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_columns: int, plan: slice
+) -> Novelty:
     found: list[Moments | None] = []
     for prefix, count in zip((_NOVELTY, _FEEDBACK_NOVELTY), numbers["novelty_counts"], strict=True):
         if not count and prefix == _FEEDBACK_NOVELTY:
@@ -223,9 +225,11 @@ def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_column
         )
     training, feedback = found
     limits = np.array(numbers["novelty_limits"], dtype=float)
-    if training is None or limits.shape != (2,) or not np.all(limits > 0.0):
-        raise ValueError(f"its limits of novelty are {limits}, expected two positive numbers")
-    return Novelty(training=training, feedback=feedback, limits=limits)
+    if training is None or limits.shape != (NUM_DISTANCES,) or not np.all(limits > 0.0):
+        raise ValueError(
+            f"its limits of novelty are {limits}, expected {NUM_DISTANCES} positive numbers"
+        )
+    return Novelty(training=training, feedback=feedback, limits=limits, plan=plan)
 
 
 def _used(

@@ -191,7 +191,11 @@ class Innovation:
             own = range(part, len(x), _NUM_FOLDS)
             others = [one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x
             predictor = Predictor.fit(*_steps(others, num_states))
-            known = Novelty(training=Moments.of(np.concatenate(others)), limits=novelty.limits)
+            known = Novelty(
+                training=Moments.of(np.concatenate(others)),
+                limits=novelty.limits,
+                plan=novelty.plan,
+            )
             for i in own:
                 errors[i] = _errors(predictor, x[i], num_states)
                 distances[i] = known.of(x[i][1:])

@@ -19,6 +19,12 @@ def used_states(info: EpisodesInfo, parameters: AssessmentParameters) -> np.ndar
     return np.array([has_rates or not is_rate(name) for name in info.state_names], dtype=bool)
 
 
+def plan_columns(info: EpisodesInfo, parameters: AssessmentParameters) -> slice:
+    """Returns which columns of x are the plan z*."""
+    start = int(used_states(info, parameters).sum())
+    return slice(start, start + info.horizon * len(info.output_names))
+
+
 def inputs(
     state: np.ndarray,
     desired_preview: np.ndarray,

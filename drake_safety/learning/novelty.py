@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+NUM_DISTANCES = 3
 NUM_FOLDS = 5
 """Folds of the episodes for the limits: every distance is from the inputs of other episodes."""
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
@@ -14,6 +15,7 @@ _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would
 _REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
 _LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
 _LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs that much.
+_LEAST_PLAN_VARIANCE = 1e-4  # The same for the plan alone, which no robot's reality changes.
 _LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; against rounding.
 
 
@@ -45,52 +47,82 @@ class Moments:
         between = share * (1.0 - share) * np.outer(shift, shift)
         return Moments(count=count, mean=self.mean + share * shift, covariance=within + between)
 
-    def whitenings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns W with (x - mean) W of unit covariance, for the range and for the redundancies.
+    def whitenings(self, plan: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns W with (x - mean) W of unit covariance: range, redundancies and plan.
 
         The variance along the axes of the standardised inputs has a lower bound.
 
+        Args:
+            plan: The plan's columns of x, n_p of them.
+
         Returns:
-            (n_x, n_x) for all axes, and (n_x, m) for the m redundancies.
+            (n_x, n_x) for all axes, (n_x, m) for the m redundancies, and (n_x, n_p) for the axes of
+            the plan alone.
         """
         scale = np.maximum(np.sqrt(np.diag(self.covariance)), _SMALLEST_SPREAD)
         variance, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         axes = axes / scale[:, None]
         is_redundant = variance < _REDUNDANT_VARIANCE
         redundant = np.maximum(variance[is_redundant], _LEAST_REDUNDANT_VARIANCE)
+        planned = np.zeros((len(scale), len(scale[plan])))
+        own_variance, own_axes = np.linalg.eigh(
+            self.covariance[plan, plan] / np.outer(scale[plan], scale[plan])
+        )
+        own_axes = own_axes / scale[plan][:, None]
+        planned[plan] = own_axes / np.sqrt(np.maximum(own_variance, _LEAST_PLAN_VARIANCE))
         return (
             axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE)),
             axes[:, is_redundant] / np.sqrt(redundant),
+            planned,
         )
 
 
 class Novelty:
-    """Says which inputs are beyond those of training, by two Mahalanobis distances.
+    """Says which inputs are beyond those of training, by three Mahalanobis distances.
 
     One is along all axes of the training inputs, with a tolerance: an input outside their range is
-    novel. The other is along their redundancies alone. Features and preview follow from state and
+    novel. The second is along their redundancies alone. Features and preview follow from state and
     plan, in an actual robot as in the nominal one; an input that contradicts itself, such as the
     features of another plan, is novel though every entry is within its range, and the maps ignore
-    these axes. The two distances are known in process monitoring as T^2 and SPE. The object is
-    immutable.
+    these axes. The two are known in process monitoring as T^2 and SPE. The third is that of the
+    plan alone: a planner asks for what it always did, or for something new, whatever the state.
+    The object is immutable.
 
     Args:
         training: Moments of the training inputs.
-        limits: Largest distances of a known input, along all axes and along redundancies, (2,).
+        limits: Largest distances of a known input: of all of it, along redundancies, and of the
+            plan, (3,).
+        plan: The plan's columns of x.
         feedback: Moments of an actual robot's inputs, which are known as well; None before
             adaptation.
     """
 
-    def __init__(self, *, training: Moments, limits: np.ndarray, feedback: Moments | None = None):
+    def __init__(
+        self,
+        *,
+        training: Moments,
+        limits: np.ndarray,
+        plan: slice,
+        feedback: Moments | None = None,
+    ):
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
+        self.plan = plan
         known = training if feedback is None else training.joined(feedback)
-        self._mean, self._whitenings = known.mean, known.whitenings()
+        self._mean, self._whitenings = known.mean, known.whitenings(plan)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Novelty:
         return self
 
     @classmethod
-    def fit(cls, x: np.ndarray, episode: np.ndarray, is_unsafe: np.ndarray, rate: float) -> Novelty:
+    def fit(
+        cls,
+        x: np.ndarray,
+        episode: np.ndarray,
+        is_unsafe: np.ndarray,
+        rate: float,
+        *,
+        plan: slice,
+    ) -> Novelty:
         """Computes the moments of training inputs and chooses the limits.
 
         Each limit is exceeded somewhere in at most a share of `rate` of the safe episodes, each
@@ -102,23 +134,26 @@ class Novelty:
             episode: Episode of each, (N,).
             is_unsafe: Whether it ended unsafely, (N,).
             rate: Share of safe episodes with a novel input, in (0, 1).
+            plan: The plan's columns of x.
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
-        distances = np.full((len(x), 2), np.inf)
+        distances = np.full((len(x), NUM_DISTANCES), np.inf)
         for part in range(NUM_FOLDS):
             is_part = fold == part
             if is_part.any() and not is_part.all():
-                others = cls(training=Moments.of(x[~is_part]), limits=np.ones(2))
+                others = cls(
+                    training=Moments.of(x[~is_part]), limits=np.ones(NUM_DISTANCES), plan=plan
+                )
                 distances[is_part] = others.distances(x[is_part])
         counted = ~is_unsafe if not is_unsafe.all() else np.ones(len(x), dtype=bool)
         _, position = np.unique(episode[counted], return_inverse=True)
-        farthest = np.zeros((position.max() + 1, 2))
+        farthest = np.zeros((position.max() + 1, NUM_DISTANCES))
         np.maximum.at(farthest, position, distances[counted])
-        whole = cls(training=Moments.of(x), limits=np.ones(2))
+        whole = cls(training=Moments.of(x), limits=np.ones(NUM_DISTANCES), plan=plan)
         limits = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
         num_redundancies = whole._whitenings[1].shape[1]
-        least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies))]
-        return cls(training=whole.training, limits=np.maximum(limits, least))
+        least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
+        return cls(training=whole.training, limits=np.maximum(limits, least), plan=plan)
 
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
@@ -130,13 +165,15 @@ class Novelty:
             x: Inputs, (N, n_x).
             rate: Largest share of novel inputs of a robot without a reality gap, in (0, 1).
         """
-        alone = Novelty(training=self.training, limits=self.limits)
+        alone = Novelty(training=self.training, limits=self.limits, plan=self.plan)
         if np.mean(alone.of(x) > 1.0) <= rate:
             return alone
-        return Novelty(training=self.training, limits=self.limits, feedback=Moments.of(x))
+        return Novelty(
+            training=self.training, limits=self.limits, plan=self.plan, feedback=Moments.of(x)
+        )
 
     def distances(self, x: np.ndarray) -> np.ndarray:
-        """Returns the distances of inputs (N, n_x) along all axes and redundancies, (N, 2).
+        """Returns the distances of inputs (N, n_x): all of it, redundancies, plan, (N, 3).
 
         Those of an input that is not finite are infinite.
         """
@@ -150,7 +187,7 @@ class Novelty:
         return np.stack(found, axis=1)
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Returns the larger distance of inputs (N, n_x) in units of its limit, (N,).
+        """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
 
         An input is novel above 1; that of an input that is not finite is infinite.
         """
