@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -30,7 +32,7 @@ from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 
 _MAPS, _CORRECTION = "embedding.", "correction."
 _INNOVATION = "innovation."
@@ -45,10 +47,17 @@ _TRAINING: dict[str, tuple[type, type]] = {
 }
 """Arrays of the training segments: the type on disk and in memory."""
 _OPTIONAL = ("training_heads", "training_nearest", "training_target")
+_INFINITE = ("innovation.chart_limits", "innovation.sums")
+"""Arrays with limits, which are infinite if training had too little motion."""
+_MASS_TOLERANCE = 1e-6
+_T = TypeVar("_T")
 
 
 def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
     """Writes one safetensors file atomically.
+
+    Its metadata is one JSON text with the SHA-256 of all else. The same assessment gives the same
+    bytes.
 
     Args:
         path: The file.
@@ -83,15 +92,17 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
         "used": [asdict(one) for one in learned["used_"]],
     }
-    metadata = {
-        "schema": SCHEMA,
-        "schema_version": str(SCHEMA_VERSION),
-        "parameters": json.dumps(asdict(parameters)),
-        "info": json.dumps(asdict(learned["info_"])),
-        "adaptation": json.dumps(None if adaptation is None else asdict(adaptation)),
-        "numbers": json.dumps(numbers),
+    entries = {
+        "schema_version": SCHEMA_VERSION,
+        "parameters": asdict(parameters),
+        "info": asdict(learned["info_"]),
+        "adaptation": None if adaptation is None else asdict(adaptation),
+        "numbers": numbers,
     }
-    content = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
+    arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    # safetensors stores several entries of metadata in any order.
+    text = _to_json(entries | {"sha256": _digest(entries, arrays)})
+    content = save(arrays, {SCHEMA: text})
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -116,35 +127,88 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             incomplete.
     """
     metadata, tensors = _open(path)
-    if metadata.get("schema") != SCHEMA:
+    # Before version 9 schema and version were entries of their own.
+    version = metadata.get("schema_version", "none")
+    if SCHEMA not in metadata and metadata.get("schema") != SCHEMA:
         raise ValueError(
-            f"'{path}' is not a safety assessment: its schema is '{metadata.get('schema')}', "
-            f"expected '{SCHEMA}'"
-        )
-    if metadata.get("schema_version") != str(SCHEMA_VERSION):
-        raise ValueError(
-            f"'{path}' has the schema version {metadata.get('schema_version')}, this version "
-            f"reads {SCHEMA_VERSION}: train the assessment again (episodes are kept: `--resume`)"
+            f"'{path}' is not a safety assessment: its metadata has the entries "
+            f"{sorted(metadata)}, expected '{SCHEMA}'"
         )
     try:
-        entries = {
-            name: json.loads(metadata[name])
-            for name in ("parameters", "info", "adaptation", "numbers")
-        }
-        adaptation = AdaptationParameters(**entries["parameters"].pop("adaptation"))
-        paper = PaperReading(**entries["parameters"].pop("paper"))
-        parameters = AssessmentParameters(
-            **entries["parameters"], paper=paper, adaptation=adaptation
-        )
-        return parameters, _learned(parameters, entries, tensors)
-    except (KeyError, TypeError, ValueError) as error:
+        if SCHEMA in metadata:
+            entries = json.loads(metadata[SCHEMA])
+            version = str(entries["schema_version"])
+        if version == str(SCHEMA_VERSION):
+            return _checked(entries, tensors)
+    except KeyError as error:
+        raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
+    except (AttributeError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
+    raise ValueError(
+        f"'{path}' has the schema version {version}, this version reads {SCHEMA_VERSION}: train "
+        "the assessment again (episodes are kept: `--resume`)"
+    )
+
+
+def _checked(
+    entries: dict[str, Any], tensors: dict[str, np.ndarray]
+) -> tuple[AssessmentParameters, dict[str, Any]]:
+    stored = entries.pop("sha256")
+    if stored != _digest(entries, tensors):
+        raise ValueError("its contents do not have the SHA-256 that it was written with")
+    for name, tensor in tensors.items():
+        is_number = np.isnan if name in _INFINITE else lambda values: ~np.isfinite(values)
+        if is_number(tensor).any():
+            raise ValueError(f"its {name} has entries that are not finite numbers")
+    nested = {"paper": PaperReading, "adaptation": AdaptationParameters}
+    own = dict(entries["parameters"])
+    own |= {name: _typed(made, own[name], name) for name, made in nested.items()}
+    parameters = _typed(AssessmentParameters, own, "parameters")
+    return parameters, _learned(parameters, entries, tensors)
+
+
+def _to_json(entries: Mapping[str, Any]) -> str:
+    return json.dumps(entries, sort_keys=True)
+
+
+def _digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of the entries and of the names, types, shapes and bytes of the tensors."""
+    digest = hashlib.sha256(_to_json(entries).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype.str} {tensor.shape}".encode())
+        digest.update(np.ascontiguousarray(tensor).tobytes())
+    return digest.hexdigest()
+
+
+def _typed(made: type[_T], entries: Mapping[str, Any], where: str) -> _T:
+    """Makes a dataclass of JSON values of its fields' types."""
+    hints = get_type_hints(made)
+    for name, value in entries.items():
+        if name not in hints:
+            raise ValueError(f"its {where} has no field '{name}'")
+        if not _is_of(value, hints[name]):
+            raise ValueError(f"its {where}.{name} is {value!r}, expected {hints[name]}")
+    return made(**entries)
+
+
+def _is_of(value: Any, hint: Any) -> bool:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is UnionType:
+        return any(_is_of(value, one) for one in arguments)
+    if origin in (list, tuple):
+        return isinstance(value, (list, tuple)) and all(_is_of(v, arguments[0]) for v in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(_is_of(v, arguments[1]) for v in value.values())
+    if hint is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    return type(value) is hint
 
 
 def _learned(
     parameters: AssessmentParameters, entries: dict[str, Any], tensors: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    info, numbers = EpisodesInfo(**entries["info"]), entries["numbers"]
+    info, numbers = _typed(EpisodesInfo, entries["info"], "info"), entries["numbers"]
     grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
     weights = {k.removeprefix(_MAPS): v for k, v in tensors.items() if k.startswith(_MAPS)}
     embedding = Embedding(weights, num_margins=numbers["num_margins"])
@@ -156,10 +220,11 @@ def _learned(
     base_logit = numbers["base_logit"]
     if base_logit is not None:
         low, high = base_logit["margin_range"]
-        base_logit = BaseLogit(**base_logit | {"margin_range": (low, high)})
+        base_logit = base_logit | {"margin_range": (low, high)}
+        base_logit = _typed(BaseLogit, base_logit, "base_logit")
     correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
     correction["guard"] = correction["guard"].astype(float)
-    calibrations = [Calibration(**one) for one in numbers["calibrations"]]
+    calibrations = [_typed(Calibration, one, "calibration") for one in numbers["calibrations"]]
     adaptation = entries["adaptation"]
     learned: dict[str, Any] = {
         "info_": info,
@@ -179,8 +244,8 @@ def _learned(
             num_states=int(used_states(info, parameters).sum()),
         ),
         "calibrations_": {one.kind: one for one in calibrations},
-        "used_": _used(info, calibrations, numbers.get("used")),
-        "adaptation_": None if adaptation is None else Adaptation(**adaptation),
+        "used_": [_typed(UsedEpisodes, one, "used") for one in numbers["used"]],
+        "adaptation_": None if adaptation is None else _typed(Adaptation, adaptation, "adaptation"),
     }
     for name, (_, used) in _TRAINING.items():
         is_absent = name in _OPTIONAL and name not in tensors
@@ -198,7 +263,29 @@ def _learned(
     for name, shape in expected.items():
         if tensors[name].shape != shape:
             raise ValueError(f"the shape of its {name} is {tensors[name].shape}, expected {shape}")
+    beliefs = tensors["beliefs"]
+    masses = np.stack([beliefs[..., :3].sum(axis=-1), beliefs[..., 1]], axis=-1)
+    known = np.stack([np.ones(cells), beliefs[..., 3:].sum(axis=-1)], axis=-1)
+    if (beliefs < 0.0).any() or np.abs(masses - known).max() > _MASS_TOLERANCE:
+        raise ValueError("its beliefs are not masses that sum to 1, with causes of the unsafe one")
+    _check_names(tensors, learned)
     return learned
+
+
+def _check_names(tensors: Mapping[str, np.ndarray], learned: Mapping[str, Any]) -> None:
+    """Checks that all tensors belong to what was learned."""
+    known = {"beliefs", *_TRAINING}
+    known |= {f"{_MAPS}{name}" for name in learned["embedding_"].weights}
+    known |= {f"{_CORRECTION}{field.name}" for field in fields(Correction)}
+    known |= {f"{_INNOVATION}{name}" for name in learned["innovation_"].arrays()}
+    moments = {
+        _NOVELTY: learned["novelty_"].training,
+        _FEEDBACK_NOVELTY: learned["novelty_"].feedback,
+    }
+    for prefix, one in moments.items():
+        known |= set() if one is None else {f"{prefix}mean", f"{prefix}covariance"}
+    if not tensors.keys() <= known:
+        raise ValueError(f"it has the unknown tensors {sorted(tensors.keys() - known)}")
 
 
 def _novelty(
@@ -230,19 +317,6 @@ def _novelty(
             f"its limits of novelty are {limits}, expected {NUM_DISTANCES} positive numbers"
         )
     return Novelty(training=training, feedback=feedback, limits=limits, plan=plan)
-
-
-def _used(
-    info: EpisodesInfo, calibrations: list[Calibration], stored: list[dict[str, Any]] | None
-) -> list[UsedEpisodes]:
-    """The used episodes; inferred from other entries in files that do not store them."""
-    if stored is not None:
-        return [UsedEpisodes(**one) for one in stored]
-    used = [UsedEpisodes.of("training", info, None)]
-    for one in calibrations[:1]:
-        seen = replace(info, seed=one.seed, scenario_hash=one.scenario_hash)
-        used.append(UsedEpisodes.of("calibration", seen, one.num_unsafe + one.num_safe))
-    return used
 
 
 def single(values: np.ndarray) -> np.ndarray:

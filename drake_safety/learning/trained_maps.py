@@ -50,16 +50,15 @@ class Embedding:
             w.setflags(write=False)
         self.num_margins = num_margins
         self.num_layers = sum(name.startswith("trunk.") for name in self.weights) // 2
+        self.has_safety_head = any(name.startswith("safety.") for name in self.weights)
         names = [f"trunk.{i}" for i in range(self.num_layers)] + ["output"]
-        missing = [
-            f"{name}.{kind}"
-            for name in names
-            for kind in ("weight", "bias")
-            if f"{name}.{kind}" not in self.weights
-        ]
-        if missing or self.num_layers == 0:
+        heads = ["safety.0", "safety.1"] if self.has_safety_head else []
+        expected = {f"{name}.{kind}" for name in names + heads for kind in ("weight", "bias")}
+        if expected != self.weights.keys() or self.num_layers == 0:
+            missing, surplus = expected - self.weights.keys(), self.weights.keys() - expected
             raise ValueError(
-                f"Embedding: {missing or 'trunk layers'} missing in {list(self.weights)}"
+                f"Embedding: a map of {self.num_layers} hidden layers has the arrays "
+                f"{sorted(expected)}; missing {sorted(missing)}, unexpected {sorted(surplus)}"
             )
         self._layers = [self._layer(name) for name in names]
         for (w, _), (next_w, _) in zip(self._layers, self._layers[1:], strict=False):
@@ -74,7 +73,6 @@ class Embedding:
                 f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
                 f"{2 + num_margins} for {num_margins} margins"
             )
-        self.has_safety_head = "safety.0.weight" in self.weights
         if self.has_safety_head:
             self._safety_layers = [self._layer(f"safety.{i}") for i in range(2)]
 
