@@ -89,7 +89,8 @@ class Balancing(LeggedLoop):
                     kinematics,
                     parameters.recovery.step,
                     threshold=parameters.recovery.threshold,
-                    persistence_s=parameters.recovery.persistence_s,
+                    # A probability from outside triggers at once: its source has judged it.
+                    persistence_s=parameters.recovery.persistence_s if assessment else 0.0,
                     period_s=scenario.control_period_s,
                     offset_s=tick_offset_s,
                     horizon=scenario.assessment.horizon,

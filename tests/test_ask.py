@@ -16,6 +16,7 @@ from drake_safety.cli.target_run import alarm_row, named_push
 from drake_safety.cli.targets import join_targets, parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import Calibration
 from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.simulation.goal_motion import GoalMotion
 from drake_safety.simulation.scenario import load_scenario
@@ -50,9 +51,23 @@ def folder(trained, tmp_path):
 
 
 def calibrate(folder, threshold):
-    """Writes what `evaluate` would; above one, nothing is accepted."""
-    estimate = {"value": threshold, "low": threshold, "high": threshold, "n": 100}
-    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": estimate}))
+    """Chooses the threshold of the folder's assessment; just above one, nothing is accepted."""
+    file = assessment_file(folder, "sharpened")
+    assessment = SafetyAssessment.load(file)
+    rates = {"miss_rate": 0.01, "false_alarm_rate": 0.05, "confidence": None}
+    counts = {"num_unsafe": 99, "num_safe": 99, "num_missed": 0, "num_accepted": 9}
+    assessment.calibrations_["plan"] = Calibration(
+        kind="plan",
+        threshold=threshold,
+        unsafe_below=threshold,
+        seed=5,
+        scenario_hash="",
+        **rates,
+        **counts,
+    )
+    file.unlink()
+    assessment.save(file)
+    return assessment
 
 
 @pytest.fixture
@@ -246,7 +261,7 @@ def nothing_near(monkeypatch):
 
 
 def test_a_run_obeys_a_refusal(call, folder, nothing_near):
-    calibrate(folder, 1.5)
+    calibrate(folder, 1.0 + 1e-6)
     code, told = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")
     assert code == 1
     assert "refused: nothing moved; --force goes there" in told
@@ -271,7 +286,7 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
 
 @pytest.mark.slow
 def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothing_near):
-    calibrate(folder, 1.5)
+    calibrate(folder, 1.0 + 1e-6)
     options = ("--assessment", folder, "--target", "blue_box", "--duration", 0.2)
     code, told = call("run", SCENARIO, *options, "--force")
     assert code == 0
@@ -284,16 +299,20 @@ def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
     call, folder, trained
 ):
     gamma = trained[1]
-    assert goal_threshold(folder, "sharpened", gamma).threshold == DEFAULT_THRESHOLD
+    assert goal_threshold(folder, gamma).threshold == DEFAULT_THRESHOLD
     told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
     assert "remark" in told and "is not calibrated" in told
-    calibrate(folder, 0.25)
-    assert goal_threshold(folder, "sharpened", gamma) == (0.25, 0.25, "")
-    assert goal_threshold(folder, "paper", gamma).threshold == DEFAULT_THRESHOLD
-    # What was stored with the assessment itself comes first.
-    stored = SimpleNamespace(threshold=0.7, unsafe_below=0.2, promise="a promise")
-    calibrated = SimpleNamespace(calibrations_={"plan": stored})
-    assert goal_threshold(folder, "sharpened", calibrated) == (0.7, 0.2, "a promise")
+    threshold, unsafe_below, promise = goal_threshold(folder, calibrate(folder, 0.25))
+    assert (threshold, unsafe_below) == (0.25, 0.25)
+    assert promise.startswith("at most 1 % of unsafe episodes called safe, on average, on the plan")
+
+
+def test_a_threshold_beside_the_assessment_is_not_believed(call, folder):
+    forged = {"value": -5.0, "low": -5.0, "high": -5.0, "n": 100}
+    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": forged}))
+    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
+    assert code == 1
+    assert "unsafe" in told
 
 
 @pytest.mark.parametrize(

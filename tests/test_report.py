@@ -16,6 +16,7 @@ import pytest
 from drake_safety.evaluation.report import page
 from drake_safety.evaluation.report.cell_map import map_cells, map_views, most_typical
 from drake_safety.evaluation.report.page import write_report
+from drake_safety.evaluation.report.results import read_evaluation
 from drake_safety.evaluation.report.run_folder import read_run
 from drake_safety.learning.beliefs import SAFE, UNSAFE
 from report_runs import (
@@ -298,3 +299,20 @@ def test_a_page_without_what_writes_it_names_the_extra(copy, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
         page_of(copy)
+
+
+@pytest.mark.parametrize(
+    ("key", "estimate", "words"),
+    [
+        ("/elsewhere/x.y", {"value": 1.0, "low": 0.0, "high": 1.0, "n": 1}, "'/elsewhere/x.y'"),
+        ("../../x.y", {"value": 1.0, "low": 0.0, "high": 1.0, "n": 1}, "between dots"),
+        ("x.y", {"value": "much", "low": 0.0, "high": 1.0, "n": 1}, "'x.y' is damaged"),
+        ("x.y", {"value": 1.0, "low": 0.0, "high": 1.0, "n": "Infinity"}, "'x.y' is damaged"),
+    ],
+)
+def test_a_forged_evaluation_is_not_read(tmp_path, key, estimate, words):
+    file = tmp_path / "evaluation.json"
+    file.write_text(json.dumps({key: estimate}))
+    with pytest.raises(ValueError, match=words) as caught:
+        read_evaluation(file)
+    assert str(file) in str(caught.value)

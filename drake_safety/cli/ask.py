@@ -41,7 +41,7 @@ def ask(
     options: dict[str, Any] = {} if hand is None else {"hand": hand}
     loop = loaded.make_loop(assessment=gamma, **options)
     goal = parse_target(loop, target)
-    threshold, unsafe_below, remark = goal_threshold(folder.path, mode, gamma)
+    threshold, unsafe_below, remark = goal_threshold(folder.path, gamma)
     verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=unsafe_below)
     nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
     if as_json:

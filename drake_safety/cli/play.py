@@ -56,7 +56,7 @@ def play(
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session: LiveSession
     if has_goals:
-        rule = goal_threshold(folder.path, mode, gamma)
+        rule = goal_threshold(folder.path, gamma)
         if rule.remark:
             console.print(rule.remark, highlight=False, soft_wrap=True)
         session = LiveGoals(

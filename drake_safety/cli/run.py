@@ -129,7 +129,7 @@ def run(
     )
     print_shipped(learned)
     if target is not None:
-        rule = goal_threshold(learned.path, mode, settings.assessment)
+        rule = goal_threshold(learned.path, settings.assessment)
         if not run_to_target(settings, target, rule, is_forced=force):
             raise typer.Exit(1)
         return

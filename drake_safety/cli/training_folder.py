@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -223,26 +222,19 @@ def check_fresh(
     assessment.check_unused(*seeds)
 
 
-def goal_threshold(folder: Path, mode: str, assessment: SafetyAssessment) -> GoalThreshold:
+def goal_threshold(folder: Path, assessment: SafetyAssessment) -> GoalThreshold:
     """Thresholds of verdicts on goals.
 
     Args:
         folder: Folder of a training.
-        mode: Mode of the assessment.
         assessment: The assessment.
 
     Returns:
-        The thresholds of ``calibrate``; else the threshold that ``evaluate`` chose on its
-        calibration episodes; else the default with a remark.
+        The assessment's thresholds, which `calibrate` chooses; else the default with a remark.
     """
     calibration = assessment.calibrations_.get("plan")
     if calibration is not None:
         return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.promise)
-    file = folder / "evaluation.json"
-    estimates = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    estimate = estimates.get(f"plans.{mode}.threshold")
-    if estimate is not None:
-        return GoalThreshold(float(estimate["value"]), float(estimate["value"]))
     return GoalThreshold(
         DEFAULT_THRESHOLD,
         DEFAULT_THRESHOLD,

@@ -132,7 +132,7 @@ def choose_threshold(
     logs: Sequence[ThrowLog],
     probabilities: Sequence[np.ndarray],
     *,
-    max_false_share: float = 0.025,
+    max_false_share: float = 0.015,
 ) -> float:
     """The highest threshold whose share of false triggers stays within a bound.
 

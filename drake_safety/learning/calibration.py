@@ -28,6 +28,18 @@ PLAN, MOTION = "plan", "motion"
 KINDS = (PLAN, MOTION)
 
 _BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust against rounding.
+_RANGES = {
+    "miss_rate": (0.0, 1.0),
+    "false_alarm_rate": (0.0, 1.0),
+    "confidence": (0.0, 1.0),
+    # Below the lowest score, or above the highest one.
+    "threshold": (-2.0 * _BELOW_ALL, 1.0 + 2.0 * _BELOW_ALL),
+    "unsafe_below": (-2.0 * _BELOW_ALL, 1.0 + 2.0 * _BELOW_ALL),
+    "num_unsafe": (0, np.inf),
+    "num_safe": (0, np.inf),
+    "num_missed": (0, np.inf),
+    "num_accepted": (0, np.inf),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +85,12 @@ class Calibration:
             raise ValueError(
                 f"calibration: unknown kind '{self.kind}'; the kinds are {list(KINDS)}"
             )
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ValueError(
+                    f"calibration: {name} is {value}, expected a value in [{low:g}, {high:g}]"
+                )
         if not self.unsafe_below <= self.threshold:
             raise ValueError(
                 f"calibration: unsafe_below is {self.unsafe_below}, expected at most the threshold "

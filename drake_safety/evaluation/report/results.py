@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from drake_safety.evaluation.metrics import Estimate
+
+_KEY = re.compile(r"[\w-]+(\.[\w-]+)*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +39,20 @@ def read_evaluation(path: Path) -> Results:
         ValueError: The file holds no evaluation.
     """
     content = read_object(path)
-    estimates = {key: as_estimate(value) for key, value in content.items() if is_estimate(value)}
+    estimates = {}
+    for key, value in content.items():
+        if not is_estimate(value):
+            continue
+        # Tables are files named after keys.
+        if not _KEY.fullmatch(key):
+            raise ValueError(
+                f"{path} holds an estimate '{key[:80]}', expected words of letters, digits, '_' "
+                "and '-' between dots"
+            )
+        try:
+            estimates[key] = as_estimate(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{path}: the estimate '{key[:80]}' is damaged: {error}") from error
     if not estimates:
         raise ValueError(f"{path} is no evaluation: it holds no estimate")
     return Results(
@@ -53,7 +69,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds a {type(content).__name__}; expected a JSON object")
