@@ -9,7 +9,7 @@ from drake_safety.simulation.rollouts import episodes_info
 SCENARIO = "atlas_reaching"
 BOUNDARY_M = 0.75
 CAUSE = "collision"
-NEAR, FAR = (0.6, 0.5, 1.05), (0.9, 0.5, 1.05)
+NEAR, FAR = (0.6, 0.5, 1.05), (0.95, 0.5, 1.05)
 
 
 def made_up_episodes(loop):

@@ -90,7 +90,7 @@ def test_an_accepted_target_is_told_with_its_belief_and_ends_with_zero(call, fol
     assert re.search(r"verdict +safe: Γ \d\.\d+ ≥ threshold 0\.400", told)
     assert "belief" in told
     assert "nearest accepted" not in told
-    assert "remark" not in told
+    assert "at most 1 % of unsafe episodes called safe" in told
 
 
 def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call, folder):

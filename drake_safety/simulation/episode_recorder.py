@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, PortDataType
 
 from drake_safety.learning.segments import (
     DIVERGED,
@@ -51,11 +51,12 @@ class Recorder:
         self._times.append(context.get_time() if time_s is None else time_s)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns ``time_s`` (N,) [s], and (N, size) for each port by name."""
-        arrays = {
-            name: np.array([row[name] for row in self._rows]).reshape(len(self._rows), port.size())
-            for name, port in self._ports.items()
-        }
+        """Returns ``time_s`` (N,) [s] and, by name, (N, size) for a vector port, else (N,)."""
+        arrays = {}
+        for name, port in self._ports.items():
+            is_vector = port.get_data_type() == PortDataType.kVectorValued
+            shape = (len(self._rows), port.size()) if is_vector else len(self._rows)
+            arrays[name] = np.array([row[name] for row in self._rows]).reshape(shape)
         return {"time_s": np.array(self._times), **arrays}
 
 
