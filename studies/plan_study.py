@@ -67,7 +67,7 @@ def plan_study(
     learned = assessment_folder(loaded, assessment)
     gamma = load_assessment(learned.path, mode)
     check_fresh(gamma, loaded, (seed,))
-    rule = goal_threshold(learned.path, mode, gamma)
+    rule = goal_threshold(learned.path, gamma)
     print_shipped(learned)
     with open_stages() as stages:
         trials = run_trials(

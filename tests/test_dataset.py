@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import logging
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -20,7 +22,7 @@ def write(path, indices, **options):
 
 
 def names_in(path):
-    return sorted(file.name for file in path.iterdir())
+    return sorted(file.name for file in path.iterdir() if file.name != ".lock")
 
 
 def assert_same_bits(a, b):
@@ -295,6 +297,33 @@ def test_leftover_temporary_files_are_ignored(tmp_path):
     assert completed(tmp_path) == {0}
     write(tmp_path, [1])
     assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+
+
+def test_leftover_temporary_files_are_removed_by_the_next_writer(tmp_path):
+    (tmp_path / ".episodes-00001.parquet.123.tmp").write_bytes(b"PAR1 half")
+    write(tmp_path, [0])
+    assert not list(tmp_path.glob(".*.tmp"))
+
+
+def test_a_folder_has_one_writer_at_a_time(tmp_path):
+    with EpisodeWriter(tmp_path, make_info()) as writer:
+        writer.append(make_episode(0))
+        with pytest.raises(ValueError, match=f"{tmp_path} is being written by another process"):
+            EpisodeWriter(tmp_path, make_info())
+    write(tmp_path, [1])
+    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+
+
+def test_the_lock_of_a_killed_writer_is_gone(tmp_path):
+    lock = f"FileLock({str(tmp_path / '.lock')!r})"
+    code = f"from filelock import FileLock; lock = {lock}; lock.acquire(); "
+    code += "import time; print('locked', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"locked\n"
+        with pytest.raises(ValueError, match="another process"):
+            EpisodeWriter(tmp_path, make_info())
+        process.kill()
+    write(tmp_path, [0])
 
 
 def test_shards_without_an_info_are_refused(tmp_path):

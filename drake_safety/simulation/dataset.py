@@ -7,6 +7,8 @@ complete, and an interrupted run loses at most the episodes that were not flushe
 rows by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
 """
 
+from __future__ import annotations
+
 import contextlib
 import dataclasses
 import itertools
@@ -25,6 +27,7 @@ from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from filelock import BaseFileLock
 
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
@@ -38,8 +41,8 @@ class EpisodeWriter:
     """Appends episodes to a folder, a shard at a time; a context manager.
 
     Leaving the ``with`` block writes the pending episodes, after an exception or Ctrl-C too. A
-    folder that holds episodes is continued: ``completed(path)`` gives their indices. A folder must
-    not have two writers at a time.
+    folder that holds episodes is continued: ``completed(path)`` gives their indices. The folder is
+    locked until the writer is closed or its process ends.
 
     Args:
         path: The folder; made if it does not exist.
@@ -52,7 +55,7 @@ class EpisodeWriter:
         accept_code_change: See :func:`open_folder`.
 
     Raises:
-        ValueError: The folder holds another set of episodes, or something else.
+        ValueError: The folder holds another set of episodes, or something else, or has a writer.
     """
 
     def __init__(
@@ -76,6 +79,18 @@ class EpisodeWriter:
         self._pending: list[Episode] = []
         self._pending_since_s = 0.0
         self._is_closed = False
+        self._lock = _locked(self.path)
+        try:
+            self._open(info, extra, accept_code_change)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _open(
+        self, info: EpisodesInfo, extra: Mapping[str, Any] | None, accept_code_change: bool
+    ) -> None:
+        for left_behind in self.path.glob(".*.tmp"):
+            left_behind.unlink()
         # Before info.json is written: a folder with shards but no info.json is refused.
         self._indices = completed(self.path)
         open_folder(self.path, info, extra, accept_code_change=accept_code_change)
@@ -127,15 +142,35 @@ class EpisodeWriter:
         self._pending = []
 
     def close(self) -> None:
-        """Writes the pending episodes; the writer takes no more."""
-        self.flush()
-        self._is_closed = True
+        """Writes the pending episodes and unlocks the folder; the writer takes no more."""
+        try:
+            self.flush()
+        finally:
+            self._is_closed = True
+            self._lock.release()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _locked(path: Path) -> BaseFileLock:
+    """Makes the folder if it does not exist, and locks it."""
+    from filelock import FileLock, Timeout
+
+    path.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path / ".lock", thread_local=False)
+    try:
+        # The operating system unlocks it when the process ends, however that happens.
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(
+            f"{path} is being written by another process or another EpisodeWriter: wait for it, "
+            "stop it, or choose another folder"
+        ) from None
+    return lock
 
 
 def open_folder(
@@ -302,7 +337,7 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
         _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
 
 
-def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
+def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
     import pyarrow as pa
 
     counts = [len(episode.time_s) for episode in episodes]
@@ -329,7 +364,7 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> "pa.Table":
     return pa.table(columns)
 
 
-def _from_table(table: "pa.Table", info: EpisodesInfo, shard: Path) -> list[Episode]:
+def _from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
     widths = info.widths
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
@@ -397,7 +432,7 @@ def _shard_number(shard: Path) -> int:
     return int(shard.stem.removeprefix("episodes-"))
 
 
-def _read_shard(shard: Path, columns: list[str] | None = None) -> "pa.Table":
+def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
