@@ -449,3 +449,17 @@ def test_the_papers_mode_knows_no_short_segments(episodes):
     learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
     sizes = {assessment.training_score_.shape[-1] for assessment in learned}
     assert sizes == {len(split(few, stride=1, discount=0.99))}
+
+
+def test_parts_of_the_input_that_are_swapped_are_refused_by_name(assessment, held_out):
+    state, preview, features = inputs(held_out)
+    for name, swapped in {
+        "state": (preview, state, features),
+        "desired_preview": (state, np.hstack([preview, preview[:, :1]]), features),
+    }.items():
+        with pytest.raises(ValueError, match=rf"{name} has the shape \({len(state)}, \d+\), exp"):
+            assessment.predict(*swapped)
+    if assessment.parameters.is_sharpened:
+        for wrong in (None, features[:, :-1]):
+            with pytest.raises(ValueError, match=r"features has the shape"):
+                assessment.predict(state, preview, wrong)

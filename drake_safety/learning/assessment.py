@@ -28,7 +28,6 @@ from drake_safety.learning.feedback import (
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.innovation import Innovation
 from drake_safety.learning.inputs import (
-    check_width,
     input_names,
     inputs,
     plan_columns,
@@ -398,7 +397,6 @@ class SafetyAssessment:
         x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
-        check_width(x.shape[1], self.info_, self.parameters)
         with np.errstate(over="ignore", invalid="ignore"):
             is_usable = np.einsum("ij,ij->i", x, x) < INPUT_LIMIT
         return prediction.predict(

@@ -40,17 +40,31 @@ def inputs(
         features: Features, (..., n_f); ignored in the paper's mode.
         info: The episodes' metadata.
         parameters: The assessment's. A feature unit u appends asinh(features / u).
+
+    Raises:
+        ValueError: One of them has another width.
     """
-    state = np.asarray(state, dtype=float)
     is_used = used_states(info, parameters)
-    # A state of another width is refused by `check_width`.
-    if not is_used.all() and state.shape[-1] == len(is_used):
-        state = state[..., is_used]
-    parts = [state, np.asarray(desired_preview, dtype=float)]
-    if features is not None and parameters.is_sharpened:
-        parts.append(np.asarray(features, dtype=float))
-        if parameters.feature_unit:
-            parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
+    widths = {
+        "state": (state, len(is_used)),
+        "desired_preview": (desired_preview, info.horizon * len(info.output_names)),
+    }
+    if parameters.is_sharpened and info.feature_names:
+        given = np.empty(0) if features is None else features
+        widths["features"] = (given, len(info.feature_names))
+    parts = []
+    for name, (values, width) in widths.items():
+        part = np.asarray(values, dtype=float)
+        if part.shape[-1:] != (width,):
+            raise ValueError(
+                f"SafetyAssessment of '{info.scenario}': {name} has the shape {part.shape}, "
+                f"expected {width} columns"
+            )
+        parts.append(part)
+    if not is_used.all():
+        parts[0] = parts[0][..., is_used]
+    if len(parts) == 3 and parameters.feature_unit:
+        parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
     return np.concatenate(parts, axis=-1)
 
 
@@ -71,19 +85,3 @@ def input_names(info: EpisodesInfo, parameters: AssessmentParameters) -> list[st
         names += info.feature_names
         names += [f"asinh {name}" for name in info.feature_names if parameters.feature_unit]
     return names
-
-
-def check_width(num_columns: int, info: EpisodesInfo, parameters: AssessmentParameters) -> None:
-    """Checks the width of x.
-
-    Raises:
-        ValueError: The number of columns is not n_x.
-    """
-    if num_columns != num_inputs(info, parameters):
-        num_features = len(info.feature_names) if parameters.is_sharpened else 0
-        raise ValueError(
-            f"SafetyAssessment of '{info.scenario}': the input has {num_columns} columns, "
-            f"expected {used_states(info, parameters).sum()} of the state, "
-            f"{info.horizon * len(info.output_names)} of the desired preview and "
-            f"{num_features} features{' twice' if parameters.feature_unit else ''}"
-        )
