@@ -1,8 +1,11 @@
 """Live sessions: clicks and sliders, as a browser sends them, and what comes of them."""
 
+import math
 import shutil
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli import main
+from drake_safety.cli.console import LOOPBACK, open_viewer
 from drake_safety.live.panel import UNSAFE_RGB, LivePanel, picture_board, text_picture
 from drake_safety.live.session import (
     PROBABILITY,
@@ -300,3 +304,24 @@ def test_a_browser_shows_the_board_and_its_button_throws_the_ball(throws, tmp_pa
         browser.close()
     assert complaints == []
     assert 0.004 < share < 0.2
+
+
+def test_only_this_machine_reaches_a_page_unless_it_is_asked_for(capsys):
+    here, everywhere = open_viewer(LOOPBACK), open_viewer("0.0.0.0")
+    listening = {
+        line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line
+    }
+    assert f"0100007F:{here.port():04X}" in listening
+    assert f"00000000:{everywhere.port():04X}" in listening
+    assert f"00000000:{here.port():04X}" not in listening
+    with pytest.raises(ValueError, match=rf"no page can be served at {LOOPBACK}:{here.port()}"):
+        open_viewer(LOOPBACK, here.port())
+
+
+@pytest.mark.parametrize("sent", [-1.0, math.nan, math.inf, 1e308])
+def test_what_a_page_sends_stays_within_the_range_of_its_slider(throws, sent):
+    low, high = throws._ranges[throws.MASS]
+    throws.meshcat.SetSliderValue(throws.MASS, 3.0)
+    assert throws._slider(throws.MASS) == 3.0
+    throws.meshcat = SimpleNamespace(GetSliderValue=lambda name: sent)
+    assert low <= throws._slider(throws.MASS) <= high

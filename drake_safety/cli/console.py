@@ -25,6 +25,7 @@ from rich.table import Column, Table
 
 if TYPE_CHECKING:
     import numpy as np
+    from pydrake.geometry import Meshcat
 
     from drake_safety.cli.training_folder import AssessmentFolder
     from drake_safety.evaluation.metrics import Estimate
@@ -54,9 +55,38 @@ TrainingOption = Annotated[
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
 ]
+LOOPBACK = "127.0.0.1"
+"""Address that only this machine reaches."""
+HostOption = Annotated[
+    str,
+    typer.Option(
+        "--host",
+        help="Address that serves the page; 0.0.0.0 for every one of this machine. Whoever reaches "
+        "it can use the controls: there is no password.",
+    ),
+]
 
 # Square brackets are units here, not markup. Output to a file has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
+
+
+def open_viewer(host: str, port: int | None = None) -> Meshcat:
+    """Starts a Meshcat server.
+
+    Args:
+        host: Address that serves the page.
+        port: Its port; a free one by default.
+
+    Raises:
+        ValueError: The server does not start.
+    """
+    from pydrake.geometry import Meshcat, MeshcatParams
+
+    try:
+        return Meshcat(MeshcatParams(host=host, port=port))
+    except RuntimeError as error:
+        place = host if port is None else f"{host}:{port}"
+        raise ValueError(f"no page can be served at {place}: {error}") from error
 
 
 def new_table(*columns: str, title: str | None = None) -> Table:

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
+from drake_safety.cli.console import (
+    LOOPBACK,
+    AssessmentOption,
+    HostOption,
+    ScenarioArgument,
+    console,
+    open_viewer,
+    print_shipped,
+)
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 from drake_safety.learning.seeds import DEMONSTRATION
@@ -29,13 +37,12 @@ def play(
     port: Annotated[
         int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")
     ] = None,
+    host: HostOption = LOOPBACK,
 ) -> None:
     """Run the robot in the browser, in real time, until Stop or Ctrl-C.
 
     Sliders and buttons throw a ball or move the target; Γ, belief and verdict are shown.
     """
-    from pydrake.geometry import Meshcat, MeshcatParams
-
     from drake_safety.live.session import LiveGoals, LiveThrows
     from drake_safety.simulation.capabilities import HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
@@ -52,7 +59,7 @@ def play(
         require(asked, HasBall, "play")
         options["ball"] = True
     print_shipped(folder)
-    meshcat = Meshcat(MeshcatParams() if port is None else MeshcatParams(port=port))
+    meshcat = open_viewer(host, port)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session: LiveSession
     if has_goals:

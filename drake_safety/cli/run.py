@@ -10,7 +10,9 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import (
+    LOOPBACK,
     AssessmentOption,
+    HostOption,
     ScenarioArgument,
     cause_words,
     print_shipped,
@@ -101,6 +103,7 @@ def run(
     meshcat: Annotated[
         bool, typer.Option("--meshcat", help="Show the run live in the browser, in real time.")
     ] = False,
+    host: HostOption = LOOPBACK,
     animation: Annotated[
         bool, typer.Option("--animation", help="Also write animation.gif.")
     ] = False,
@@ -126,6 +129,7 @@ def run(
         folder=(out or learned.out) / "run",
         is_live=meshcat,
         is_animated=animation,
+        host=host,
     )
     print_shipped(learned)
     if target is not None:

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_safety.cli.console import command_line, console, new_table, print_path, versions
+from drake_safety.cli.console import (
+    LOOPBACK,
+    command_line,
+    console,
+    new_table,
+    open_viewer,
+    print_path,
+    versions,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,6 +46,7 @@ class RunSettings:
         folder: Folder of recording and figures.
         is_live: Whether the run is shown in the browser, in real time.
         is_animated: Whether an animation is written.
+        host: Address that serves the page.
     """
 
     scenario: Scenario
@@ -50,6 +59,7 @@ class RunSettings:
     folder: Path
     is_live: bool
     is_animated: bool = False
+    host: str = LOOPBACK
 
     @property
     def realtime_rate(self) -> float:
@@ -80,10 +90,8 @@ class Recording:
     """
 
     def __init__(self, settings: RunSettings):
-        from pydrake.geometry import Meshcat
-
         self._settings = settings
-        self.viewer = Meshcat()
+        self.viewer = open_viewer(settings.host)
         if settings.is_live:
             console.print(f"live at {self.viewer.web_url()}")
 

@@ -89,6 +89,7 @@ class LiveSession(ABC):
         self._seed = seed
         self._num_resets = 0
         self._clicks: dict[str, int] = {}
+        self._ranges: dict[str, tuple[float, float]] = {}
         self._late_s = 0.0
         self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
@@ -141,6 +142,16 @@ class LiveSession(ABC):
         is_new = clicks > self._clicks[name]
         self._clicks[name] = clicks
         return is_new
+
+    def _add_slider(self, name: str, low: float, high: float, step: float, value: float) -> None:
+        self.meshcat.AddSlider(name, low, high, step, value)
+        self._ranges[name] = (low, high)
+
+    def _slider(self, name: str) -> float:
+        """Value of a slider within its range, whatever a page sent."""
+        low, high = self._ranges[name]
+        value = float(self.meshcat.GetSliderValue(name))
+        return min(max(value, low), high) if math.isfinite(value) else low
 
     def _next_rng(self) -> np.random.Generator:
         self._num_resets += 1
@@ -223,9 +234,9 @@ class LiveThrows(LiveSession):
         self._lies_until_s = math.inf
         self._add_button(self.THROW, "Space")
         self._add_button(self.STAND, "KeyR")
-        meshcat.AddSlider(self.MASS, 1.0, 5.0, 0.5, 3.0)
-        meshcat.AddSlider(self.SPEED, 1.0, 11.0, 0.5, 8.0)
-        meshcat.AddSlider(self.DIRECTION, -180.0, 180.0, 15.0, -75.0)
+        self._add_slider(self.MASS, 1.0, 5.0, 0.5, 3.0)
+        self._add_slider(self.SPEED, 1.0, 11.0, 0.5, 8.0)
+        self._add_slider(self.DIRECTION, -180.0, 180.0, 15.0, -75.0)
         self._stand()
 
     def tick(self) -> bool:
@@ -246,9 +257,7 @@ class LiveThrows(LiveSession):
         self._begin()
 
     def _throw(self) -> None:
-        mass, speed, direction = map(
-            self.meshcat.GetSliderValue, (self.MASS, self.SPEED, self.DIRECTION)
-        )
+        mass, speed, direction = map(self._slider, (self.MASS, self.SPEED, self.DIRECTION))
         throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
         try:
             self._thrown.throw_ball(self.context, throw, _FLIGHT_S)
@@ -317,7 +326,7 @@ class LiveGoals(LiveSession):
         ):
             self._add_button(name, key)
         for name, low, high, value in zip(self.AXES, *box.tolist(), start, strict=True):
-            meshcat.AddSlider(name, low, high, 0.01, value)
+            self._add_slider(name, low, high, 0.01, value)
         radius_m = 0.03 * self._size_m
         meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*INK_RGB, 0.8))
         meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*SAFE_RGB, 0.8))
@@ -326,7 +335,7 @@ class LiveGoals(LiveSession):
 
     def tick(self) -> bool:
         """Assesses a target that was moved, starts a motion if requested, and shows the verdict."""
-        goal = np.array([self.meshcat.GetSliderValue(name) for name in self.AXES])
+        goal = np.array([self._slider(name) for name in self.AXES])
         is_asked = self._is_clicked(self.ASK)
         is_to_go, is_forced = self._is_clicked(self.GO), self._is_clicked(self.FORCE)
         if self._is_clicked(self.STAND):
