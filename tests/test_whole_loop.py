@@ -67,11 +67,18 @@ def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
     ports = ("safety_probability", "normalized_safety_probability", "belief")
     log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=1.0, ports=ports)
     result = assessment.predict(log.state, log.desired_preview, log.features)
+    # Outside the safe set nothing is safe.
+    is_outside = log.margins.min(axis=1) < 0.0
+    assert is_outside.any() and not is_outside.all()
+    belief = result.belief.copy()
+    belief[is_outside, 1] += belief[is_outside, 0]
+    belief[is_outside, 0] = 0.0
+    inside = ~is_outside[:, None]
     # A row shows the state before the updates of its instant: Γ of a row is published in the next.
     for name, expected in (
-        ("safety_probability", result.safety_probability[:, None]),
-        ("normalized_safety_probability", result.normalized[:, None]),
-        ("belief", result.belief),
+        ("safety_probability", result.safety_probability[:, None] * inside),
+        ("normalized_safety_probability", result.normalized[:, None] * inside),
+        ("belief", belief),
     ):
         np.testing.assert_allclose(log.extra[name][1:], expected[:-1], atol=1e-5)
     assert np.ptp(result.normalized) > 0.5
