@@ -357,9 +357,9 @@ sys.exit(", ".join(heavy & set(sys.modules)) or 0)
 
 def test_inputs_of_another_width_are_refused_with_the_expected_one(assessment, held_out):
     state, preview, features = inputs(held_out)
-    with pytest.raises(ValueError, match=r"of 'lip': the input has .* expected 6 of the state"):
+    with pytest.raises(ValueError, match=r"of 'lip': state has the shape .* expected 6 columns"):
         assessment.predict(state[:, 1:], preview, features)
-    with pytest.raises(ValueError, match="expected 6 of the state"):
+    with pytest.raises(ValueError, match="expected 6 columns"):
         assessment.predict_one(state[0, 1:], preview[0], features[0])
 
 

@@ -89,6 +89,17 @@ def test_who_sees_the_same_later_has_that_much_less_time():
     assert late["monitoring.sharpened.detected"].value == 1 / 4
 
 
+def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
+    blow = [motion_of(0, {1.0: np.nan, 1.1: 1.0})]
+    one, two = (
+        evaluate_alarms([seen()], CALM, [*TEST, *blow], num_rows=n).estimates for n in (1, 2)
+    )
+    leads = [found["monitoring.sharpened.lead_to_fall_s"].value for found in (one, two)]
+    assert leads[0] - leads[1] == pytest.approx(0.1)
+    false = [found["monitoring.sharpened.false_alarm_share"].value for found in (one, two)]
+    assert false == [2 / 3, 1 / 3]
+
+
 def test_false_alarms_are_counted_once_a_motion_over_all_hours():
     estimates = figures_of(seen()).estimates
     assert estimates["monitoring.sharpened.false_alarm_share"].value == 1 / 2

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, PortDataType
 from pydrake.systems.primitives import ConstantVectorSource, LinearSystem
 
 from cart_episodes import ARRAYS
@@ -144,6 +144,9 @@ class Refusing:
 
     def size(self):
         return 2
+
+    def get_data_type(self):
+        return PortDataType.kVectorValued
 
 
 def test_margins_are_those_of_their_row():

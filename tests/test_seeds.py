@@ -2,12 +2,9 @@
 
 import dataclasses
 import inspect
-import json
 from itertools import combinations
 
 import pytest
-from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
 
 from drake_safety.cli import adapt, calibrate, evaluate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
@@ -21,7 +18,6 @@ from drake_safety.learning.seeds import (
     CALIBRATION,
     DEMONSTRATION,
     NOT_DRAWN,
-    TRAINING,
     UsedEpisodes,
     check_unused,
 )
@@ -145,22 +141,3 @@ def test_who_is_judged_has_not_seen_the_episodes(assessment):
             evaluate_episodes([gamma], calibration, test)
     stranger = Scorer(name="stranger", probability=gamma.probability)
     evaluate_episodes([stranger], make_episodes(20, seed=30), fresh)
-
-
-def test_a_file_of_an_earlier_version_tells_what_its_other_entries_know(assessment, tmp_path):
-    calibrated(assessment, 30)
-    path = tmp_path / "gamma.safetensors"
-    assessment.save(path)
-    with safe_open(path, framework="numpy") as file:
-        metadata = file.metadata()
-    numbers = json.loads(metadata["numbers"])
-    del numbers["used"]
-    numbers["calibrations"][0]["seed"] = 30
-    save_file(load_file(path), path, metadata | {"numbers": json.dumps(numbers)})
-    loaded = SafetyAssessment.load(path)
-    assert [(one.purpose, one.seed) for one in loaded.used_] == [
-        ("training", TRAINING.first),
-        ("calibration", 30),
-    ]
-    with pytest.raises(ValueError, match="as the 'nominal' episodes of its training"):
-        loaded.check_unused(0)

@@ -12,6 +12,7 @@ from drake_safety.cli.training_folder import fresh_episodes_folder
 if TYPE_CHECKING:
     from drake_safety.simulation.watched_motion import WatchedMotion
 
+_NUM_ROWS = 2  # Below the threshold: a blow itself can make one row "don't know".
 _PLANT = "actual"
 
 
@@ -96,7 +97,7 @@ def evaluate_monitoring(
         *(scorer_alarm(scorer) for scorer in judged.classifiers),
         *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]
-    study = evaluate_alarms(alarms, calibration, test)
+    study = evaluate_alarms(alarms, calibration, test, num_rows=_NUM_ROWS)
     return Findings(
         estimates=study.estimates,
         pictures=save(monitoring_figure(study), judged.folder / "monitoring"),

@@ -90,6 +90,18 @@ def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
     return float(value.min(initial=math.inf))
 
 
+def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
+    """The largest of each value and those before it, (N,); NaN is minus infinity.
+
+    Args:
+        value: Value of each row, (N,).
+        num_rows: Number of values, of which those before the first are infinite.
+    """
+    value = np.where(np.isnan(value), -math.inf, value)
+    padded = np.concatenate([np.full(num_rows - 1, math.inf), value])
+    return np.lib.stride_tricks.sliding_window_view(padded, num_rows).max(axis=1)
+
+
 def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
     """The highest threshold with which at most a share of motions has an alarm.
 
@@ -133,6 +145,7 @@ def evaluate_alarms(
     test: Sequence[WatchedMotion],
     *,
     false_alarm_share: float = FALSE_ALARM_SHARE,
+    num_rows: int = 1,
 ) -> MonitoringStudy:
     """Compares alarms at the same share of false alarms on calibration motions.
 
@@ -143,6 +156,7 @@ def evaluate_alarms(
         calibration: Motions on which thresholds are chosen.
         test: Fresh motions.
         false_alarm_share: Allowed share of safe calibration motions with a false alarm.
+        num_rows: Successive rows below the threshold that give an alarm.
 
     Raises:
         ValueError: No calibration motion stays safe, or the share is out of range.
@@ -154,9 +168,11 @@ def evaluate_alarms(
     estimates = _motion_estimates(judged, len(test))
     thresholds, scores, leads = {}, {}, {}
     for alarm in alarms:
-        lowest = np.array([lowest_value(motion, alarm.value(motion)) for motion in calm])
+        lowest = np.array(
+            [lowest_value(one, persisting(alarm.value(one), num_rows)) for one in calm]
+        )
         threshold = equal_share_threshold(lowest, false_alarm_share)
-        values = [alarm.value(motion) for motion in judged]
+        values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
         found, lead_s = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)

@@ -161,8 +161,8 @@ class AssessmentParameters:
             one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
         initialization: Initial points of t-SNE: "spectral", which keeps the global order, or
             "random".
-        novelty_rate: Share of safe episodes in which an input may exceed a limit of novelty, see
-            `novelty.Novelty`.
+        novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may
+            exceed a limit of novelty, see `novelty.Novelty`.
         seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments per training step.

@@ -125,15 +125,16 @@ class Novelty:
     ) -> Novelty:
         """Computes the moments of training inputs and chooses the limits.
 
-        Each limit is exceeded somewhere in at most a share of `rate` of the safe episodes, each
-        judged by the moments of other episodes. Unsafe ones do not count: they lead out of what is
+        Each limit is exceeded by at most a share of `rate` of the first inputs, which are as drawn,
+        and somewhere in at most that share of the safe episodes, each judged by the moments of
+        other episodes. Later inputs of unsafe episodes do not count: they lead out of what is
         known.
 
         Args:
-            x: Inputs, (N, n_x).
+            x: Inputs, those of an episode in the order of time, (N, n_x).
             episode: Episode of each, (N,).
             is_unsafe: Whether it ended unsafely, (N,).
-            rate: Share of safe episodes with a novel input, in (0, 1).
+            rate: Share of episodes with a novel input, in (0, 1).
             plan: The plan's columns of x.
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
@@ -145,12 +146,15 @@ class Novelty:
                     training=Moments.of(x[~is_part]), limits=np.ones(NUM_DISTANCES), plan=plan
                 )
                 distances[is_part] = others.distances(x[is_part])
-        counted = ~is_unsafe if not is_unsafe.all() else np.ones(len(x), dtype=bool)
-        _, position = np.unique(episode[counted], return_inverse=True)
-        farthest = np.zeros((position.max() + 1, NUM_DISTANCES))
-        np.maximum.at(farthest, position, distances[counted])
+        first = np.unique(episode, return_index=True)[1]
+        limits = np.quantile(distances[first], 1.0 - rate, axis=0, method="higher")
+        if not is_unsafe.all():
+            _, position = np.unique(episode[~is_unsafe], return_inverse=True)
+            farthest = np.zeros((position.max() + 1, NUM_DISTANCES))
+            np.maximum.at(farthest, position, distances[~is_unsafe])
+            of_safe = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
+            limits = np.maximum(limits, of_safe)
         whole = cls(training=Moments.of(x), limits=np.ones(NUM_DISTANCES), plan=plan)
-        limits = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
         num_redundancies = whole._whitenings[1].shape[1]
         least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
         return cls(training=whole.training, limits=np.maximum(limits, least), plan=plan)
