@@ -12,7 +12,7 @@ from typing import Any
 
 from drake_safety.evaluation.metrics import Estimate
 
-_KEY = re.compile(r"[\w-]+(\.[\w-]+)*")
+_KEY = re.compile(r"[\w -]+(\.[\w -]+)*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ def read_evaluation(path: Path) -> Results:
         # Tables are files named after keys.
         if not _KEY.fullmatch(key):
             raise ValueError(
-                f"{path} holds an estimate '{key[:80]}', expected words of letters, digits, '_' "
+                f"{path} holds an estimate '{key[:80]}', expected letters, digits, spaces, '_' "
                 "and '-' between dots"
             )
         try:
