@@ -1,5 +1,6 @@
 """Balancing: a legged robot moves its base over its feet along a plan, with recovery steps."""
 
+import math
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -68,6 +69,7 @@ class Balancing(LeggedLoop):
         parameters = scenario.parameters
         # Assessor, trigger, step planner and controller update in this order in one plant step.
         tick_offset_s = 0.25 * scenario.time_step_s
+        self._control_offset_s = 3 * tick_offset_s
         builder = DiagramBuilder()
 
         has_ball = parameters.push.share > 0 if ball is None else ball
@@ -89,8 +91,7 @@ class Balancing(LeggedLoop):
                     kinematics,
                     parameters.recovery.step,
                     threshold=parameters.recovery.threshold,
-                    # A probability from outside triggers at once: its source has judged it.
-                    persistence_s=parameters.recovery.persistence_s if assessment else 0.0,
+                    persistence_s=parameters.recovery.persistence_s,
                     period_s=scenario.control_period_s,
                     offset_s=tick_offset_s,
                     horizon=scenario.assessment.horizon,
@@ -119,7 +120,7 @@ class Balancing(LeggedLoop):
                 kinematics,
                 np.array(stiffness),
                 period_s=scenario.control_period_s,
-                offset_s=3 * tick_offset_s,
+                offset_s=self._control_offset_s,
             ),
         )
         self._controller = controller
@@ -133,7 +134,12 @@ class Balancing(LeggedLoop):
         )
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
-        self._watch(builder, safe_set, outlook=desired["desired_outlook"])
+        self._watch(
+            builder,
+            safe_set,
+            outlook=desired["desired_outlook"],
+            servo_command=controller.GetOutputPort("desired_joint_state"),
+        )
         assessor = self._export_robot(
             builder,
             assessment_period_s=parameters.recovery.assessment_period_s,
@@ -143,10 +149,8 @@ class Balancing(LeggedLoop):
             meshcat=meshcat,
         )
         if assessor is not None and recovery:
-            builder.Connect(
-                assessor.GetOutputPort(self.trigger_port),
-                switch.GetInputPort("safety_probability"),
-            )
+            for name, port in (("safety_probability", self.trigger_port), ("belief", "belief")):
+                builder.Connect(assessor.GetOutputPort(port), switch.GetInputPort(name))
         elif recovery:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
         self.finish(builder)
@@ -204,6 +208,23 @@ class Balancing(LeggedLoop):
     def _begin(self, context: Context, rng: np.random.Generator, start: EpisodeStart) -> None:
         self._enter(context, start)
         self._observers.reseed(context, rng)
+        self.start_control(context)
+
+    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
+        """Sets the plan and keeps the state; see `PlannedLoop.set_plan`."""
+        super().set_plan(context, plan)
+        if context.get_time() == 0.0:  # Nothing was commanded yet.
+            self.start_control(context)
+
+    def start_control(self, context: Context) -> None:
+        """Sets the command that the controller holds at the Context's time; see `LeggedLoop`."""
+        time_s, period_s = context.get_time(), self.scenario.control_period_s
+        num_periods = math.ceil((time_s - self._control_offset_s) / period_s) - 1
+        if num_periods >= 0:
+            context.SetTime(num_periods * period_s + self._control_offset_s)
+        self._controller.start(self._controller.GetMyMutableContextFromRoot(context))
+        if num_periods >= 0:
+            context.SetTime(time_s)
 
     def _output_of(self, q: np.ndarray) -> np.ndarray:
         return q[4:7]

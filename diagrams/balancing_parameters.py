@@ -29,7 +29,8 @@ class RecoveryParameters:
     is_normalized: bool = True
     """Whether the threshold is on b_safe / (1 - μ), or on b_safe as in the paper."""
     persistence_s: float = 0.02
-    """Time for which Γ must have been below Γ_thre [s]: two assessments. The paper has none."""
+    """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known Γ
+    triggers at once. The paper has neither."""
     assessment_period_s: float = 0.02
     """Time between two evaluations of Γ [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)

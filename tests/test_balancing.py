@@ -388,7 +388,7 @@ def test_during_recovery_features_and_preview_tell_of_the_same_plan():
     context = simulator.get_mutable_context()
     loop.reset(context, np.random.default_rng(0))
     loop.GetInputPort("safety_probability").FixValue(context, [0.0])
-    observer = loop.GetSubsystemByName("assessor_observer")
+    observer = loop._assessor_observer
     safe_set = BalanceSafeSet(loop.kinematics, loop.scenario.parameters.safe_set)
     num_active = 0
     for time in np.arange(0.05, 0.6, 0.05):
@@ -444,3 +444,47 @@ def test_plans_to_choose_from_end_over_the_same_point_as_high_and_as_late_as_tra
         assert bounds[0] <= np.min(values) < np.max(values) <= bounds[1]
     for plan in others:
         np.testing.assert_allclose(plan.value(0.0), default.value(0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_servo_load_is_what_is_commanded_minus_what_is_measured(name):
+    loop = standing_loop(name)
+    joints = loop.kinematics.joint_names
+    assert loop.feature_names[-len(joints) :] == [f"servo_load_{joint}" for joint in joints]
+    simulator, context = started(loop)
+    controller = loop.GetSubsystemByName("inverse_kinematics_controller")
+    # Without noise there is one observer for controller and assessor.
+    observer = loop.GetSubsystemByName("observer")
+
+    def expected():
+        command = controller.GetOutputPort("desired_joint_state").Eval(
+            controller.GetMyContextFromRoot(context)
+        )
+        measured = observer.GetOutputPort("measured_plant_state").Eval(
+            observer.GetMyContextFromRoot(context)
+        )
+        return command[: len(joints)] - measured[7 : 7 + len(joints)]
+
+    for time in (0.0, 0.5):
+        simulator.AdvanceTo(time)
+        load = loop.GetOutputPort("features").Eval(context)[-len(joints) :]
+        np.testing.assert_allclose(load, expected(), atol=1e-12)
+    # At rest the servos carry the robot: load times stiffness is the static torque.
+    assert np.abs(load).max() > 1e-3
+
+
+def test_a_reset_and_a_new_plan_before_the_start_command_what_the_start_does():
+    loop = load_scenario("laikago_balancing").make_loop(ball=False)
+    context = loop.CreateDefaultContext()
+    features = loop.GetOutputPort("features")
+
+    def started_features():
+        simulator = Simulator(loop, context.Clone())
+        simulator.Initialize()
+        return features.Eval(simulator.get_context())
+
+    loop.reset(context, np.random.default_rng(1))
+    np.testing.assert_array_equal(features.Eval(context), started_features())
+    plans = loop.candidate_plans(context, np.random.default_rng(2), 2)
+    loop.set_plan(context, plans[1])
+    np.testing.assert_array_equal(features.Eval(context), started_features())

@@ -84,9 +84,10 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
         change = adapted.correction_.change
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
-        # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
+        # A twin of a log draws noise of its own, its plan is another polynomial between rows, and
+        # servo loads are solved for anew.
         np.testing.assert_allclose(
-            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.01)
+            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.15 * changed, 0.015)
         )
         np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 

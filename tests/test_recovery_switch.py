@@ -64,6 +64,7 @@ def test_it_exports_the_promised_ports():
     outputs = {switch.get_output_port(i).get_name() for i in range(switch.num_output_ports())}
     assert inputs == {
         "safety_probability",
+        "belief",
         "plant_state",
         "nominal_desired_output",
         "nominal_desired_preview",

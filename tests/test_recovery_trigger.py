@@ -11,19 +11,22 @@ from pydrake.systems.primitives import ConstantVectorSource, PortSwitch
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 PERIOD_S = 0.01
+EMPTY = (0.0, 0.0, 1.0)
 
 
 class Bench:
     """A trigger alone; `look` lets one period pass."""
 
-    def __init__(self, probability=1.0, **options):
+    def __init__(self, probability=1.0, belief=None, **options):
         self.trigger = RecoveryTrigger(**{"period_s": PERIOD_S} | options)
         self.simulator = Simulator(self.trigger)
         self.context = self.simulator.get_mutable_context()
-        self.set(probability)
+        self.set(probability, belief=belief)
 
-    def set(self, probability, done=None):
+    def set(self, probability, *, belief=None, done=None):
         self.trigger.GetInputPort("safety_probability").FixValue(self.context, [probability])
+        if belief is not None:
+            self.trigger.GetInputPort("belief").FixValue(self.context, belief)
         if done is not None:
             self.trigger.GetInputPort("recovery_done").FixValue(self.context, [done])
 
@@ -52,15 +55,19 @@ def test_it_fires_below_the_threshold_and_when_nothing_is_known(probability, fir
     assert Bench(probability).look() == fires
 
 
-def test_with_a_persistence_gamma_must_stay_below_for_that_long():
-    bench = Bench(0.0, persistence_s=2 * PERIOD_S)
+def test_with_a_persistence_dont_know_must_last_that_long_and_danger_fires_at_once():
+    bench = Bench(0.0, belief=EMPTY, persistence_s=2 * PERIOD_S)
     assert [bench.look() for _ in range(3)] == [False, False, True]
-    bench = Bench(0.0, persistence_s=2 * PERIOD_S)
+    bench = Bench(0.0, belief=EMPTY, persistence_s=2 * PERIOD_S)
     bench.look(2)
-    bench.set(1.0)
+    bench.set(1.0, belief=(0.7, 0.0, 0.3))
     assert not bench.look()
-    bench.set(0.0)
+    bench.set(0.0, belief=EMPTY)
     assert [bench.look() for _ in range(3)] == [False, False, True]
+    known = (0.1, 0.6, 0.3)
+    assert Bench(0.1, belief=known, persistence_s=2 * PERIOD_S).look()
+    # Without the port every Γ is known.
+    assert Bench(0.0, persistence_s=2 * PERIOD_S).look()
 
 
 def test_a_negative_persistence_is_refused():

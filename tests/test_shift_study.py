@@ -134,6 +134,11 @@ def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     np.testing.assert_array_equal(np.sort(shuffled, axis=0), np.sort(plain, axis=0))
     kept = np.concatenate([one.state for one in found["plan of another row"].motions])
     np.testing.assert_array_equal(kept, plain)
+    # Noise makes every row unique: none is taken from its own motion.
+    for own, changed in zip(
+        nominal.motions[:20], found["state of another row"].motions, strict=True
+    ):
+        assert not np.isin(changed.state[:, 0], own.state[:, 0]).any()
     judges = {"gamma": assessment_judge(assessment)}
     result = evaluate_shift(found["columns shuffled"], assessment, judges).estimates
     assert result["gamma.unknown"].value > 0.9

@@ -155,13 +155,14 @@ def test_a_probability_that_is_not_known_triggers():
     assert throw_study.trigger_time(log, probability, 0.1) == TIME_S[0]
 
 
-def test_with_a_persistence_one_low_row_triggers_nothing_and_two_do():
+def test_with_a_persistence_one_unknown_row_triggers_nothing_two_do_and_danger_does_at_once():
     log = log_of(0)
 
-    def trigger(low, persistence_s):
+    def trigger(low, persistence_s, *, is_known=False):
         values = np.ones(len(TIME_S))
-        values[low] = np.nan
-        scorer = Scorer(name="given", probability=lambda *_: values)
+        values[low] = 0.0
+        known = (values > 0.0) | is_known
+        scorer = Scorer(name="given", probability=lambda *_: values, is_known=lambda *_: known)
         probability = throw_study.log_probability(log, scorer, persistence_s)
         return throw_study.trigger_time(log, probability, 0.6)
 
@@ -170,3 +171,4 @@ def test_with_a_persistence_one_low_row_triggers_nothing_and_two_do():
     assert trigger([7, 9, 10], 0.02) == TIME_S[10]
     assert trigger([0, 1], 0.02) == TIME_S[1]
     assert math.isnan(trigger([0, 1], 0.04))
+    assert trigger([7], 0.02, is_known=True) == TIME_S[7]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
-from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment import Assessments, SafetyAssessment
+from drake_safety.learning.beliefs import UNCERTAINTY
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
 
@@ -24,12 +25,14 @@ class Scorer:
         name: Its key in tables.
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
             (N, n_f); NaN for "don't know".
+        is_known: Whether anything is known of the same inputs, (N,); None if it always is.
         uses_true_state: Whether it takes the state without noise in nominal episodes.
         used: Episodes used to train, calibrate or adapt it.
     """
 
     name: str
     probability: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    is_known: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     uses_true_state: bool = False
     used: Sequence[UsedEpisodes] = ()
 
@@ -50,18 +53,25 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
             "don't know".
     """
 
-    def probability(
+    def predict(
         state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
-    ) -> np.ndarray:
-        result = assessment.predict(
+    ) -> Assessments:
+        return assessment.predict(
             state, desired_preview, features if assessment.uses_features else None
         )
-        probability: np.ndarray = getattr(result, published)
-        return probability
+
+    def probability(*inputs: np.ndarray) -> np.ndarray:
+        found: np.ndarray = getattr(predict(*inputs), published)
+        return found
+
+    def is_known(*inputs: np.ndarray) -> np.ndarray:
+        known: np.ndarray = predict(*inputs).belief[:, UNCERTAINTY] < 1.0
+        return known
 
     return Scorer(
         name=name,
         probability=probability,
+        is_known=is_known,
         uses_true_state=not assessment.parameters.is_sharpened,
         used=assessment.used_,
     )

@@ -191,8 +191,10 @@ def _rows_of(loop: ClosedLoop, contexts: Sequence) -> Motion:
 def junk(motions: Sequence[Motion], seed: int) -> dict[str, ShiftedSet]:
     """Inputs that contradict themselves, in which no robot can be.
 
+    "Another row" is one of another motion: those of the same motion may agree with each other.
+
     Args:
-        motions: Nominal motions.
+        motions: Nominal motions, at least two.
         seed: Seed of the permutations.
     """
     rng = np.random.default_rng(seed)
@@ -214,6 +216,8 @@ def junk(motions: Sequence[Motion], seed: int) -> dict[str, ShiftedSet]:
         },
     }
     order = rng.permutation(len(motion))
+    while (is_own := motion[order] == motion).any():
+        order[is_own] = rng.integers(len(motion), size=int(is_own.sum()))
     for name, what in zip(SEEN, ("state", "plan", "features"), strict=True):
         if rows[name].shape[1]:
             changed[f"{what} of another row"] = {name: rows[name][order]}
@@ -457,7 +461,7 @@ def _monitored(
     if promise is not None:
         accepted = _first_probability(assessment, motions) >= promise.threshold
     delay, errors = [], {span: [] for span in SPANS_S}  # type: ignore[var-annotated]
-    missed = num_unsafe = 0
+    counts = np.zeros((0, 2))  # Missed and unsafe motions of each sequence.
     starts = np.linspace(0, len(motions), min(_MOST_STARTS, len(motions)), endpoint=False)
     for start in starts.astype(int):
         order, rows = [], 0
@@ -476,10 +480,9 @@ def _monitored(
         for span in SPANS_S:
             errors[span].append(wrong[: round(span / step_s)].mean())
         begins = np.concatenate([[0], np.cumsum([len(x[i]) for i in order])[:-1]])
-        for i, begin in zip(order, begins, strict=True):
-            if motions[i].is_unsafe:
-                num_unsafe += 1
-                missed += bool(accepted[i] and begin < alarm)
+        is_unsafe = np.array([motions[i].is_unsafe for i in order])
+        is_missed = is_unsafe & accepted[order] & (begins < alarm)
+        counts = np.vstack([counts, [is_missed.sum(), is_unsafe.sum()]])
     found = {
         f"monitor.confident_error_{span:g}s": _mean(np.array(values))
         for span, values in errors.items()
@@ -487,8 +490,13 @@ def _monitored(
     found["monitor.delay_s"] = _quantile(np.array(delay), 0.5)
     found["monitor.delay_95_s"] = _quantile(np.array(delay), 0.95)
     found["monitor.alarmed"] = proportion(int(np.isfinite(delay).sum()), len(delay))
-    if promise is not None and num_unsafe:
-        found["monitor.missed"] = Estimate.exact(missed / num_unsafe, len(starts))
+    if promise is not None and counts[:, 1].any():
+
+        def missed_share(weight: np.ndarray) -> float:
+            num_missed, num_unsafe = weight @ counts
+            return float(num_missed / num_unsafe) if num_unsafe else np.nan
+
+        found["monitor.missed"] = _BOOTSTRAP.over_episodes(missed_share, np.arange(len(counts)))
     return found
 
 

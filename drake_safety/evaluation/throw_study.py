@@ -113,19 +113,22 @@ class ThrowStudy:
 
 
 def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
-    """Highest safety probability of a scorer within a time, at every row of a log, (N,).
+    """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
 
     Args:
         log: The log.
         scorer: The scorer.
-        persistence_s: The time up to each row [s]; before it has passed the probability is 1.
+        persistence_s: Where nothing is known, the highest probability within this time counts [s];
+            before it has passed, 1.
     """
-    probability = scorer.probability(log.state, log.desired_preview, log.features)
-    if len(probability) < 2 or not persistence_s:
+    inputs = (log.state, log.desired_preview, log.features)
+    probability = np.nan_to_num(scorer.probability(*inputs), nan=0.0)
+    if len(probability) < 2 or not persistence_s or scorer.is_known is None:
         return probability
     num_waited = math.ceil(persistence_s / (log.time_s[1] - log.time_s[0]) - 1e-6)
-    padded = np.concatenate([np.ones(num_waited), np.nan_to_num(probability, nan=0.0)])
-    return np.lib.stride_tricks.sliding_window_view(padded, num_waited + 1).max(axis=1)
+    padded = np.concatenate([np.ones(num_waited), probability])
+    highest = np.lib.stride_tricks.sliding_window_view(padded, num_waited + 1).max(axis=1)
+    return np.where(scorer.is_known(*inputs), probability, highest)
 
 
 def choose_threshold(
@@ -185,7 +188,7 @@ def evaluate_throws(
         num_calibration: Number of calibration throws, for thresholds that are None.
         seed: Seed of the test throws.
         calibration_seed: Seed of the calibration throws.
-        persistence_s: Time for which a probability must have been below the threshold [s].
+        persistence_s: Time for which "don't know" must have lasted to trigger [s].
         variation: Variation of the plant.
         num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.

@@ -21,6 +21,8 @@ innovations, and their two charts."""
 _NUM_FOLDS = 3
 _HIDDEN = (128, 128)
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
+_TRIMMED = 0.1  # Share of the largest errors left out of their covariance, such as impacts.
+_TRIMMINGS = 4
 _CLIP_SHARE = 0.99  # Of innovations that are not clipped, so that one impact is no lasting change.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL = 0.1  # Share of the blocks in the tail.
@@ -200,7 +202,7 @@ class Innovation:
                 errors[i] = _errors(predictor, x[i], num_states)
                 distances[i] = known.of(x[i][1:])
         whole = np.concatenate(errors)
-        offset, whitening = _whitening(whole)
+        offset, whitening = _trimmed_whitening(whole)
         norm = np.linalg.norm((whole - offset) @ whitening, axis=1)
         distance = np.concatenate(distances)
         summed = np.stack([distance, np.minimum(norm, np.quantile(norm, _CLIP_SHARE))])
@@ -528,6 +530,15 @@ def _whitening(values: np.ndarray, *, is_centred: bool = False) -> tuple[np.ndar
     root = np.linalg.cholesky(np.linalg.inv(found.covariance_ + ridge))
     mean = np.zeros(len(scale)) if is_centred else found.location_ * scale
     return mean, root / scale[:, None]
+
+
+def _trimmed_whitening(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same without the largest values, which would hide a change of the others."""
+    mean, whitening = _whitening(values)
+    for _ in range(_TRIMMINGS):
+        norm = np.linalg.norm((values - mean) @ whitening, axis=1)
+        mean, whitening = _whitening(values[norm <= np.quantile(norm, 1.0 - _TRIMMED)])
+    return mean, whitening
 
 
 def _averaged(values: np.ndarray, rate: float) -> np.ndarray:

@@ -200,3 +200,5 @@ def _set_state(loop: LeggedLoop, context: Context, time_s: float, state: np.ndar
     context.SetTime(float(time_s))
     plant_context = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)
+    # What the robot was commanded is not logged: the loop's own controller says it.
+    loop.start_control(context)

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
+from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, Multiplexer
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.physics import Physics, Scene, add_physics
@@ -148,8 +148,20 @@ class LeggedLoop(PlannedLoop):
         safe_set: LeggedSafeSet,
         *,
         outlook: OutputPort | None = None,
+        servo_command: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features; see :meth:`_add_safe_set`."""
+        """Adds monitor and features; see :meth:`_add_safe_set`.
+
+        Features after those of the safe set are gravity in the plane of the feet and, with position
+        servos, the servos' load.
+
+        Args:
+            builder: The diagram's builder.
+            safe_set: The safe set.
+            outlook: Port of the outlook.
+            servo_command: Port of the joints' commanded positions and rates, (2 n_j,); None without
+                servos.
+        """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self._rate_features = safe_set.rate_features
@@ -162,9 +174,10 @@ class LeggedLoop(PlannedLoop):
             outlook=outlook,
         )
         self._add_gravity(builder)
+        if servo_command is not None:
+            self._add_servo_load(builder, servo_command)
 
     def _add_gravity(self, builder: DiagramBuilder) -> None:
-        """Appends gravity in the plane of the feet to the features."""
         system = builder.AddNamedSystem(
             "gravity_features", GravityFeatures(self.kinematics, mirror=self._observers.mirror)
         )
@@ -174,12 +187,37 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(gravity.get_output_port(), system.GetInputPort("gravity"))
         measured = self._assessor_observer.GetOutputPort("measured_plant_state")
         builder.Connect(measured, system.GetInputPort("plant_state"))
-        parts = (self._features, system.GetOutputPort("features"))
-        features = builder.AddNamedSystem("features", Multiplexer([port.size() for port in parts]))
-        for i, port in enumerate(parts):
-            builder.Connect(port, features.get_input_port(i))
+        self._append_features(builder, system.GetOutputPort("features"), system.feature_names)
+
+    def _add_servo_load(self, builder: DiagramBuilder, command: OutputPort) -> None:
+        """Appends commanded minus measured joint positions, to which loads are proportional."""
+        names = self.kinematics.joint_names
+        measured = self._assessor_observer.GetOutputPort("measured_plant_state")
+        difference = builder.AddNamedSystem("servo_load", Adder(2, len(names)))
+        for i, (name, port, first, sign) in enumerate(
+            (
+                ("commanded_joints", command, 0, 1.0),
+                ("measured_joints", measured, NUM_BASE_POSITIONS, -1.0),
+            )
+        ):
+            joints = np.zeros((len(names), port.size()))
+            joints[:, first : first + len(names)] = sign * np.eye(len(names))
+            part = builder.AddNamedSystem(name, MatrixGain(joints))
+            builder.Connect(port, part.get_input_port())
+            builder.Connect(part.get_output_port(), difference.get_input_port(i))
+        self._append_features(
+            builder, difference.get_output_port(), [f"servo_load_{name}" for name in names]
+        )
+
+    def _append_features(self, builder: DiagramBuilder, port: OutputPort, names: list[str]) -> None:
+        parts = (self._features, port)
+        features = builder.AddNamedSystem(
+            f"features_to_{names[-1]}", Multiplexer([part.size() for part in parts])
+        )
+        for i, part in enumerate(parts):
+            builder.Connect(part, features.get_input_port(i))
         self._features = features.get_output_port(0)
-        self.feature_names = self.feature_names + system.feature_names
+        self.feature_names = self.feature_names + names
 
     def _export_robot(
         self,
@@ -217,6 +255,7 @@ class LeggedLoop(PlannedLoop):
         self._observers.reseed(context, rng)
         if rng is None:
             self._observers.silence(context)
+        self.start_control(context)
 
     def standing_start(self) -> EpisodeStart:
         """A start at rest in the standing posture, with a constant plan."""
@@ -233,6 +272,13 @@ class LeggedLoop(PlannedLoop):
 
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:
         return start.stance_pose(self.kinematics)
+
+    def start_control(self, context: Context) -> None:
+        """Sets the command that the controller would hold by now; it holds none by default.
+
+        Args:
+            context: The root Context.
+        """
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         with self._physics.edited(context) as plant_context:

@@ -124,6 +124,14 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         lowest, highest = self._limits
         return np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
 
+    def start(self, context: Context) -> None:
+        """Sets the command for the present inputs, as the start of a simulation does.
+
+        Args:
+            context: This system's Context, with its inputs connected.
+        """
+        self._initialize(context, context.get_mutable_discrete_state())
+
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         plant_state = self._state_port.Eval(context)
         guess = plant_state[NUM_BASE_POSITIONS : self._kinematics.num_positions]

@@ -20,6 +20,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         name: RecoverySwitch
         input_ports:
         - safety_probability
+        - belief (optional)
         - plant_state
         - nominal_desired_output
         - nominal_desired_preview
@@ -41,7 +42,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         kinematics: The controller's model of the robot.
         parameters: Parameters of the recovery steps.
         threshold: Γ_thre.
-        persistence_s: Time for which Γ must have been below it [s].
+        persistence_s: Time for which Γ must have been below it while nothing is known [s].
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].
             Simultaneous discrete updates would add a period of delay each.
@@ -85,6 +86,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         )
         planner = self.step_planner
         builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
+        builder.ExportInput(trigger.GetInputPort("belief"), "belief")
         builder.ExportInput(planner.GetInputPort("plant_state"), "plant_state")
         builder.ExportInput(
             planner.GetInputPort("nominal_desired_output"), "nominal_desired_output"

@@ -1,4 +1,4 @@
-"""RecoveryTrigger: a latch that is set when Γ stays below its threshold."""
+"""RecoveryTrigger: a latch that is set when Γ falls below its threshold."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         name: RecoveryTrigger
         input_ports:
         - safety_probability
+        - belief (optional)
         - recovery_done (optional)
         output_ports:
         - port_selector
         - recovery_active
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A Γ that is NaN
-    activates it. ``port_selector`` drives a PortSwitch whose ports were declared ``nominal``
-    first, ``recovery`` second.
+    activates it. ``belief`` (3,) tells a Γ that is low from one of which nothing is known: while it
+    is (0, 0, 1), Γ must have been below Γ_thre for ``persistence_s``. An impact makes a single
+    input unlike those of training. ``port_selector`` drives a PortSwitch whose ports were declared
+    ``nominal`` first, ``recovery`` second.
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6.
-        persistence_s: Time for which Γ must have been below Γ_thre [s]; none by default, as in the
-            paper. An impact can make a single assessment low or unknown.
+        persistence_s: Time for which Γ must have been below Γ_thre while nothing is known [s]; none
+            by default, as in the paper.
         period_s: Update period [s].
         offset_s: Time of the first update [s].
 
@@ -56,6 +59,7 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         self.threshold = threshold
         self._num_waited = math.ceil(persistence_s / period_s - 1e-6)
         self._probability_port = self.DeclareVectorInputPort("safety_probability", 1)
+        self._belief_port = self.DeclareVectorInputPort("belief", 3)
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
         self._num_below = self.DeclareDiscreteState(1)  # Updates with Γ below Γ_thre, up to now.
@@ -80,7 +84,10 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
             is_below = not self._probability_port.Eval(context)[0] >= self.threshold
             num_below = context.get_discrete_state(self._num_below).GetAtIndex(0)
             num_below = num_below + 1.0 if is_below else 0.0
-            active = num_below > self._num_waited
+            is_known = not (
+                self._belief_port.HasValue(context) and self._belief_port.Eval(context)[2] >= 1.0
+            )
+            active = is_below and (is_known or num_below > self._num_waited)
         discrete_state.set_value(self._active, [float(active)])
         discrete_state.set_value(self._num_below, [num_below])
 
