@@ -21,7 +21,7 @@ from drake_safety.evaluation.shift_study import (
     run_changed_starts,
     shifted_scenario,
 )
-from drake_safety.evaluation.shifts import PLANS, POSTURES, plant_shifts
+from drake_safety.evaluation.shifts import POSTURES, STARTS, plant_shifts
 from drake_safety.evaluation.shifts_figure import shifts_figure
 from drake_safety.learning.calibration import PLAN, Calibration
 from lip_assessments import QUICK
@@ -198,7 +198,7 @@ def test_a_plant_of_its_own_has_the_scenarios_variations_alone():
 def test_postures_and_falls_are_never_called_safe():
     scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
     sets = run_changed_starts(scenario, 6, seed=77, num_workers=1)
-    assert {*PLANS, *POSTURES} <= set(sets)
+    assert {*STARTS, *POSTURES} <= set(sets)
     judge = assessment_judge(gamma)
     for name in sets:
         if sets[name].kind != "posture":

@@ -16,7 +16,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.monitoring_study import rate_per_hour
 from drake_safety.evaluation.scorers import Scorer, StageProgress
-from drake_safety.evaluation.shifts import PLANS, POSTURES, PlantShift
+from drake_safety.evaluation.shifts import POSTURES, STARTS, PlantShift
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
@@ -104,7 +104,7 @@ def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenar
 def run_changed_starts(
     scenario: Scenario, num_motions: int, seed: int, num_workers: int | None = None
 ) -> dict[str, ShiftedSet]:
-    """Simulates plans outside the range of training, and evaluates postures outside of it.
+    """Simulates plans and starts outside the range of training, and evaluates such postures.
 
     Postures are single rows, unsafe by definition. "falling" has the rows outside the safe
     set of nominal episodes in which the robot falls.
@@ -118,7 +118,7 @@ def run_changed_starts(
     if not isinstance(scenario.make_loop(), LeggedLoop):
         return {}
     found = {}
-    names = [*PLANS, *POSTURES, "falling"]
+    names = [*STARTS, *POSTURES, "falling"]
     for name in names:
 
         def arguments(batch: list[int], name: str = name) -> tuple:
@@ -128,7 +128,7 @@ def run_changed_starts(
             _changed_batch, list(range(num_motions)), arguments, num_workers=num_workers
         )
         motions = [motion for motion in results if len(motion.state)]
-        kind = "plan" if name in PLANS else "posture"
+        kind = "plan" if name in STARTS else "posture"
         if motions:
             found[name] = ShiftedSet(kind=kind, motions=motions)
     return found
@@ -147,8 +147,8 @@ def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motio
     loop.reset(context, episode_rng(seed, index))
     start = loop.start_of(context)
     kinematics = loop.kinematics
-    if name in PLANS:
-        start = PLANS[name](start, kinematics)
+    if name in STARTS:
+        start = STARTS[name](start, kinematics)
         return Motion.of_episode(run_episode(loop, index, seed=seed, start=start))
     loop.reset_to(context, episode_rng(seed, index), POSTURES[name](start, kinematics))
     return _rows_of(loop, [context])

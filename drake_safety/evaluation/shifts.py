@@ -35,6 +35,7 @@ _NOISE_FACTOR = 10.0
 _FROZEN_AT_S = 0.4
 _STALE_S = 0.2
 _FARTHER, _FASTER = 1.5, 2.0
+_START_SPEED = 0.75  # Of sqrt(g h), h the standing height: the capture point is 0.75 h ahead.
 _LIFT_SHARE = 0.5  # Of the standing height.
 
 
@@ -160,8 +161,14 @@ def _faster(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
     return dataclasses.replace(start, plan=_scaled_plan(start.plan, distance=1.0, speed=_FASTER))
 
 
-PLANS: Mapping[str, Reshape] = {"farther": _farther, "faster": _faster}
-"""Plans outside the range of training, by name."""
+def _moving(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
+    v = start.v.copy()
+    v[4] += _START_SPEED * math.sqrt(9.81 * kinematics.standing_height)
+    return dataclasses.replace(start, v=v)
+
+
+STARTS: Mapping[str, Reshape] = {"farther": _farther, "faster": _faster, "moving": _moving}
+"""Plans and initial velocities outside the range of training, by name."""
 
 
 def _lifted(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:

@@ -30,7 +30,7 @@ _TITLES = {
     "nominal": "as in training",
     "plant": "another plant",
     "sensor": "faulty measurements",
-    "plan": "plans beyond the range",
+    "plan": "starts and plans beyond the range",
     "posture": "postures beyond the range",
     "junk": "contradictions",
 }
