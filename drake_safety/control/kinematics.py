@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.framework import Context
 
+from drake_safety.plants.scratch import Scratch
 from drake_safety.robots.robot import (
     PlantVariation,
     add_robot,
@@ -31,12 +34,21 @@ NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6
 
 
+@dataclass(eq=False)
+class _Instant:
+    """A scratch Context, and the contact points of the positions they were last computed for."""
+
+    context: Context
+    positions: bytes = b""
+    contacts: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+
 class RobotKinematics:
     """Kinematics of a robot without ground or scene.
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
-    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context, which every method
-    overwrites.
+    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
+    method overwrites.
 
     Args:
         robot: The robot.
@@ -64,10 +76,10 @@ class RobotKinematics:
                 f"{self.plant.num_positions()} positions and "
                 f"{self.plant.num_velocities()} velocities"
             )
-        self.context = self.plant.CreateDefaultContext()
-        self._last_contacts: tuple[bytes, np.ndarray] = (b"", np.empty((0, 3)))
+        model = self.plant.CreateDefaultContext()
         if variation is not None:
-            apply_masses(self.plant, self.context, robot, variation)
+            apply_masses(self.plant, model, robot, variation)
+        self._scratch = Scratch(lambda: _Instant(model.Clone()))
         self.num_positions = self.plant.num_positions()
         self.num_velocities = self.plant.num_velocities()
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
@@ -96,6 +108,11 @@ class RobotKinematics:
         self.posture = np.array([posture[name] for name in self.joint_names])
         self.total_mass = self.plant.CalcTotalMass(self.context)
         self._set_standing()
+
+    @property
+    def context(self) -> Context:
+        """The scratch Context of the calling thread."""
+        return self._scratch.value.context
 
     def _set_standing(self) -> None:
         q = self.positions_at(RigidTransform(), self.posture)
@@ -132,13 +149,13 @@ class RobotKinematics:
     def contact_positions(self, q: np.ndarray) -> np.ndarray:
         """Returns the contact spheres' centres in the world, (n_c, 3) [m], read-only."""
         # Margins, state and features of one instant need the same positions.
-        key = q.tobytes()
-        if key == self._last_contacts[0]:
-            return self._last_contacts[1]
+        key, instant = q.tobytes(), self._scratch.value
+        if key == instant.positions:
+            return instant.contacts
         self.set_positions(q)
         p_WC = self._contacts()
         p_WC.flags.writeable = False
-        self._last_contacts = (key, p_WC)
+        instant.positions, instant.contacts = key, p_WC
         return p_WC
 
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.plants.mujoco_model import build_model, import_mujoco
+from drake_safety.plants.scratch import Scratch
 from drake_safety.robots.robot import PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel
 
@@ -58,7 +59,7 @@ class MujocoDynamics:
         self.model, commands = build_model(
             robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
         )
-        self._scratch = mujoco.MjData(self.model)
+        self._scratch = Scratch(lambda: mujoco.MjData(self.model))
         self.command_places = np.array(commands, dtype=int)
         self.joint_names = servo_joints(plant, robot)
         self.num_command = len(self.joint_names) * (2 if servos else 1)
@@ -128,7 +129,7 @@ class MujocoDynamics:
         """
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
             raise DivergenceError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")
-        mujoco, model, scratch = self._mujoco, self.model, self._scratch
+        mujoco, model, scratch = self._mujoco, self.model, self._scratch.value
         scratch.time = 0.0
         scratch.qpos[:], scratch.qvel[:], scratch.qacc_warmstart[:] = self._parts(state)
         scratch.ctrl[:] = command[self.command_places]
@@ -150,7 +151,7 @@ class MujocoDynamics:
         return np.concatenate([scratch.qpos, scratch.qvel, scratch.qacc_warmstart])
 
     def _apply(self, force: ExternallyAppliedSpatialForce) -> None:
-        mujoco, model, scratch = self._mujoco, self.model, self._scratch
+        mujoco, model, scratch = self._mujoco, self.model, self._scratch.value
         body = self._plant.get_body(force.body_index).name()
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
         if index < 0:

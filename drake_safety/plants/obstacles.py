@@ -17,6 +17,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_safety.plants.scratch import Scratch
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import RobotModel
@@ -149,7 +150,7 @@ def filter_collisions(
 class Clearance:
     """Signed distances of a robot's arms, and of points, to obstacles.
 
-    It has its own plant and scene graph, without ground, and one scratch Context.
+    It has its own plant and scene graph, without ground, and one scratch Context a thread.
 
     Args:
         robot: The robot.
@@ -171,9 +172,7 @@ class Clearance:
         self._plant.Finalize()
         filter_collisions(self._plant, self._scene_graph, robot, instances)
         diagram = builder.Build()
-        self._context = diagram.CreateDefaultContext()
-        self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
-        self._scene_context = self._scene_graph.GetMyContextFromRoot(self._context)
+        self._scratch = Scratch(diagram.CreateDefaultContext)
         self._obstacles = set(collision_geometries(self._plant, instances))
         if self._obstacles and not arm_geometries(self._plant, robot):
             raise ValueError(
@@ -184,7 +183,8 @@ class Clearance:
         self.range_m = range_m
 
     def _query(self) -> QueryObject:
-        return self._scene_graph.get_query_output_port().Eval(self._scene_context)
+        context = self._scene_graph.GetMyContextFromRoot(self._scratch.value)
+        return self._scene_graph.get_query_output_port().Eval(context)
 
     def of_arms(self, q: np.ndarray) -> float:
         """Returns the distance of the arms to the nearest obstacle, negative in contact [m].
@@ -200,7 +200,8 @@ class Clearance:
             raise ValueError(f"clearance: positions must be finite; got {q}")
         if not self._obstacles:
             return self.range_m
-        self._plant.SetPositions(self._plant_context, q)
+        context = self._plant.GetMyMutableContextFromRoot(self._scratch.value)
+        self._plant.SetPositions(context, q)
         pairs = self._query().ComputeSignedDistancePairwiseClosestPoints(self.range_m)
         return min((pair.distance for pair in pairs), default=self.range_m)
 

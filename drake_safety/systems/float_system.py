@@ -12,9 +12,9 @@ class FloatSystem:
     Drake clones by scalar conversion, which systems written in Python support only as templates on
     the scalar type. The systems of this package evaluate networks, QP solvers and a MultibodyPlant
     of floats, so :meth:`Clone` calls the constructor with the same arguments. Objects passed to the
-    constructor are shared: a robot's kinematics has a scratch Context, so clones must not be used
-    in different threads. Drake's own ``Diagram.Clone()`` and ``copy.deepcopy`` of a diagram with
-    such a system still raise.
+    constructor are shared. They keep scratch memory for every thread, so that one diagram can be
+    simulated in several threads, each with its own Context. Drake's own ``Diagram.Clone()`` and
+    ``copy.deepcopy`` of a diagram with such a system still raise.
 
     Must precede the Drake class among the bases: ``class Planner(FloatSystem, LeafSystem)``.
     """

@@ -1,0 +1,58 @@
+"""One diagram in several threads, each with a Context of its own, as Drake's users expect."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from balancing_loops import PACKAGED, standing_loop
+from drake_safety import load_assessment, load_scenario
+from drake_safety.plants.scratch import Scratch
+
+NUM_THREADS, DURATION_S = 8, 0.2
+PORTS = ("state", "features", "margins")
+
+
+def final_values(loop, seed, ports):
+    context = loop.CreateDefaultContext()
+    loop.reset(context, np.random.default_rng(seed))
+    simulator = Simulator(loop, context)
+    simulator.Initialize()
+    simulator.AdvanceTo(DURATION_S)
+    return np.concatenate([loop.GetOutputPort(name).Eval(context) for name in ports])
+
+
+@pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])
+def test_threads_with_one_diagram_give_the_same_bits_as_one_after_the_other(name):
+    assessment = load_assessment(name)
+    loop = load_scenario(name).make_loop("actual", assessment=assessment)
+    ports = (*PORTS, "belief")
+    alone = [final_values(loop, seed, ports) for seed in range(NUM_THREADS)]
+    assert len({one.tobytes() for one in alone}) == NUM_THREADS
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        together = list(pool.map(lambda seed: final_values(loop, seed, ports), range(NUM_THREADS)))
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_two_contexts_in_turn_do_not_disturb_each_other():
+    loop = standing_loop(PACKAGED)
+    expected = final_values(loop, 1, PORTS)
+    first, second = loop.CreateDefaultContext(), loop.CreateDefaultContext()
+    loop.reset(first, np.random.default_rng(1))
+    loop.reset(second, np.random.default_rng(2))
+    simulators = [Simulator(loop, context) for context in (first, second)]
+    for time in np.linspace(0.01, DURATION_S, 20):
+        for simulator in simulators:
+            simulator.AdvanceTo(time)
+    found = np.concatenate([loop.GetOutputPort(name).Eval(first) for name in PORTS])
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_each_thread_has_a_value_of_its_own():
+    scratch = Scratch(list)
+    scratch.value.append("main")
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: scratch.value).result() == []
+    assert scratch.value == ["main"]
