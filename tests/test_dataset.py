@@ -3,6 +3,7 @@ import json
 import logging
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,6 @@ import pytest
 
 from cart_episodes import ARRAYS, make_episode, make_info
 from drake_safety.learning.segments import Episode
-from drake_safety.simulation import dataset
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
 
 
@@ -129,18 +129,36 @@ def test_a_shard_is_written_after_every_flush_episodes(tmp_path):
     assert completed(tmp_path) == {0, 1, 2, 3}
 
 
-def test_a_shard_is_written_when_the_oldest_pending_episode_is_old_enough(tmp_path, monkeypatch):
-    now_s = 100.0
-    monkeypatch.setattr(dataset.time, "monotonic", lambda: now_s)
-    with EpisodeWriter(tmp_path, make_info(), flush_seconds=10.0) as writer:
-        now_s = 150.0
+def test_pending_episodes_are_written_by_the_clock_though_no_other_comes(tmp_path):
+    with EpisodeWriter(tmp_path, make_info(), flush_seconds=0.2) as writer:
         writer.append(make_episode(0))
-        now_s = 159.0
         writer.append(make_episode(1))
         assert completed(tmp_path) == set()
-        now_s = 160.0
-        writer.append(make_episode(2))
-        assert completed(tmp_path) == {0, 1, 2}
+        end_s = time.monotonic() + 10.0
+        while completed(tmp_path) != {0, 1}:
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
+
+
+def test_what_cannot_be_written_by_the_clock_is_kept_and_raised_later(
+    tmp_path, monkeypatch, caplog
+):
+    def full(*_, **__):
+        raise OSError("No space left on device")
+
+    writer = EpisodeWriter(tmp_path, make_info(), flush_seconds=0.05)
+    with monkeypatch.context() as patched:
+        patched.setattr("pyarrow.parquet.write_table", full)
+        writer.append(make_episode(0))
+        end_s = time.monotonic() + 10.0
+        while "could not be written yet: No space left on device" not in caplog.text:
+            assert time.monotonic() < end_s
+            time.sleep(0.02)
+        with pytest.raises(OSError, match="No space left"):
+            writer.flush()
+    writer.close()
+    assert completed(tmp_path) == {0}
 
 
 @pytest.mark.parametrize("interruption", [RuntimeError, KeyboardInterrupt])

@@ -7,6 +7,7 @@ docstring the help) and a line in `_COMMANDS`.
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 
 import typer
@@ -44,6 +45,7 @@ _COMMANDS = (
 )
 
 _DEBUG = "--debug"
+_STOPPED = 130  # Exit code after Ctrl-C.
 
 app = typer.Typer(
     help="Learn safety assessments of robot motions from simulations, and use them before and "
@@ -65,18 +67,24 @@ def main() -> None:
 def run_app(commands: typer.Typer, program: str) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
+    SIGTERM stops it as Ctrl-C does.
+
     Args:
         commands: The commands.
         program: Name of the program.
     """
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
     try:
-        sys.exit(commands(arguments, prog_name=program, standalone_mode=False))
+        code = commands(arguments, prog_name=program, standalone_mode=False)
+        if code == _STOPPED:  # Typer's own answer to Ctrl-C.
+            raise KeyboardInterrupt
+        sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         console.print("stopped; finished episodes are kept", highlight=False)
-        sys.exit(130)
+        sys.exit(_STOPPED)
     except Exception as error:
         from drake_safety.learning.segments import EpisodeError
 

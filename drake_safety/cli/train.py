@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -113,7 +114,11 @@ def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
     """Yields a function that submits calls to workers, which end on an error or Ctrl-C."""
     from joblib.externals.loky import ProcessPoolExecutor
 
-    executor = ProcessPoolExecutor(max_workers=max(num_workers, 1))
+    from drake_safety.simulation.rollouts import end_with_parent
+
+    executor = ProcessPoolExecutor(
+        max_workers=max(num_workers, 1), initializer=end_with_parent, initargs=(os.getpid(),)
+    )
     try:
         yield executor.submit
     except BaseException:

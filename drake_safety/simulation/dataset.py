@@ -16,7 +16,7 @@ import json
 import logging
 import os
 import re
-import time
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -50,8 +50,7 @@ class EpisodeWriter:
         extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
             ...). In a folder that is continued, it replaces entries of the same names.
         flush_episodes: Number of pending episodes that are written as a shard.
-        flush_seconds: Age of the oldest pending episode at which they are written [s]; checked
-            when an episode is appended.
+        flush_seconds: Age of the oldest pending episode at which they are written [s].
         accept_code_change: See :func:`open_folder`.
 
     Raises:
@@ -77,7 +76,8 @@ class EpisodeWriter:
         self._flush_episodes = flush_episodes
         self._flush_seconds = flush_seconds
         self._pending: list[Episode] = []
-        self._pending_since_s = 0.0
+        self._timer: threading.Timer | None = None
+        self._access = threading.RLock()  # Of the pending episodes.
         self._is_closed = False
         self._lock = _locked(self.path)
         try:
@@ -110,18 +110,33 @@ class EpisodeWriter:
         if episode.index in self._indices:
             raise ValueError(f"episode {episode.index} is already in {self.path}; see completed()")
         Episodes(self.info, [episode])  # Checks the shapes.
-        if not self._pending:
-            self._pending_since_s = time.monotonic()
-        self._pending.append(episode)
-        self._indices.add(episode.index)
-        age_s = time.monotonic() - self._pending_since_s
-        if len(self._pending) >= self._flush_episodes or age_s >= self._flush_seconds:
+        with self._access:
+            self._pending.append(episode)
+            self._indices.add(episode.index)
+            if len(self._pending) >= self._flush_episodes:
+                self.flush()
+            elif self._timer is None:
+                self._timer = threading.Timer(self._flush_seconds, self._flush_by_the_clock)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _flush_by_the_clock(self) -> None:
+        try:
             self.flush()
+        except OSError as error:
+            # They are still pending: the next flush tries again, and raises.
+            _LOGGER.warning("%s: episodes could not be written yet: %s", self.path, error)
 
     def flush(self) -> None:
         """Writes the pending episodes as one shard."""
-        if not self._pending:
-            return
+        with self._access:
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+            if self._pending:
+                self._write()
+
+    def _write(self) -> None:
         import pyarrow.parquet as pq
 
         table = _to_table(self._pending, self.info)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import copyreg
+import functools
 import hashlib
 import importlib
 import logging
+import os
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import closing, nullcontext
@@ -40,6 +44,7 @@ from drake_safety.simulation.scenario import Scenario
 
 _LOGGER = logging.getLogger("drake_safety")
 _BATCH = 4  # Episodes, or throws, per call of a worker.
+_WATCH_PERIOD_S = 1.0
 
 Progress = Callable[[int, int], None]
 """Called with the number done and in all."""
@@ -338,14 +343,19 @@ def parallel_map(
     """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
 
     Every worker has one BLAS thread, and so has this process if it does the work, so that results
-    do not depend on the number of workers. On Ctrl-C or any error the workers end.
+    do not depend on the number of workers. On Ctrl-C or any error the workers end; when this
+    process is killed they end within a second or two.
 
     Args:
         function: A function at module level.
         arguments: One tuple per call.
         num_workers: Number of processes; that of cores by default.
+
+    Raises:
+        ChildProcessError: A worker was killed.
     """
     import joblib
+    from joblib.externals.loky.process_executor import BrokenProcessPool
     from threadpoolctl import threadpool_limits
 
     num_workers = num_workers or joblib.cpu_count()
@@ -358,10 +368,17 @@ def parallel_map(
         parallel = joblib.Parallel(
             n_jobs=num_workers, return_as="generator_unordered", batch_size=1
         )
-        results = parallel(joblib.delayed(function)(*args) for args in arguments)
+        calls = (joblib.delayed(_call_in_worker)(os.getpid(), function, args) for args in arguments)
+        results = parallel(calls)
         try:
             for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
                 yield result
+        except BrokenProcessPool:
+            raise ChildProcessError(
+                "a worker process was killed, by the system if memory ran out; what had finished "
+                "is kept: run the same again to continue (train: with --resume), with fewer "
+                "workers if memory is short"
+            ) from None
         except BaseException:
             from joblib.externals.loky import get_reusable_executor
 
@@ -371,6 +388,29 @@ def parallel_map(
                 warnings.simplefilter("ignore")
                 results.close()
             raise
+
+
+def _call_in_worker(parent: int, function: Callable[..., Any], arguments: tuple) -> Any:
+    end_with_parent(parent)
+    return function(*arguments)
+
+
+@functools.cache
+def end_with_parent(parent: int) -> None:
+    """Ends this process soon after its parent, however that ends.
+
+    Args:
+        parent: Process ID of the parent; nothing happens if another process is.
+    """
+    if os.getppid() != parent:
+        return
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_PERIOD_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="end_with_parent", daemon=True).start()
 
 
 def _reduce_builtin(function: Any) -> Any:

@@ -1,0 +1,89 @@
+"""Killed processes: nothing is left running, what had finished is kept, and resuming is exact."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+import pytest
+
+from cart_episodes import ARRAYS
+from drake_safety import load_scenario, run_episodes
+from drake_safety.simulation.dataset import completed, load_episodes
+
+NUM_EPISODES, WITHIN_S = 1500, 10.0
+
+
+def start(folder):
+    """`drake-safety train` of the pendulum with two workers, once some episodes are on disk."""
+    command = [sys.executable, "-m", "drake_safety.cli", "train", "pendulum", "--workers", "2"]
+    command += ["--episodes", f"{NUM_EPISODES}", "--mode", "sharpened", "--out", str(folder)]
+    process = subprocess.Popen(
+        [*command, "--resume"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    wait_for(lambda: len(completed(folder / "episodes")) >= 64, 60.0)
+    return process
+
+
+def wait_for(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def workers_of(process):
+    children = psutil.Process(process.pid).children(recursive=True)
+    return [child for child in children if "popen_loky" in " ".join(child.cmdline())]
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    return run_episodes(load_scenario("pendulum"), 400, num_workers=2)
+
+
+def assert_kept(folder, undisturbed):
+    """What is on disk is right, and the set goes on from there, bit for bit."""
+    kept = completed(folder)
+    assert len(kept) >= 64
+    if len(kept) < len(undisturbed):
+        resumed = run_episodes(load_scenario("pendulum"), len(undisturbed), path=folder)
+    else:
+        resumed = load_episodes(folder)
+    for episode, expected in zip(resumed, undisturbed, strict=False):
+        assert episode.index == expected.index
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(episode, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, undisturbed):
+    process = start(tmp_path)
+    workers = workers_of(process)
+    assert len(workers) == 2
+    process.send_signal(kill)
+    output = process.communicate(timeout=WITHIN_S)[0]
+    _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
+    assert not alive
+    if kill != signal.SIGKILL:
+        assert process.returncode == 130
+        assert "stopped; finished episodes are kept" in output
+        assert "Traceback" not in output
+    assert_kept(tmp_path / "episodes", undisturbed)
+
+
+def test_a_killed_worker_is_one_line_that_says_how_to_go_on(tmp_path, undisturbed):
+    process = start(tmp_path)
+    workers = workers_of(process)
+    os.kill(workers[0].pid, signal.SIGKILL)
+    output = process.communicate(timeout=60.0)[0]
+    assert process.returncode == 2
+    assert "a worker process was killed" in output
+    assert "--resume" in output
+    assert "Traceback" not in output
+    _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
+    assert not alive
+    assert_kept(tmp_path / "episodes", undisturbed)
