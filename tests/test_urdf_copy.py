@@ -158,3 +158,10 @@ def test_what_is_no_urdf_is_refused_with_a_reason(tmp_path, text, message):
 def test_a_file_that_does_not_exist_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere.urdf' does not exist"):
         read_urdf(tmp_path / "nowhere.urdf")
+
+
+@pytest.mark.parametrize("mass", ["-1", "nan", "inf", "heavy"])
+def test_a_mass_that_no_body_has_is_refused_with_file_and_link(mass, tmp_path):
+    path = written(tmp_path, f'<link name="a"><inertial><mass value="{mass}"/></inertial></link>')
+    with pytest.raises(ValueError, match=r"r.urdf': link 'a' has a mass of (-1|nan|inf) kg"):
+        read_urdf(path)

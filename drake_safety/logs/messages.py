@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_safety.logs.channel import Channel, listed, missing_extra
 from drake_safety.logs.log_map import LogTime
+from drake_safety.robots.reading import reading
 
 Message = tuple[str, int, Any]
 """Topic, recording time [ns] and decoded message."""
@@ -31,27 +32,24 @@ def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) ->
             missing.
     """
     try:
-        from mcap.exceptions import McapError
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
         raise missing_extra(path, error) from error
-    try:
-        with path.open("rb") as file:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            summary = reader.get_summary()
-            if summary is None:
-                raise ValueError(f"log '{path}' is cut off: it has no summary")
-            _require_topics(path, wanted, {c.topic for c in summary.channels.values()})
-            messages = (
-                (channel.topic, message.log_time, decoded)
-                for _, channel, message, decoded in reader.iter_decoded_messages(
-                    topics=list(wanted), log_time_order=True
-                )
+    # A damaged file makes the reader raise errors of any kind.
+    with reading(path, "damaged, or not an MCAP file: log", Exception), path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        if summary is None:
+            raise ValueError(f"log '{path}' is cut off: it has no summary")
+        _require_topics(path, wanted, {c.topic for c in summary.channels.values()})
+        messages = (
+            (channel.topic, message.log_time, decoded)
+            for _, channel, message, decoded in reader.iter_decoded_messages(
+                topics=list(wanted), log_time_order=True
             )
-            return _channels(path, messages, wanted, time)
-    except McapError as error:
-        raise ValueError(f"log '{path}' is damaged or not an MCAP file: {error}") from error
+        )
+        return _channels(path, messages, wanted, time)
 
 
 def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
@@ -67,21 +65,22 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
             missing.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise missing_extra(path, error) from error
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            connections = [c for c in reader.connections if c.topic in wanted]
-            _require_topics(path, wanted, {c.topic for c in reader.connections})
-            messages = (
-                (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
-                for connection, stamp, raw in reader.messages(connections=connections)
-            )
-            return _channels(path, messages, wanted, time)
-    except AnyReaderError as error:
-        raise ValueError(f"log '{path}' is damaged or not a ROS bag: {error}") from error
+    # A damaged bag makes the reader raise errors of any kind.
+    with (
+        reading(path, "damaged, or not a ROS bag: log", Exception),
+        AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader,
+    ):
+        connections = [c for c in reader.connections if c.topic in wanted]
+        _require_topics(path, wanted, {c.topic for c in reader.connections})
+        messages = (
+            (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
+            for connection, stamp, raw in reader.messages(connections=connections)
+        )
+        return _channels(path, messages, wanted, time)
 
 
 def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_safety.logs.channel import Channel, listed, missing_extra
 from drake_safety.logs.log_map import LogTime
+from drake_safety.robots.reading import reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,15 +30,14 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         ValueError: A column is missing, duplicate or not numeric, or the extra is not installed.
     """
     pd = _pandas(path)
-    names = _checked_names(path, wanted, time, _header_of(path))
-    try:
+    # Parser errors are of several kinds.
+    with reading(path, "not a CSV table: log", Exception):
+        names = _checked_names(path, wanted, time, _header_of(path))
         # Read as text, so that errors can quote cells that are not numbers.
         frame = pd.read_csv(
             path, usecols=names, dtype=str, keep_default_na=False, skip_blank_lines=False
         )
-    except (pd.errors.ParserError, UnicodeDecodeError) as error:
-        raise ValueError(f"log '{path}' is not a CSV table: {error}") from error
-    return _channel(path, frame, wanted, time, "line", 2)
+        return _channel(path, frame, wanted, time, "line", 2)
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
@@ -52,17 +52,16 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         ValueError: The file is not a Parquet file, a column is missing or not numeric, or the extra
             is not installed.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     _pandas(path)
-    try:
-        with pq.ParquetFile(path) as file:
-            names = _checked_names(path, wanted, time, file.schema_arrow.names)
-            frame = file.read(columns=names).to_pandas(timestamp_as_object=False)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise ValueError(f"log '{path}' is damaged or not a Parquet file: {error}") from error
-    return _channel(path, frame, wanted, time, "row", 0)
+    with (
+        reading(path, "damaged, or not a Parquet file: log", Exception),
+        pq.ParquetFile(path, page_checksum_verification=True) as file,
+    ):
+        names = _checked_names(path, wanted, time, file.schema_arrow.names)
+        frame = file.read(columns=names).to_pandas(timestamp_as_object=False)
+        return _channel(path, frame, wanted, time, "row", 0)
 
 
 def _pandas(path: Path) -> ModuleType:
@@ -75,10 +74,7 @@ def _pandas(path: Path) -> ModuleType:
 
 def _header_of(path: Path) -> list[str]:
     with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            return next(csv.reader(file), [])
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"log '{path}' is not a CSV table: {error}") from error
+        return next(csv.reader(file), [])
 
 
 def _checked_names(

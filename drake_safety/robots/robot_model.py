@@ -11,6 +11,8 @@ import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load_typed
 
+from drake_safety.robots.reading import parse_yaml, reading, shortened
+
 _Value = TypeVar("_Value")
 
 
@@ -306,7 +308,7 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
         value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw, sort_keys=False))
         _validate(value)
     except Exception as error:  # Drake's loader raises RuntimeError and bare Exception.
-        raise ValueError(f"{who}: {error}") from error
+        raise ValueError(f"{who}: {shortened(str(error))}") from error
     return value
 
 
@@ -318,11 +320,9 @@ def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
     """
     if not path.is_file():
         raise ValueError(f"{who} does not exist")
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{who} is not YAML: {error}") from error
-    return load_typed(schema, raw, who)
+    with reading(path):
+        raw = parse_yaml(path.read_text(encoding="utf-8"), who)
+        return load_typed(schema, raw, who)
 
 
 def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:

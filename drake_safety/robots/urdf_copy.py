@@ -268,7 +268,7 @@ def read_urdf(path: Path) -> UrdfCopy:
         path: The file.
 
     Raises:
-        ValueError: The file does not exist or is not a URDF.
+        ValueError: The file does not exist, is not a URDF, or has a negative mass.
     """
     path = Path(path)
     if not path.is_file():
@@ -286,6 +286,15 @@ def read_urdf(path: Path) -> UrdfCopy:
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
     if not root.findall("link"):
         raise ValueError(f"'{path}' has no links")
+    for link in root.iter("link"):
+        element = link.find("inertial/mass")
+        mass = number(element, "value")
+        # Drake warns, and simulates a body of another mass.
+        if element is not None and not 0.0 <= mass < math.inf:
+            raise ValueError(
+                f"'{path}': link '{link.get('name')}' has a mass of {mass:g} kg, expected a finite "
+                "number that is not negative"
+            )
     return UrdfCopy(source=path, root=root)
 
 

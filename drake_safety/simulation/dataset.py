@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
+from drake_safety.robots.reading import reading
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,6 +34,7 @@ _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
 _FAILURES = "num_controller_failures"
 _EARLIER_CODE = "earlier_code"
+_LARGEST = 1e12  # Of any quantity in SI units.
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 _LOGGER = logging.getLogger("drake_safety")
 
@@ -241,7 +243,7 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
         content = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ValueError(f"{path} holds no episodes: it has no {_INFO_NAME}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is not JSON: {error}") from error
     schema_version = content.get("schema_version") if isinstance(content, dict) else None
     if schema_version != _SCHEMA_VERSION:
@@ -288,7 +290,10 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     info, _ = read_info(path)
     episodes: dict[int, tuple[Episode, Path]] = {}
     for shard in _shards(Path(path)):
-        for episode in _from_table(_read_shard(shard), info, shard):
+        with reading(shard):
+            found = _from_table(_read_shard(shard), info, shard)
+            Episodes(info, found)  # Checks them.
+        for episode in found:
             known, where = episodes.setdefault(episode.index, (episode, shard))
             if known is not episode and not _is_same(known, episode):
                 raise ValueError(
@@ -403,12 +408,23 @@ def _from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episod
     if _FAILURES in table.column_names:
         failures = table.column(_FAILURES).to_numpy()
     episode = arrays["episode"]
+    if not len(episode):
+        raise ValueError(f"{shard} holds no episodes")
     bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), table.num_rows]
     result = []
     for first, last in itertools.pairwise(bounds):
         rows = slice(first, last)
         if not np.array_equal(arrays["step"][rows], np.arange(last - first)):
             raise ValueError(f"{shard}: the steps of episode {episode[first]} are not 0, 1, 2, ...")
+        if not (np.diff(arrays["time_s"][rows]) > 0.0).all():
+            raise ValueError(f"{shard}: the time of episode {episode[first]} does not increase")
+        if arrays["cause"][first] != DIVERGED:
+            for name in ("time_s", *widths):
+                if not (np.abs(arrays[name][rows]) < _LARGEST).all():
+                    raise ValueError(
+                        f"{shard}: {name} of episode {episode[first]} holds values that are not "
+                        f"finite numbers below {_LARGEST:g}"
+                    )
         result.append(
             Episode(
                 index=int(episode[first]),

@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import inspect
+import math
 import re
 import sys
 import textwrap
@@ -17,6 +18,7 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.robots.reading import parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
 
 
+_MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 ON_ALARM = ("unknown", "report")
 """What an alarm of the monitor may do."""
 
@@ -64,9 +67,15 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
-            if not getattr(self, name) > 0:
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
                 raise ValueError(
-                    f"scenario '{self.name}': {name} must be positive; got {getattr(self, name)}"
+                    f"scenario '{self.name}': {name} must be positive and finite; got {value}"
+                )
+            if self.episode_duration_s > _MOST_STEPS * value:
+                raise ValueError(
+                    f"scenario '{self.name}': {name} is {value}, so that an episode of "
+                    f"{self.episode_duration_s} s has more than {_MOST_STEPS} steps"
                 )
         if self.on_alarm not in ON_ALARM:
             raise ValueError(
@@ -301,9 +310,10 @@ def load_scenario(name: str | Path) -> Scenario:
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
-    return parse_scenario(
-        path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
-    )
+    with reading(path, errors=ValueError):
+        return parse_scenario(
+            path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
+        )
 
 
 def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
@@ -317,10 +327,7 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     Raises:
         ValueError: See :func:`load_scenario`.
     """
-    try:
-        raw = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"scenario '{name}' is not YAML: {error}") from error
+    raw = parse_yaml(text, f"scenario '{name}'")
     if not isinstance(raw, dict) or "task" not in raw:
         raise ValueError(
             f"scenario '{name}' must be a mapping with the key 'task', and 'robot' if the task has "

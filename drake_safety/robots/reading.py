@@ -1,0 +1,101 @@
+"""The boundary at which the errors of file formats become errors that name the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_LONGEST_MESSAGE = 600  # Characters.
+_MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
+
+
+@contextmanager
+def reading(
+    path: Path,
+    what: str = "",
+    errors: type[Exception] | tuple[type[Exception], ...] = (ValueError, RecursionError),
+) -> Iterator[None]:
+    """Context manager in which a file is read: errors become `ValueError` with its name.
+
+    Args:
+        path: The file, or the folder of a log.
+        what: What the file is, such as "log"; it precedes the name.
+        errors: Errors that mean that the file is wrong. Readers of foreign formats raise any.
+
+    Raises:
+        ValueError: The file is wrong. Errors of the operating system, and classes of errors of this
+            package, pass unchanged.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or not isinstance(error, errors):
+            raise
+        raise ValueError(_message(path, what, error)) from error
+    except errors as error:
+        if type(error).__module__.startswith("drake_safety."):
+            raise  # Not about the file, such as a missing extra.
+        if type(error) is ValueError and str(path) in str(error):
+            if len(str(error)) <= _LONGEST_MESSAGE:
+                raise
+            raise ValueError(shortened(str(error))) from error
+        raise ValueError(_message(path, what, error)) from error
+
+
+def _message(path: Path, what: str, error: Exception) -> str:
+    name = f"{what} '{path}'" if what else str(path)
+    if isinstance(error, RecursionError):
+        return f"{name} is nested too deeply"
+    if isinstance(error, UnicodeDecodeError):
+        return f"{name} is not UTF-8 text: {error}"
+    text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return f"{name}: {shortened(text)}"
+
+
+def shortened(text: str) -> str:
+    """Cuts a message that quotes a large part of a file."""
+    return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE - 4]} ..."
+
+
+def parse_yaml(text: str, who: str) -> Any:
+    """Parses a YAML document of plain values.
+
+    Args:
+        text: The document.
+        who: Beginning of error messages.
+
+    Raises:
+        ValueError: It is not YAML, is nested too deeply, contains itself, or a few aliases stand
+            for more values than a description of a robot or task can have.
+    """
+    try:
+        value = yaml.safe_load(text)
+        _num_values(value, {})
+    except yaml.YAMLError as error:
+        raise ValueError(f"{who} is not YAML: {shortened(str(error))}") from error
+    except RecursionError:
+        raise ValueError(f"{who} is not YAML that can be read: it is nested too deeply") from None
+    except OverflowError as error:
+        raise ValueError(f"{who} is not YAML that can be read: {error}") from None
+    return value
+
+
+def _num_values(value: Any, counted: dict[int, int]) -> int:
+    """Number of values in a document; an alias counts as often as it stands."""
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) in counted:
+        if not counted[id(value)]:
+            raise OverflowError("an alias contains itself")
+        return counted[id(value)]
+    counted[id(value)] = 0
+    children = [*value, *value.values()] if isinstance(value, dict) else value
+    number = 1 + sum(_num_values(child, counted) for child in children)
+    if number > _MOST_VALUES:
+        raise OverflowError(f"its aliases stand for more than {_MOST_VALUES} values")
+    counted[id(value)] = number
+    return number

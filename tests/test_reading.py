@@ -1,0 +1,59 @@
+"""Files that would keep a reader busy, or bury the error, are refused in a line."""
+
+from pathlib import Path
+
+import pytest
+
+from drake_safety import load_scenario
+from drake_safety.robots.reading import parse_yaml, reading
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "\n".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "aliases stand for more than 200000 values"),
+        ("a: &a [*a]", "an alias contains itself"),
+        ("[" * 20000, "nested too deeply"),
+        ("a: [", "the text is not YAML"),
+    ],
+)
+def test_yaml_that_is_a_trap_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_yaml(text, "the text")
+
+
+def test_an_alias_that_saves_typing_is_read():
+    text = "a: &a {x: 1}\nb: *a\nc: [*a, *a]"
+    assert parse_yaml(text, "the text") == {"a": {"x": 1}, "b": {"x": 1}, "c": [{"x": 1}] * 2}
+
+
+def test_errors_gain_the_name_of_the_file_once_and_lose_their_length():
+    path = Path("/there/file.csv")
+
+    def message(error, errors=Exception):
+        with pytest.raises(ValueError, match="file") as caught, reading(path, "log", errors):
+            raise error
+        return str(caught.value)
+
+    assert message(ValueError("no columns")) == "log '/there/file.csv': no columns"
+    assert message(KeyError("q")) == "log '/there/file.csv': KeyError: 'q'"
+    own = f"log '{path}' has no columns"
+    assert message(ValueError(own)) == own
+    assert len(message(ValueError("x" * 5000))) < 700
+    assert len(message(ValueError(own + "x" * 5000))) < 700
+    with pytest.raises(KeyError), reading(path):
+        raise KeyError("q")
+    with pytest.raises(FileNotFoundError), reading(path, "log", Exception):
+        path.read_text()
+
+
+@pytest.mark.parametrize("line", ["control_period_s: 1.0e-9", "time_step_s: 1.0e-8"])
+def test_an_episode_with_endless_steps_is_refused(line, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"task: drake_safety.diagrams.pendulum:Pendulum\n{line}\n")
+    with pytest.raises(ValueError, match=r"mine.yaml.*has more than 10000000 steps"):
+        load_scenario(file)
