@@ -11,7 +11,13 @@ from drake_safety import load_scenario
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation import scenario as scenario_module
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.scenario import parse_scenario, scenario_names, task_names
+from drake_safety.simulation.scenario import (
+    parse_scenario,
+    read_scenario,
+    scenario_names,
+    task_names,
+)
+from drake_safety.simulation.scenario_check import check_scenario
 from gliding_task import SCENARIO, Gliding, GlidingParameters
 from legged_robots import write_hexapod
 
@@ -260,3 +266,24 @@ def test_a_relative_robot_path_starts_at_the_scenarios_folder(tmp_path, monkeypa
     path.write_text(BALANCING.replace("laikago", "robots/robot.yaml"))
     monkeypatch.chdir("/")
     assert load_scenario(path).robot == str((tmp_path / "robots" / "robot.yaml").resolve())
+
+
+def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monkeypatch):
+    (tmp_path / "stranger.py").write_text('raise SystemExit("code was run")\n')
+    file = tmp_path / "mine.yaml"
+    file.write_text("task: stranger:Task\nrobot: laikago\nvariations: {nominal: {}, actual: {}}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    findings = list(check_scenario(file, is_imported=False))
+    assert all(finding.is_ok for finding in findings)
+    assert "stranger:Task, which was not imported" in findings[1].message
+    assert "12 joints" in " ".join(finding.message for finding in findings)
+    scenario, parameters = read_scenario(file)
+    assert (scenario.task, parameters) == ("stranger:Task", {})
+    with pytest.raises(SystemExit, match="code was run"):
+        load_scenario(file)
+
+
+def test_check_says_whose_code_a_scenario_runs():
+    code = next(f for f in check_scenario("pendulum", num_episodes=0) if f.item == "code")
+    assert "drake_safety.diagrams.pendulum:Pendulum" in code.message
+    assert code.message.endswith("pendulum.py")

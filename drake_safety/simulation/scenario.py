@@ -290,9 +290,10 @@ def task_names() -> list[str]:
 
 
 def load_scenario(name: str | Path) -> Scenario:
-    """Loads a scenario by name, or by the path of a YAML file.
+    """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
-    A relative ``robot`` path is relative to the scenario file's folder.
+    Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
+    not. A relative ``robot`` path is relative to the scenario file's folder.
 
     Args:
         name: Name of a scenario of the package, or a path.
@@ -300,6 +301,31 @@ def load_scenario(name: str | Path) -> Scenario:
     Raises:
         ValueError: No such scenario, unknown or ill-typed keys, or no such task.
     """
+    path = _scenario_file(name)
+    with reading(path, errors=ValueError):
+        return parse_scenario(
+            path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
+        )
+
+
+def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
+    """Reads a scenario's file without importing its task, so that no code of a stranger runs.
+
+    Args:
+        name: See :func:`load_scenario`.
+
+    Returns:
+        The scenario without parameters, and the task's parameters as they stand in the file.
+
+    Raises:
+        ValueError: See :func:`load_scenario`.
+    """
+    path = _scenario_file(name)
+    with reading(path):
+        return _parsed(path.read_text(encoding="utf-8"), path.stem, path.resolve().parent)
+
+
+def _scenario_file(name: str | Path) -> Path:
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
         path = _scenario_folder() / f"{name}.yaml"
@@ -310,10 +336,7 @@ def load_scenario(name: str | Path) -> Scenario:
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
-    with reading(path, errors=ValueError):
-        return parse_scenario(
-            path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
-        )
+    return path
 
 
 def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
@@ -327,6 +350,16 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     Raises:
         ValueError: See :func:`load_scenario`.
     """
+    scenario, parameters = _parsed(text, name, folder)
+    task = scenario.task_class()
+    if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
+        parameters = task.complete_parameters(scenario.robot, parameters)
+    scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
+    return scenario
+
+
+def _parsed(text: str, name: str, folder: Path) -> tuple[Scenario, Any]:
+    """The scenario without parameters, and these as they stand in the text."""
     raw = parse_yaml(text, f"scenario '{name}'")
     if not isinstance(raw, dict) or "task" not in raw:
         raise ValueError(
@@ -337,8 +370,4 @@ def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
-    task = scenario.task_class()
-    if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
-        parameters = task.complete_parameters(scenario.robot, parameters)
-    scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
-    return scenario
+    return scenario, parameters

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
@@ -38,7 +39,9 @@ class _State:
     loop: ClosedLoop | None = None
 
 
-def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -> Iterator[Finding]:
+def check_scenario(
+    name: str | Path, *, num_episodes: int = 16, seed: int = 0, is_imported: bool = True
+) -> Iterator[Finding]:
     """Checks a scenario item by item, the cheap ones first.
 
     An error in a user's files is a finding, never an exception. Checks that depend on a scenario,
@@ -48,12 +51,17 @@ def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -
         name: Name of a scenario of the package, or the path of one.
         num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
         seed: Seed of the episodes.
+        is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
+            files are checked.
 
     Yields:
         The findings.
     """
     state = _State()
-    yield from _guarded("scenario", lambda: _scenario(state, name))
+    if is_imported:
+        yield from _guarded("scenario", lambda: _scenario(state, name))
+    else:
+        yield from _guarded("scenario", lambda: _unimported_scenario(state, name))
     if (scenario := state.scenario) is None:
         return
     if scenario.robot:
@@ -65,6 +73,8 @@ def check_scenario(name: str | Path, *, num_episodes: int = 16, seed: int = 0) -
             return
         yield from _guarded("standing posture", lambda: _posture(kinematics))
         yield from _guarded("motors", lambda: _motors(kinematics))
+    if not is_imported:
+        return
     yield from _guarded("diagram", lambda: _diagram(state, scenario))
     if (loop := state.loop) is None:
         return
@@ -90,6 +100,21 @@ def _scenario(state: _State, name: str | Path) -> Iterator[Finding]:
     scenario = load_scenario(name)
     task = scenario.task_class()
     yield passed("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
+    file = getattr(sys.modules[task.__module__], "__file__", None)
+    yield passed("code", f"the scenario runs {scenario.task}, {file}")
+    yield from _plants(state, scenario)
+
+
+def _unimported_scenario(state: _State, name: str | Path) -> Iterator[Finding]:
+    scenario, _ = read_scenario(name)
+    yield passed("scenario", f"'{scenario.name}' fits the schema, but for its parameters")
+    yield passed(
+        "code", f"the scenario runs {scenario.task}, which was not imported; read it before you do"
+    )
+    yield from _plants(state, scenario)
+
+
+def _plants(state: _State, scenario: Scenario) -> Iterator[Finding]:
     state.scenario = scenario
     if "nominal" not in scenario.variations:
         yield failed(
