@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from safetensors import safe_open
+from threadpoolctl import threadpool_limits
 
 from drake_safety.learning import assessment_file
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
@@ -463,3 +464,16 @@ def test_parts_of_the_input_that_are_swapped_are_refused_by_name(assessment, hel
         for wrong in (None, features[:, :-1]):
             with pytest.raises(ValueError, match=r"features has the shape"):
                 assessment.predict(state, preview, wrong)
+
+
+def test_learning_gives_the_same_bits_for_any_number_of_threads():
+    episodes, found = make_episodes(120, noise=0.002), []
+    for number in (1, 2):
+        with threadpool_limits(number):
+            found.append(SafetyAssessment(AssessmentParameters(**QUICK)).fit(episodes))
+    one, other = found
+    for name in ("training_points_", "training_heads_", "beliefs_"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
+    for name, array in one.innovation_.arrays().items():
+        np.testing.assert_array_equal(array, other.innovation_.arrays()[name], err_msg=name)

@@ -113,6 +113,16 @@ class SafetyAssessment:
         Raises:
             ValueError: The horizons differ, or the episodes give too few segments.
         """
+        from threadpoolctl import threadpool_limits
+
+        # The order of sums depends on the number of threads, and the last bits with it.
+        with threadpool_limits(1, user_api="blas"):
+            self._learn(episodes, progress)
+        return self
+
+    def _learn(
+        self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
+    ) -> None:
         parameters = self.parameters
         info = episodes.info
         for name in ("horizon", "preview_stride"):
@@ -176,7 +186,6 @@ class SafetyAssessment:
         )
         if progress is not None:
             progress("beliefs", 1.0)
-        return self
 
     def prior_beliefs(self) -> np.ndarray:
         """Computes the beliefs of every map's cells before any feedback, (K, R*R, 3 + n_c)."""
