@@ -262,10 +262,13 @@ def _mark_instants(
 def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
     start, end = interval_s
     axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
+    # Lines to stills lead up and to the right from Γ at the trigger.
     axes.annotate(
         "recovery steps",
-        (0.5 * (start + end), 0.6),
-        ha="center",
+        (end, 0.2),
+        xytext=(-6, 0),
+        textcoords="offset points",
+        ha="right",
         color=RECOVERY_COLOUR,
         fontsize=9,
     )

@@ -24,6 +24,7 @@ REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
 ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
 """Further output ports of a task with an assessment."""
 
+_MOST_NAMES = 8  # Of a list that an error quotes whole.
 _SIZED_BY = {
     "state": "state_names",
     "true_state": "state_names",
@@ -232,8 +233,16 @@ class ClosedLoop(FloatSystem, Diagram):
             if learned != here:
                 raise ValueError(
                     f"assessment and diagram differ in {what}: the assessment was learned with "
-                    f"{learned}, the diagram has {here}"
+                    f"{_told_from(learned, here)}, the diagram has {_told_from(here, learned)}"
                 )
+
+
+def _told_from(value: Any, other: Any) -> str:
+    """A value; of a long list of names what the other one does not have."""
+    if not isinstance(value, list) or len(value) <= _MOST_NAMES:
+        return f"{value}"
+    own = [name for name in value if name not in other]
+    return f"{len(value)} names, of which {own} are its own"
 
 
 def check_ports(loop: ClosedLoop) -> None:
