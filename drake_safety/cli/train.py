@@ -113,6 +113,7 @@ def train(
 def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
     """Yields a function that submits calls to workers, which end on an error or Ctrl-C."""
     from joblib.externals.loky import ProcessPoolExecutor
+    from joblib.externals.loky.process_executor import BrokenProcessPool
 
     from drake_safety.simulation.rollouts import end_with_parent
 
@@ -121,6 +122,11 @@ def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
     )
     try:
         yield executor.submit
+    except BrokenProcessPool:
+        raise ChildProcessError(
+            "the process that learned a mode was killed, by the system if memory ran out; the "
+            "episodes are kept: train again with --resume"
+        ) from None
     except BaseException:
         executor.shutdown(wait=False, kill_workers=True)
         raise
