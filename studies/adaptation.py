@@ -173,7 +173,7 @@ def _losses_table(found: AdaptationStudy, mode: str) -> Table:
 
 
 def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
-    columns = ("brier", "auc", "unsafe_recall", "safe_recall")
+    columns = ("brier", "auc", "unsafe_recall", "safe_recall", "unknown")
     estimates = found.estimates
     table = new_table(
         "",

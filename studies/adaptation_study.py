@@ -13,6 +13,7 @@ from drake_safety.evaluation.metrics import Estimate, area_under_curve, proporti
 from drake_safety.evaluation.scorers import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.rollouts import parallel_map
 
@@ -66,7 +67,7 @@ class TestSet:
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.
 
-    "k0.…" are those of first rows alone.
+    "k0.…" are those of first rows alone; "unknown" is the share of "don't know".
 
     Args:
         assessment: The assessment.
@@ -79,6 +80,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
         segments.desired_preview,
         segments.features if assessment.uses_features else None,
     )
+    unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
     found = {}
     for name, published in PUBLISHED.items():
         unsafe = 1.0 - published(result)
@@ -88,6 +90,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
             for prefix, chosen in rows.items()
             for metric, value in _metrics(unsafe[chosen], segments.is_unsafe[chosen]).items()
         }
+        found[name]["unknown"] = float(unknown.mean())
     return found
 
 

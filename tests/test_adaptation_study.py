@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes
 from lip_assessments import QUICK, pairs_with, worse
 from lip_episodes import make_episodes
@@ -35,6 +36,8 @@ def test_scores_are_those_of_what_is_published(assessment, judged):
         first = segments.is_first
         squared = (unsafe - segments.is_unsafe)[first] ** 2
         assert found[name]["k0.brier"] == pytest.approx(squared.mean())
+        unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
+        assert found[name]["unknown"] == unknown.mean()
 
 
 def pool_of(flip, judged, seed=3):
