@@ -14,7 +14,7 @@ from cart_episodes import ARRAYS
 from drake_safety import load_scenario, run_episodes
 from drake_safety.simulation.dataset import completed, load_episodes
 
-NUM_EPISODES, WITHIN_S = 1500, 10.0
+NUM_EPISODES, WITHIN_S, PATIENCE_S = 1500, 10.0, 60.0
 
 
 def start(folder):
@@ -24,7 +24,7 @@ def start(folder):
     process = subprocess.Popen(
         [*command, "--resume"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    wait_for(lambda: len(completed(folder / "episodes")) >= 64, 60.0)
+    wait_for(lambda: len(completed(folder / "episodes")) >= 64, 2 * PATIENCE_S)
     return process
 
 
@@ -65,7 +65,7 @@ def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, 
     workers = workers_of(process)
     assert len(workers) == 2
     process.send_signal(kill)
-    output = process.communicate(timeout=WITHIN_S)[0]
+    output = process.communicate(timeout=PATIENCE_S)[0]
     _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
     assert not alive
     if kill != signal.SIGKILL:
@@ -79,7 +79,7 @@ def test_a_killed_worker_is_one_line_that_says_how_to_go_on(tmp_path, undisturbe
     process = start(tmp_path)
     workers = workers_of(process)
     os.kill(workers[0].pid, signal.SIGKILL)
-    output = process.communicate(timeout=60.0)[0]
+    output = process.communicate(timeout=PATIENCE_S)[0]
     assert process.returncode == 2
     assert "a worker process was killed" in output
     assert "--resume" in output
