@@ -22,7 +22,7 @@ from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from log_files import FORMATS, balancing_loop, map_text, part, recorded, write
 
 NUM_FILES = int(os.environ.get("FUZZ_FILES", "1000"))
-LONGEST_MESSAGE = 700
+LONGEST_MESSAGE = 800
 ROOT = Path(__file__).parents[1]
 TOKENS = [
     *(b"NaN", b"1e308", b"-1", b"inf", b"[", b"{", b"*a", b"&a [*a]", b"\xff\xfe", b"\x00"),

@@ -250,8 +250,9 @@ def check_rates(
     Raises:
         ValueError: The check failed; the message names the column.
     """
-    size = np.sqrt(np.mean(logged**2, axis=0))
-    expected = np.sqrt(np.mean(derived**2, axis=0))
+    with np.errstate(over="ignore"):  # An infinite size is implausible too.
+        size = np.sqrt(np.mean(logged**2, axis=0))
+        expected = np.sqrt(np.mean(derived**2, axis=0))
     is_far = (size > _MOVING) & (size > _RATE_FACTOR * expected)
     if is_far.any():
         column = int(np.argmax(is_far))

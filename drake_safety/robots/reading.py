@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-_LONGEST_MESSAGE = 600  # Characters.
+_LONGEST_MESSAGE = 500  # Characters, without the name of the file.
 _MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
 
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes, EpisodesInfo
-from drake_safety.robots.reading import reading
+from drake_safety.robots.reading import reading, shortened
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -256,8 +256,8 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
             raise TypeError("it has no extra")
         # Fields that older folders lack have defaults that mean "unknown".
         return EpisodesInfo(**fields), extra
-    except TypeError as error:
-        raise ValueError(f"{file} does not describe episodes: {error}") from error
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{file} does not describe episodes: {shortened(str(error))}") from error
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
