@@ -217,14 +217,19 @@ class Balancing(LeggedLoop):
             self.start_control(context)
 
     def start_control(self, context: Context) -> None:
-        """Sets the command that the controller holds at the Context's time; see `LeggedLoop`."""
-        time_s, period_s = context.get_time(), self.scenario.control_period_s
-        num_periods = math.ceil((time_s - self._control_offset_s) / period_s) - 1
-        if num_periods >= 0:
-            context.SetTime(num_periods * period_s + self._control_offset_s)
+        """Sets the command for the present state and plan; see `LeggedLoop`."""
         self._controller.start(self._controller.GetMyMutableContextFromRoot(context))
-        if num_periods >= 0:
-            context.SetTime(time_s)
+
+    def advance_control(self, context: Context, time_s: float) -> None:
+        """Moves the Context to a time, with the controller's updates until then."""
+        period_s, offset_s = self.scenario.control_period_s, self._control_offset_s
+        first, last = (
+            max(math.ceil((time - offset_s) / period_s), 0) for time in (context.get_time(), time_s)
+        )
+        for update in range(first, last):
+            context.SetTime(update * period_s + offset_s)
+            self._controller.update(self._controller.GetMyMutableContextFromRoot(context))
+        context.SetTime(time_s)
 
     def _output_of(self, q: np.ndarray) -> np.ndarray:
         return q[4:7]

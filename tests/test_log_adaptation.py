@@ -27,8 +27,8 @@ def folder(tmp_path_factory):
     assessment.warping_cost, assessment.initialization = "rooted", "random"
     assessment.exaggeration = 1.0
     assessment.paper = PaperReading(stride=0, standardized=True, dropout=0.0, epochs=40)
-    episodes = run_episodes(scenario, 48, seed=11, num_workers=1)
-    assert 8 <= episodes.num_unsafe <= 40
+    episodes = run_episodes(scenario, 64, seed=11, num_workers=1)
+    assert 8 <= episodes.num_unsafe <= 56
     for mode in MODES:
         scenario.assessment.mode = mode
         scenario.assessment.perplexity, scenario.assessment.epochs = 5.0, 20
@@ -84,10 +84,9 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
         change = adapted.correction_.change
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
-        # A twin of a log draws noise of its own, its plan is another polynomial between rows, and
-        # servo loads are solved for anew.
+        # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
         np.testing.assert_allclose(
-            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.15 * changed, 0.015)
+            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.01)
         )
         np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 

@@ -172,7 +172,10 @@ def _episode(log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float) 
         end_s = ticks[int(np.argmax(is_out))]
         times = np.append(times[times < end_s - _ROUNDING_S], end_s)
     recorder = Recorder(loop, RECORDED_PORTS)
+    context.SetTime(0.0)
     for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
+        # What the robot was commanded is not logged: the loop's own controller says it.
+        loop.advance_control(context, float(time_s))
         _set_state(loop, context, time_s, state)
         recorder.record(context)
     arrays: dict[str, Any] = recorder.arrays()
@@ -200,5 +203,3 @@ def _set_state(loop: LeggedLoop, context: Context, time_s: float, state: np.ndar
     context.SetTime(float(time_s))
     plant_context = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)
-    # What the robot was commanded is not logged: the loop's own controller says it.
-    loop.start_control(context)

@@ -274,11 +274,20 @@ class LeggedLoop(PlannedLoop):
         return start.stance_pose(self.kinematics)
 
     def start_control(self, context: Context) -> None:
-        """Sets the command that the controller would hold by now; it holds none by default.
+        """Sets the command for a start in the present state; a controller may hold none.
 
         Args:
             context: The root Context.
         """
+
+    def advance_control(self, context: Context, time_s: float) -> None:
+        """Moves a Context to a later time, with the command that the controller holds then.
+
+        Args:
+            context: The root Context; its state is the caller's.
+            time_s: The time [s].
+        """
+        context.SetTime(time_s)
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         with self._physics.edited(context) as plant_context:

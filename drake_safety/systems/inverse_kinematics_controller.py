@@ -132,6 +132,14 @@ class InverseKinematicsController(FloatSystem, LeafSystem):
         """
         self._initialize(context, context.get_mutable_discrete_state())
 
+    def update(self, context: Context) -> None:
+        """Updates the command for the present inputs, as a simulation does every period.
+
+        Args:
+            context: This system's Context, with its inputs connected.
+        """
+        self._update(context, context.get_mutable_discrete_state())
+
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         plant_state = self._state_port.Eval(context)
         guess = plant_state[NUM_BASE_POSITIONS : self._kinematics.num_positions]
