@@ -17,7 +17,7 @@ from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Bootstrap, Estimate
 from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.learning.assessment import AssessmentParameters
-from drake_safety.simulation.rollouts import parallel_map
+from drake_safety.simulation.worker_processes import parallel_map
 from studies.ablation import (
     BASELINE,
     AblationSets,

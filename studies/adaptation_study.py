@@ -15,7 +15,7 @@ from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes, Segments, split
-from drake_safety.simulation.rollouts import parallel_map
+from drake_safety.simulation.worker_processes import parallel_map
 
 SIZES = (40, 80, 120, 160, 400)
 """Numbers of feedback sets after which an assessment is evaluated."""

@@ -10,14 +10,9 @@ from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasStatePlanes, require
-from drake_safety.simulation.rollouts import (
-    Progress,
-    batches,
-    parallel_map,
-    run_episode,
-    worker_loop,
-)
+from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import Progress, batches, parallel_map
 
 THRESHOLD = 0.5
 """Lowest Γ that is classified safe."""

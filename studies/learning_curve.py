@@ -47,8 +47,8 @@ from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.rollouts import parallel_map
 from drake_safety.simulation.scenario import load_scenario
+from drake_safety.simulation.worker_processes import parallel_map
 from studies import command_line
 from studies.learning_curve_figure import learning_curve_figure
 

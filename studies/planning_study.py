@@ -18,15 +18,9 @@ from drake_safety.learning.segments import Episode
 from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
-from drake_safety.simulation.rollouts import (
-    batches,
-    episode_rng,
-    episodes_info,
-    parallel_map,
-    run_episode,
-    worker_loop,
-)
+from drake_safety.simulation.rollouts import episode_rng, episodes_info, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import batches, parallel_map
 
 PLANS = {
     "default": "default plan",

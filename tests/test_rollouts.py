@@ -16,8 +16,9 @@ from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
-from drake_safety.simulation.rollouts import episode_rng, parallel_map, worker_loop
+from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import parse_scenario
+from drake_safety.simulation.worker_processes import parallel_map
 from gliding_task import SCENARIO, Gliding, gliding
 from legged_robots import write_hexapod
 from shuttle_task import shuttling

@@ -9,13 +9,15 @@ import pytest
 from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
-    Motion,
-    ShiftedSet,
     Verdicts,
     assessment_judge,
     detector_judges,
     evaluate_shift,
     false_alarms,
+)
+from drake_safety.evaluation.shifted_motions import (
+    Motion,
+    ShiftedSet,
     junk,
     of_episodes,
     run_changed_starts,

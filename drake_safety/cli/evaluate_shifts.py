@@ -28,7 +28,8 @@ from drake_safety.learning.seeds import SHIFTS
 
 if TYPE_CHECKING:
     from drake_safety.cli.console import Stages
-    from drake_safety.evaluation.shift_study import ShiftedSet, ShiftResult
+    from drake_safety.evaluation.shift_study import ShiftResult
+    from drake_safety.evaluation.shifted_motions import ShiftedSet
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.scenario import Scenario
 
@@ -127,7 +128,7 @@ def _shifted_sets(
     stages: Stages,
     workers: int | None,
 ) -> dict[str, ShiftedSet]:
-    from drake_safety.evaluation.shift_study import (
+    from drake_safety.evaluation.shifted_motions import (
         junk,
         of_episodes,
         run_changed_starts,

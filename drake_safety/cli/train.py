@@ -115,7 +115,7 @@ def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
     from joblib.externals.loky import ProcessPoolExecutor
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    from drake_safety.simulation.rollouts import end_with_parent
+    from drake_safety.simulation.worker_processes import end_with_parent
 
     executor = ProcessPoolExecutor(
         max_workers=max(num_workers, 1), initializer=end_with_parent, initargs=(os.getpid(),)

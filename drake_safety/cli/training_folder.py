@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
-    from drake_safety.simulation.rollouts import Progress
     from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.worker_processes import Progress
 
 
 class AssessmentFolder(NamedTuple):

@@ -18,15 +18,9 @@ from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.rollouts import (
-    Progress,
-    episodes_info,
-    run_batches,
-    run_episode,
-    run_episodes,
-    worker_loop,
-)
+from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import Progress, run_batches
 from drake_safety.systems.feedback_recorder import FeedbackRecorder, RecordedWindow
 
 _TWINS = "nominal"

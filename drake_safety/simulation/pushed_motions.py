@@ -14,15 +14,10 @@ from drake_safety.simulation.capabilities import (
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.motion_files import MotionFolder, Pair
-from drake_safety.simulation.rollouts import (
-    Progress,
-    episode_rng,
-    episodes_info,
-    run_batches,
-    worker_loop,
-)
+from drake_safety.simulation.rollouts import episode_rng, episodes_info, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
+from drake_safety.simulation.worker_processes import Progress, run_batches
 
 _MAX_TRIES = 50
 

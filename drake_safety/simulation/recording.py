@@ -23,8 +23,9 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.contract import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
-from drake_safety.simulation.rollouts import Progress, collect_episodes, episode_rng
+from drake_safety.simulation.rollouts import collect_episodes, episode_rng
 from drake_safety.simulation.scenario import source_digest
+from drake_safety.simulation.worker_processes import Progress
 
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 

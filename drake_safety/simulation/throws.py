@@ -23,13 +23,9 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import Mishap
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.rollouts import (
-    Progress,
-    episode_rng,
-    run_batches,
-    worker_loop,
-)
+from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import Progress, run_batches
 
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.

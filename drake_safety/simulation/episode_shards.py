@@ -1,0 +1,158 @@
+"""Parquet shards of episodes: rows to episodes and back."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drake_safety.learning.segments import DIVERGED, Episode, EpisodesInfo
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+_FAILURES = "num_controller_failures"
+
+
+_LARGEST = 1e12  # Of any quantity in SI units.
+
+
+_SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
+
+
+@contextlib.contextmanager
+def replacing(final: Path) -> Iterator[Path]:
+    """A temporary file beside a final one, renamed to it on success and removed on any exception.
+
+    Args:
+        final: Path of the complete file.
+    """
+    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
+    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        # The bytes reach the disk before the name does.
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(final)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
+    import pyarrow as pa
+
+    counts = [len(episode.time_s) for episode in episodes]
+
+    def repeat(values: Sequence[Any], dtype: Any) -> np.ndarray:
+        return np.repeat(np.asarray(values, dtype=dtype), counts)
+
+    columns: dict[str, Any] = {
+        "episode": repeat([episode.index for episode in episodes], np.int64),
+        "step": np.concatenate([np.arange(count, dtype=np.int32) for count in counts]),
+        "time_s": np.concatenate([np.asarray(e.time_s, dtype=np.float64) for e in episodes]),
+    }
+    for name, width in info.widths.items():
+        # Parquet has no lists of length 0: such an array has no column.
+        if width:
+            rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
+            columns[name] = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(rows)), width)
+    causes = [episode.cause for episode in episodes]
+    columns["is_safe"] = repeat([episode.is_safe for episode in episodes], np.bool_)
+    columns["cause"] = pa.array(np.repeat(np.asarray(causes, dtype=object), counts), pa.string())
+    columns["first_step"] = repeat([episode.first_step for episode in episodes], np.int32)
+    failures = [episode.num_controller_failures for episode in episodes]
+    columns[_FAILURES] = repeat(failures, np.int32)
+    return pa.table(columns)
+
+
+def _from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
+    widths = info.widths
+    names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
+    names += ["is_safe", "cause", "first_step"]
+    # Older shards have no count of failures; nothing is learned from it.
+    if table.column_names not in ([*names, _FAILURES], names):
+        raise ValueError(
+            f"{shard} has columns {table.column_names}; expected {[*names, _FAILURES]}"
+        )
+    arrays: dict[str, np.ndarray] = {}
+    for name, width in widths.items():
+        if not width:
+            arrays[name] = np.empty((table.num_rows, 0))
+            continue
+        column = table.column(name).combine_chunks()
+        if getattr(column.type, "list_size", None) != width:
+            raise ValueError(f"{shard}: {name} is {column.type}; expected lists of length {width}")
+        arrays[name] = column.flatten().to_numpy().reshape(table.num_rows, width)
+    for name in ["episode", "step", "time_s", "is_safe", "cause", "first_step"]:
+        arrays[name] = table.column(name).to_numpy()
+    failures = np.zeros(table.num_rows, dtype=int)
+    if _FAILURES in table.column_names:
+        failures = table.column(_FAILURES).to_numpy()
+    episode = arrays["episode"]
+    if not len(episode):
+        raise ValueError(f"{shard} holds no episodes")
+    bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), table.num_rows]
+    result = []
+    for first, last in itertools.pairwise(bounds):
+        rows = slice(first, last)
+        if not np.array_equal(arrays["step"][rows], np.arange(last - first)):
+            raise ValueError(f"{shard}: the steps of episode {episode[first]} are not 0, 1, 2, ...")
+        if not (np.diff(arrays["time_s"][rows]) > 0.0).all():
+            raise ValueError(f"{shard}: the time of episode {episode[first]} does not increase")
+        if arrays["cause"][first] != DIVERGED:
+            for name in ("time_s", *widths):
+                if not (np.abs(arrays[name][rows]) < _LARGEST).all():
+                    raise ValueError(
+                        f"{shard}: {name} of episode {episode[first]} holds values that are not "
+                        f"finite numbers below {_LARGEST:g}"
+                    )
+        result.append(
+            Episode(
+                index=int(episode[first]),
+                time_s=arrays["time_s"][rows].copy(),
+                **{name: arrays[name][rows].copy() for name in widths},
+                is_safe=bool(arrays["is_safe"][first]),
+                cause=str(arrays["cause"][first]),
+                first_step=int(arrays["first_step"][first]),
+                num_controller_failures=int(failures[first]),
+            )
+        )
+    return result
+
+
+def _shards(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return []
+    return sorted(
+        (file for file in path.iterdir() if _SHARD_NAME.fullmatch(file.name)), key=_shard_number
+    )
+
+
+def _shard_number(shard: Path) -> int:
+    return int(shard.stem.removeprefix("episodes-"))
+
+
+def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        # ParquetFile and not read_table, which adds columns for folders named like `seed=1`.
+        with pq.ParquetFile(shard, page_checksum_verification=True) as file:
+            table = file.read(columns=columns)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(
+            f"shard {shard} is truncated or damaged ({error}); remove it and resume: its episodes "
+            "will be run again"
+        ) from error
+    if columns is not None and table.column_names != columns:
+        raise ValueError(f"{shard} holds no episodes: expected columns {columns}")
+    return table
