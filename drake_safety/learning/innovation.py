@@ -4,130 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from drake_safety.learning.charts import (
+    Chart,
+    averaged,
+    limit_of,
+    trimmed_whitening_of,
+    whitening_of,
+)
 from drake_safety.learning.novelty import Moments, Novelty
+from drake_safety.learning.state_predictor import HIDDEN_SIZES, Predictor
 
 TIME_CONSTANTS_S = (0.8, 4.0)
 """Memory of the charts."""
-FALSE_ALARMS_PER_HOUR = 0.02
-"""Rate of false alarms of each chart on the nominal plant, by extrapolation."""
 KINDS = ("", "frozen", "distance", "scatter", "fast", "slow")
 """What raises an alarm, "" for none: repeated inputs, the distance of x, the norm of the
 innovations, and their two charts."""
 _NUM_FOLDS = 3
-_HIDDEN = (128, 128)
-_SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
-_TRIMMED = 0.1  # Share of the largest errors left out of their covariance, such as impacts.
-_TRIMMINGS = 4
 _CLIP_SHARE = 0.99  # Of innovations that are not clipped, so that one impact is no lasting change.
-_BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
-_TAIL = 0.1  # Share of the blocks in the tail.
 _ALLOWANCE = 0.5  # Of the sums, in standard deviations.
 _LARGEST_STEP = 5.0  # Of the sums, in standard deviations.
 _LEAST_ROWS = 10  # Rows for each state, below which there is no alarm.
 _FREE_REPEATS = 2  # Beyond the longest run of repeated inputs in training.
-_RIDGE = 1.0
-_LEAST_EARLY_STOPPING = 100  # Rows, of which a tenth is held out.
-_MOST_ROWS = 40_000  # For the network.
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Predictor:
-    """Predicts the change of the measured state in one step from x.
-
-    A linear regression with a network of two hidden layers on its residual.
-
-    Attributes:
-        mean, scale: Standardisation of x, (n_x,).
-        linear, bias: The regression, (n_x, n_s), (n_s,).
-        layers: Weights and biases of the network.
-    """
-
-    mean: np.ndarray
-    scale: np.ndarray
-    linear: np.ndarray
-    bias: np.ndarray
-    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
-
-    @classmethod
-    def fit(cls, x: np.ndarray, change: np.ndarray) -> Predictor:
-        """Fits the change (N, n_s) to inputs (N, n_x)."""
-        from sklearn.linear_model import Ridge
-        from sklearn.neural_network import MLPRegressor
-        from threadpoolctl import threadpool_limits
-
-        mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), _SMALLEST_SPREAD)
-        z = (x - mean) / scale
-        with threadpool_limits(1):
-            ridge = Ridge(alpha=_RIDGE).fit(z, change)
-            residual = change - ridge.predict(z)
-            unit = np.maximum(residual.std(axis=0), 1e-12)
-            rows = np.random.default_rng(0).permutation(len(x))[:_MOST_ROWS]
-            network = MLPRegressor(
-                hidden_layer_sizes=_HIDDEN,
-                alpha=1e-3,
-                batch_size=min(256, len(rows)),
-                early_stopping=len(rows) >= _LEAST_EARLY_STOPPING,
-                n_iter_no_change=4,
-                max_iter=40,
-                tol=1e-3,
-                random_state=0,
-            )
-            _fit_quietly(network, z[rows], residual[rows] / unit)
-        layers = [*zip(network.coefs_, network.intercepts_, strict=True)]
-        layers[-1] = (layers[-1][0] * unit, layers[-1][1] * unit)
-        # Files store the network in single precision.
-        layers = [tuple(np.float32(part).astype(float) for part in layer) for layer in layers]
-        return cls(
-            mean=mean,
-            scale=scale,
-            linear=ridge.coef_.T,
-            bias=ridge.intercept_,
-            layers=tuple(layers),
-        )
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Returns the predicted changes (N, n_s) at inputs (N, n_x)."""
-        z = (x - self.mean) / self.scale
-        hidden = z
-        for weight, bias in self.layers[:-1]:
-            hidden = np.maximum(hidden @ weight + bias, 0.0)
-        weight, bias = self.layers[-1]
-        return z @ self.linear + self.bias + (hidden @ weight + bias)
-
-    def corrected(self, x: np.ndarray, change: np.ndarray) -> Predictor:
-        """Returns the predictor with the regression fitted to another plant's changes."""
-        from sklearn.linear_model import Ridge
-
-        z = (x - self.mean) / self.scale
-        # Few rows: what they do not determine stays as it was.
-        ridge = Ridge(alpha=len(x) / 10.0).fit(z, change - self(x))
-        return Predictor(
-            mean=self.mean,
-            scale=self.scale,
-            linear=self.linear + ridge.coef_.T,
-            bias=self.bias + ridge.intercept_,
-            layers=self.layers,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Chart:
-    """A multivariate chart of the exponentially weighted mean of whitened innovations (MEWMA).
-
-    Attributes:
-        time_constant_s: Memory [s].
-        whitening: Whitens the mean on the nominal plant, (n_s, n_s).
-        limit: Largest norm of the whitened mean; infinite if training had too little motion.
-    """
-
-    time_constant_s: float
-    whitening: np.ndarray
-    limit: float
 
 
 class Innovation:
@@ -202,7 +103,7 @@ class Innovation:
                 errors[i] = _errors(predictor, x[i], num_states)
                 distances[i] = known.of(x[i][1:])
         whole = np.concatenate(errors)
-        offset, whitening = _trimmed_whitening(whole)
+        offset, whitening = trimmed_whitening_of(whole)
         norm = np.linalg.norm((whole - offset) @ whitening, axis=1)
         distance = np.concatenate(distances)
         summed = np.stack([distance, np.minimum(norm, np.quantile(norm, _CLIP_SHARE))])
@@ -226,9 +127,9 @@ class Innovation:
         limited = unlimited.limited(np.concatenate([errors[i] for i in order]))
         charts = []
         for rate, chart in zip(unlimited.rates, unlimited.charts, strict=True):
-            means = _averaged(limited, rate)
-            whitening = _whitening(means, is_centred=True)[1]
-            limit = _limit(np.linalg.norm(means @ whitening, axis=1), step_s)
+            means = averaged(limited, rate)
+            whitening = whitening_of(means, is_centred=True)[1]
+            limit = limit_of(np.linalg.norm(means @ whitening, axis=1), step_s)
             charts.append(
                 Chart(time_constant_s=chart.time_constant_s, whitening=whitening, limit=limit)
             )
@@ -254,8 +155,8 @@ class Innovation:
         limited = self.limited(np.concatenate(errors))
         charts = []
         for rate, chart in zip(self.rates, self.charts, strict=True):
-            norm = np.linalg.norm(_averaged(limited, rate) @ chart.whitening, axis=1)
-            limit = max(chart.limit, _limit(norm, self.step_s))
+            norm = np.linalg.norm(averaged(limited, rate) @ chart.whitening, axis=1)
+            limit = max(chart.limit, limit_of(norm, self.step_s))
             charts.append(
                 Chart(time_constant_s=chart.time_constant_s, whitening=chart.whitening, limit=limit)
             )
@@ -281,7 +182,7 @@ class Innovation:
     def _sums_with_limits(self, distance: np.ndarray, limited: np.ndarray) -> np.ndarray:
         norm = np.linalg.norm(limited, axis=1)
         limits = [
-            _limit(self._summed(i, one), self.step_s) for i, one in enumerate((distance, norm))
+            limit_of(self._summed(i, one), self.step_s) for i, one in enumerate((distance, norm))
         ]
         return np.column_stack([self.sums[:, :2], limits])
 
@@ -319,7 +220,7 @@ class Innovation:
             KeyError: One is missing.
             ValueError: A shape is wrong, or a number is not finite.
         """
-        widths = (num_inputs, *_HIDDEN, num_states)
+        widths = (num_inputs, *HIDDEN_SIZES, num_states)
         square, n_charts = (num_states, num_states), len(TIME_CONSTANTS_S)
         shapes: dict[str, tuple[int, ...]] = {
             "mean": (num_inputs,),
@@ -333,7 +234,7 @@ class Innovation:
             "chart_whitenings": (n_charts, *square),
             "settings": (3,),
         }
-        for i in range(len(_HIDDEN) + 1):
+        for i in range(len(HIDDEN_SIZES) + 1):
             shapes[f"layer.{i}.weight"] = (widths[i], widths[i + 1])
             shapes[f"layer.{i}.bias"] = (widths[i + 1],)
         for name, shape in shapes.items():
@@ -346,7 +247,7 @@ class Innovation:
                 )
         layers = [
             (arrays[f"layer.{i}.weight"], arrays[f"layer.{i}.bias"])
-            for i in range(len(_HIDDEN) + 1)
+            for i in range(len(HIDDEN_SIZES) + 1)
         ]
         clip, longest_repeat, step_s = arrays["settings"]
         return cls(
@@ -445,7 +346,7 @@ class Innovation:
             for i, values in enumerate(watched):
                 found[is_step, 1 + i] = self._summed(i, values) / self.sums[i, 2]
             for column, (chart, rate) in enumerate(zip(self.charts, self.rates, strict=True), 3):
-                averages = _averaged(innovations, rate)
+                averages = averaged(innovations, rate)
                 found[is_step, column] = (
                     np.linalg.norm(averages @ chart.whitening, axis=1) / chart.limit
                 )
@@ -500,15 +401,6 @@ def describe(kind: str, deviations: np.ndarray, state_names: Sequence[str]) -> s
 _SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
 
 
-def _fit_quietly(network: Any, z: np.ndarray, target: np.ndarray) -> None:
-    import warnings
-
-    with warnings.catch_warnings():
-        # The number of epochs is limited on purpose.
-        warnings.simplefilter("ignore")
-        network.fit(z, target)
-
-
 def _steps(x: Sequence[np.ndarray], num_states: int) -> tuple[np.ndarray, np.ndarray]:
     """Inputs of all motions but the last ones, and the changes of the state after them."""
     changes = [np.diff(one[:, :num_states], axis=0) for one in x]
@@ -517,51 +409,6 @@ def _steps(x: Sequence[np.ndarray], num_states: int) -> tuple[np.ndarray, np.nda
 
 def _errors(predictor: Predictor, x: np.ndarray, num_states: int) -> np.ndarray:
     return np.diff(x[:, :num_states], axis=0) - predictor(x[:-1])
-
-
-def _whitening(values: np.ndarray, *, is_centred: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and W with (values - mean) W of unit covariance, by shrinkage."""
-    from sklearn.covariance import LedoitWolf
-
-    # Constant states have no covariance to invert.
-    scale = np.maximum(values.std(axis=0), 1e-9)
-    found = LedoitWolf(assume_centered=is_centred).fit(values / scale)
-    ridge = 1e-6 * np.eye(len(scale))
-    root = np.linalg.cholesky(np.linalg.inv(found.covariance_ + ridge))
-    mean = np.zeros(len(scale)) if is_centred else found.location_ * scale
-    return mean, root / scale[:, None]
-
-
-def _trimmed_whitening(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same without the largest values, which would hide a change of the others."""
-    mean, whitening = _whitening(values)
-    for _ in range(_TRIMMINGS):
-        norm = np.linalg.norm((values - mean) @ whitening, axis=1)
-        mean, whitening = _whitening(values[norm <= np.quantile(norm, 1.0 - _TRIMMED)])
-    return mean, whitening
-
-
-def _averaged(values: np.ndarray, rate: float) -> np.ndarray:
-    """Exponentially weighted means of consecutive rows, from zero."""
-    from scipy.signal import lfilter
-
-    averaged: np.ndarray = lfilter([rate], [1.0, rate - 1.0], values, axis=0)
-    return averaged
-
-
-def _limit(statistic: np.ndarray, step_s: float) -> float:
-    """A limit for the rate of false alarms, by an exponential tail (peaks over threshold)."""
-    size = max(1, round(_BLOCK_S / step_s))
-    blocks = statistic[: max(1, len(statistic) // size) * size]
-    if len(blocks) >= size:
-        blocks = blocks.reshape(-1, size).max(axis=1)
-    threshold = float(np.quantile(blocks, 1.0 - _TAIL))
-    excess = blocks[blocks > threshold] - threshold
-    if not len(excess):
-        return 2.0 * float(statistic.max())
-    per_hour = _TAIL * 3600.0 / (size * step_s)
-    extrapolated = threshold + excess.mean() * np.log(per_hour / FALSE_ALARMS_PER_HOUR)
-    return float(max(extrapolated, statistic.max()))
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:

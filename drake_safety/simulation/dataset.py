@@ -26,12 +26,12 @@ from drake_safety.robots.reading import reading, shortened
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 from drake_safety.simulation.episode_shards import (
-    _from_table,
-    _read_shard,
-    _shard_number,
-    _shards,
-    _to_table,
+    from_table,
+    read_shard,
     replacing,
+    shard_number,
+    shards_in,
+    to_table,
 )
 
 _SCHEMA_VERSION = 1
@@ -98,7 +98,7 @@ class EpisodeWriter:
         self._indices = completed(self.path)
         open_folder(self.path, info, extra, accept_code_change=accept_code_change)
         self._next_shard = 1 + max(
-            (_shard_number(shard) for shard in _shards(self.path)), default=-1
+            (shard_number(shard) for shard in shards_in(self.path)), default=-1
         )
 
     def append(self, episode: Episode) -> None:
@@ -142,7 +142,7 @@ class EpisodeWriter:
     def _write(self) -> None:
         import pyarrow.parquet as pq
 
-        table = _to_table(self._pending, self.info)
+        table = to_table(self._pending, self.info)
         columns = [f"{name}.list.element" for name, width in self.info.widths.items() if width]
         final = self.path / f"episodes-{self._next_shard:05d}.parquet"
         with replacing(final) as temporary:
@@ -267,7 +267,7 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
     Raises:
         ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
     """
-    shards = _shards(Path(path))
+    shards = shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(
             f"{path} holds {len(shards)} shards but no {_INFO_NAME}, so the set that they belong "
@@ -275,7 +275,7 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
         )
     indices: set[int] = set()
     for shard in shards:
-        indices.update(_read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
+        indices.update(read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
     return indices
 
 
@@ -290,9 +290,9 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     """
     info, _ = read_info(path)
     episodes: dict[int, tuple[Episode, Path]] = {}
-    for shard in _shards(Path(path)):
+    for shard in shards_in(Path(path)):
         with reading(shard):
-            found = _from_table(_read_shard(shard), info, shard)
+            found = from_table(read_shard(shard), info, shard)
             Episodes(info, found)  # Checks them.
         for episode in found:
             known, where = episodes.setdefault(episode.index, (episode, shard))

@@ -17,13 +17,8 @@ from drake_safety.learning.segments import DIVERGED, Episode, EpisodesInfo
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
 _FAILURES = "num_controller_failures"
-
-
 _LARGEST = 1e12  # Of any quantity in SI units.
-
-
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 
 
@@ -46,7 +41,8 @@ def replacing(final: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
+def to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
+    """The rows of episodes, one after another."""
     import pyarrow as pa
 
     counts = [len(episode.time_s) for episode in episodes]
@@ -73,7 +69,17 @@ def _to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
     return pa.table(columns)
 
 
-def _from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
+def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
+    """The episodes of a shard's rows.
+
+    Args:
+        table: The rows.
+        info: Metadata of the set.
+        shard: The file, for messages.
+
+    Raises:
+        ValueError: The shard is empty or of another set, or its values are not those of episodes.
+    """
     widths = info.widths
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
@@ -128,19 +134,30 @@ def _from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episod
     return result
 
 
-def _shards(path: Path) -> list[Path]:
+def shards_in(path: Path) -> list[Path]:
+    """The shards of a folder, in the order of their numbers; none if it does not exist."""
     if not path.is_dir():
         return []
     return sorted(
-        (file for file in path.iterdir() if _SHARD_NAME.fullmatch(file.name)), key=_shard_number
+        (file for file in path.iterdir() if _SHARD_NAME.fullmatch(file.name)), key=shard_number
     )
 
 
-def _shard_number(shard: Path) -> int:
+def shard_number(shard: Path) -> int:
+    """The number in a shard's name."""
     return int(shard.stem.removeprefix("episodes-"))
 
 
-def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
+def read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
+    """The rows of a shard.
+
+    Args:
+        shard: The file.
+        columns: The columns; all by default.
+
+    Raises:
+        ValueError: The shard is truncated or damaged, or lacks a column.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
