@@ -8,17 +8,9 @@ import numpy as np
 
 FALSE_ALARMS_PER_HOUR = 0.02
 """Rate of false alarms of each chart on the nominal plant, by extrapolation."""
-
-
 _TRIMMED = 0.1  # Share of the largest errors left out of their covariance, such as impacts.
-
-
 _TRIMMINGS = 4
-
-
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
-
-
 _TAIL = 0.1  # Share of the blocks in the tail.
 
 

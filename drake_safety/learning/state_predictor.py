@@ -8,17 +8,10 @@ from typing import Any
 import numpy as np
 
 HIDDEN_SIZES = (128, 128)
-
-
+"""Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
-
-
 _RIDGE = 1.0
-
-
 _LEAST_EARLY_STOPPING = 100  # Rows, of which a tenth is held out.
-
-
 _MOST_ROWS = 40_000  # For the network.
 
 
