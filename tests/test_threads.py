@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, standing_loop
 from drake_safety import load_assessment, load_scenario
-from drake_safety.plants.scratch import Scratch
+from drake_safety.robots.robot import Scratch
 
 NUM_THREADS, DURATION_S = 8, 0.2
 PORTS = ("state", "features", "margins")

@@ -11,9 +11,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
-from drake_safety.plants.scratch import Scratch
 from drake_safety.robots.robot import (
     PlantVariation,
+    Scratch,
     add_robot,
     apply_masses,
     posture_positions,

@@ -11,8 +11,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.plants.mujoco_model import build_model, import_mujoco
-from drake_safety.plants.scratch import Scratch
-from drake_safety.robots.robot import PlantVariation, servo_joints
+from drake_safety.robots.robot import PlantVariation, Scratch, servo_joints
 from drake_safety.robots.robot_model import RobotModel
 
 _LOGGER = logging.getLogger("drake_safety")

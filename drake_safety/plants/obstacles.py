@@ -17,9 +17,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.plants.scratch import Scratch
 from drake_safety.robots.model_files import model_file, package_parser
-from drake_safety.robots.robot import add_robot
+from drake_safety.robots.robot import Scratch, add_robot
 from drake_safety.robots.robot_model import RobotModel
 
 

@@ -1,7 +1,10 @@
 """Adds a robot to a MultibodyPlant, with plant variations that model a reality gap."""
 
 import re
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 from pydrake.geometry import (
@@ -31,6 +34,7 @@ from drake_safety.robots.shift import JointShift, Shift
 
 ENGINES = ("drake", "mujoco")
 """Physics engines that a plant variation may choose."""
+_T = TypeVar("_T")
 
 
 @dataclass(kw_only=True)
@@ -377,3 +381,18 @@ def apply_masses(
     M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)
     M_BBo_B += M_PBo_B
     body.SetSpatialInertiaInBodyFrame(context, M_BBo_B)
+
+
+class Scratch(threading.local, Generic[_T]):
+    """A value that a calculation overwrites, one for each thread.
+
+    Systems of one diagram share a robot's model, and Drake's users expect that a diagram can be
+    simulated in several threads, each with a Context of its own.
+
+    Args:
+        make: Makes the value; called once in every thread that uses it.
+    """
+
+    def __init__(self, make: Callable[[], _T]):
+        # A subclass of threading.local is initialised anew in each thread.
+        self.value = make()
