@@ -5,6 +5,7 @@ import pytest
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer, classifier_scorers
+from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
 
@@ -28,6 +29,8 @@ class StandIn:
             safety_probability=state[:, 0],
             normalized=2.0 * state[:, 0],
             calibrated=3.0 * state[:, 0],
+            # Nothing is known of every third input.
+            belief=np.where(np.arange(len(state))[:, None] % 3 == 2, EMPTY, (0.6, 0.1, 0.3)),
         )
 
 
@@ -57,6 +60,11 @@ def test_gamma_scores_by_any_of_its_forms_on_what_its_mode_sees(episodes, uses_f
     np.testing.assert_array_equal(
         3.0 * literal.probability(*inputs), calibrated.probability(*inputs)
     )
+    is_unknown = np.arange(len(segments)) % 3 == 2
+    np.testing.assert_array_equal(np.isnan(literal.probability(*inputs)), is_unknown)
+    score = literal.unsafe_score(segments)
+    assert (score[is_unknown] == 1.0).all()
+    assert not np.isnan(score).any()
 
 
 def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(episodes):

@@ -160,9 +160,8 @@ def test_with_a_persistence_one_unknown_row_triggers_nothing_two_do_and_danger_d
 
     def trigger(low, persistence_s, *, is_known=False):
         values = np.ones(len(TIME_S))
-        values[low] = 0.0
-        known = (values > 0.0) | is_known
-        scorer = Scorer(name="given", probability=lambda *_: values, is_known=lambda *_: known)
+        values[low] = 0.0 if is_known else np.nan
+        scorer = Scorer(name="given", probability=lambda *_: values)
         probability = throw_study.log_probability(log, scorer, persistence_s)
         return throw_study.trigger_time(log, probability, 0.6)
 

@@ -131,7 +131,7 @@ def reachable_region(
         if progress is not None:
             progress("verdicts on the plane", start, len(targets))
         chunk = targets[start : start + _REPORT_EVERY]
-        probability.append(scorer.probability(*goal_inputs(loop, chunk)))
+        probability.append(np.nan_to_num(scorer.probability(*goal_inputs(loop, chunk)), nan=0.0))
         for name, kinematics in reachability.items():
             reachable[name].append(kinematics.is_reachable(chunk))
     if progress is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
-from drake_safety.learning.assessment import Assessments, SafetyAssessment
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import UNCERTAINTY
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
@@ -24,22 +24,24 @@ class Scorer:
     Attributes:
         name: Its key in tables.
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
-            (N, n_f); NaN for "don't know".
-        is_known: Whether anything is known of the same inputs, (N,); None if it always is.
+            (N, n_f); NaN where nothing is known.
         uses_true_state: Whether it takes the state without noise in nominal episodes.
         used: Episodes used to train, calibrate or adapt it.
     """
 
     name: str
     probability: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-    is_known: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     uses_true_state: bool = False
     used: Sequence[UsedEpisodes] = ()
 
     def unsafe_score(self, segments: Segments) -> np.ndarray:
-        """Unsafe score of each segment, one minus its safety probability, (N,)."""
+        """Unsafe score of each segment, one minus its safety probability, (N,).
+
+        Where nothing is known it is 1.
+        """
         state = segments.true_state if self.uses_true_state else segments.state
-        return 1.0 - self.probability(state, segments.desired_preview, segments.features)
+        probability = self.probability(state, segments.desired_preview, segments.features)
+        return 1.0 - np.nan_to_num(probability, nan=0.0)
 
 
 def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -> Scorer:
@@ -53,25 +55,18 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
             "don't know".
     """
 
-    def predict(
+    def probability(
         state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
-    ) -> Assessments:
-        return assessment.predict(
+    ) -> np.ndarray:
+        result = assessment.predict(
             state, desired_preview, features if assessment.uses_features else None
         )
-
-    def probability(*inputs: np.ndarray) -> np.ndarray:
-        found: np.ndarray = getattr(predict(*inputs), published)
-        return found
-
-    def is_known(*inputs: np.ndarray) -> np.ndarray:
-        known: np.ndarray = predict(*inputs).belief[:, UNCERTAINTY] < 1.0
-        return known
+        is_known = result.belief[:, UNCERTAINTY] < 1.0
+        return np.where(is_known, getattr(result, published), np.nan)
 
     return Scorer(
         name=name,
         probability=probability,
-        is_known=is_known,
         uses_true_state=not assessment.parameters.is_sharpened,
         used=assessment.used_,
     )

@@ -258,7 +258,7 @@ def _monitored(
     if promise is not None:
         accepted = _first_probability(assessment, motions) >= promise.threshold
     delay, errors = [], {span: [] for span in SPANS_S}  # type: ignore[var-annotated]
-    counts = np.zeros((0, 2))  # Missed and unsafe motions of each sequence.
+    counted = []  # Missed and unsafe motions of each sequence.
     starts = np.linspace(0, len(motions), min(_MOST_STARTS, len(motions)), endpoint=False)
     for start in starts.astype(int):
         order, rows = [], 0
@@ -279,7 +279,7 @@ def _monitored(
         begins = np.concatenate([[0], np.cumsum([len(x[i]) for i in order])[:-1]])
         is_unsafe = np.array([motions[i].is_unsafe for i in order])
         is_missed = is_unsafe & accepted[order] & (begins < alarm)
-        counts = np.vstack([counts, [is_missed.sum(), is_unsafe.sum()]])
+        counted.append((is_missed.sum(), is_unsafe.sum()))
     found = {
         f"monitor.confident_error_{span:g}s": _mean(np.array(values))
         for span, values in errors.items()
@@ -287,6 +287,7 @@ def _monitored(
     found["monitor.delay_s"] = _quantile(np.array(delay), 0.5)
     found["monitor.delay_95_s"] = _quantile(np.array(delay), 0.95)
     found["monitor.alarmed"] = proportion(int(np.isfinite(delay).sum()), len(delay))
+    counts = np.array(counted)
     if promise is not None and counts[:, 1].any():
 
         def missed_share(weight: np.ndarray) -> float:

@@ -121,14 +121,13 @@ def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -
         persistence_s: Where nothing is known, the highest probability within this time counts [s];
             before it has passed, 1.
     """
-    inputs = (log.state, log.desired_preview, log.features)
-    probability = np.nan_to_num(scorer.probability(*inputs), nan=0.0)
-    if len(probability) < 2 or not persistence_s or scorer.is_known is None:
+    probability = scorer.probability(log.state, log.desired_preview, log.features)
+    if len(probability) < 2 or not persistence_s:
         return probability
     num_waited = math.ceil(persistence_s / (log.time_s[1] - log.time_s[0]) - 1e-6)
-    padded = np.concatenate([np.ones(num_waited), probability])
+    padded = np.concatenate([np.ones(num_waited), np.nan_to_num(probability, nan=0.0)])
     highest = np.lib.stride_tricks.sliding_window_view(padded, num_waited + 1).max(axis=1)
-    return np.where(scorer.is_known(*inputs), probability, highest)
+    return np.where(np.isnan(probability), highest, probability)
 
 
 def choose_threshold(

@@ -120,9 +120,7 @@ class SafetyAssessment:
             self._learn(episodes, progress)
         return self
 
-    def _learn(
-        self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
-    ) -> None:
+    def _learn(self, episodes: Episodes, progress: Callable[[str, float], None] | None) -> None:
         parameters = self.parameters
         info = episodes.info
         for name in ("horizon", "preview_stride"):
@@ -260,19 +258,16 @@ class SafetyAssessment:
                 self._training, segments, points, *arguments
             )
         elif self.base_logit_ is not None:
-            # Only pairs with different outcomes are evidence of a reality gap.
-            if any(one.differs for one in feedback):
-                change, hidden, hidden_range = recalibration.fitted_change(
-                    *recalibration.outcomes(
-                        feedback, self.inputs_of, self.embedding_, self.base_logit_
-                    ),
-                    self.base_logit_,
-                    self.parameters.adaptation,
-                )
-                guard = recalibration.guarded_cells(segments, points, self.grid_)
-                adapted.correction_ = Correction(
-                    change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
-                )
+            adapted.correction_ = recalibration.fitted_correction(
+                feedback,
+                segments,
+                points,
+                inputs=self.inputs_of,
+                embedding=self.embedding_,
+                base_logit=self.base_logit_,
+                grid=self.grid_,
+                parameters=self.parameters.adaptation,
+            )
             residual = adapted.correction_.residual(self.embedding_, x)
             adapted.beliefs_ = recalibration.recalibrated_beliefs(
                 self._training,

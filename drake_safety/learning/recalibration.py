@@ -157,6 +157,40 @@ def fitted_change(
     return found[:3], hidden, np.array([added.min(), added.max()])
 
 
+def fitted_correction(
+    feedback: Sequence[FeedbackSet],
+    segments: FeedbackSegments,
+    points: np.ndarray,
+    *,
+    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    embedding: Embedding,
+    base_logit: BaseLogit,
+    grid: Grid,
+    parameters: AdaptationParameters,
+) -> Correction:
+    """Fits the correction of the base logit to feedback; zero without a pair that differs.
+
+    Only pairs with different outcomes are evidence of a reality gap.
+
+    Args:
+        feedback: The feedback sets.
+        segments: Their segments.
+        points: Psi(x) of the segments, (K, N, 2).
+        inputs: Maps states, previews and features to x.
+        embedding: The maps.
+        base_logit: The base logit.
+        grid: The grid.
+        parameters: Parameters of the adaptation.
+    """
+    if not any(one.differs for one in feedback):
+        return Correction.none(embedding, grid)
+    change, hidden, hidden_range = fitted_change(
+        *outcomes(feedback, inputs, embedding, base_logit), base_logit, parameters
+    )
+    guard = guarded_cells(segments, points, grid)
+    return Correction(change=change, hidden=hidden, hidden_range=hidden_range, guard=guard)
+
+
 def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
     """Averages values (M,) in every map's cells, (K, R*R); 0 in cells without points.
 

@@ -22,9 +22,6 @@ import numpy as np
 
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.robots.reading import reading, shortened
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 from drake_safety.simulation.episode_shards import (
     from_table,
     read_shard,
@@ -33,6 +30,9 @@ from drake_safety.simulation.episode_shards import (
     shards_in,
     to_table,
 )
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"

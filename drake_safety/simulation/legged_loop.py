@@ -173,11 +173,17 @@ class LeggedLoop(PlannedLoop):
             seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
             outlook=outlook,
         )
-        self._add_gravity(builder)
+        parts = [(self._features, self.feature_names), self._add_gravity(builder)]
         if servo_command is not None:
-            self._add_servo_load(builder, servo_command)
+            parts.append(self._add_servo_load(builder, servo_command))
+        features = builder.AddNamedSystem("features", Multiplexer([p.size() for p, _ in parts]))
+        for i, (port, _) in enumerate(parts):
+            builder.Connect(port, features.get_input_port(i))
+        self._features = features.get_output_port(0)
+        self.feature_names = [name for _, names in parts for name in names]
 
-    def _add_gravity(self, builder: DiagramBuilder) -> None:
+    def _add_gravity(self, builder: DiagramBuilder) -> tuple[OutputPort, list[str]]:
+        """Adds gravity in the plane of the feet; returns the port and the names of its entries."""
         system = builder.AddNamedSystem(
             "gravity_features", GravityFeatures(self.kinematics, mirror=self._observers.mirror)
         )
@@ -187,10 +193,12 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(gravity.get_output_port(), system.GetInputPort("gravity"))
         measured = self._assessor_observer.GetOutputPort("measured_plant_state")
         builder.Connect(measured, system.GetInputPort("plant_state"))
-        self._append_features(builder, system.GetOutputPort("features"), system.feature_names)
+        return system.GetOutputPort("features"), system.feature_names
 
-    def _add_servo_load(self, builder: DiagramBuilder, command: OutputPort) -> None:
-        """Appends commanded minus measured joint positions, to which loads are proportional."""
+    def _add_servo_load(
+        self, builder: DiagramBuilder, command: OutputPort
+    ) -> tuple[OutputPort, list[str]]:
+        """Adds commanded minus measured joint positions, to which loads are proportional."""
         names = self.kinematics.joint_names
         measured = self._assessor_observer.GetOutputPort("measured_plant_state")
         difference = builder.AddNamedSystem("servo_load", Adder(2, len(names)))
@@ -205,19 +213,7 @@ class LeggedLoop(PlannedLoop):
             part = builder.AddNamedSystem(name, MatrixGain(joints))
             builder.Connect(port, part.get_input_port())
             builder.Connect(part.get_output_port(), difference.get_input_port(i))
-        self._append_features(
-            builder, difference.get_output_port(), [f"servo_load_{name}" for name in names]
-        )
-
-    def _append_features(self, builder: DiagramBuilder, port: OutputPort, names: list[str]) -> None:
-        parts = (self._features, port)
-        features = builder.AddNamedSystem(
-            f"features_to_{names[-1]}", Multiplexer([part.size() for part in parts])
-        )
-        for i, part in enumerate(parts):
-            builder.Connect(part, features.get_input_port(i))
-        self._features = features.get_output_port(0)
-        self.feature_names = self.feature_names + names
+        return difference.get_output_port(), [f"servo_load_{name}" for name in names]
 
     def _export_robot(
         self,

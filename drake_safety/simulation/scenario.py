@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
 
 
-_MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 ON_ALARM = ("unknown", "report")
 """What an alarm of the monitor may do."""
+_MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 
 
 @dataclass(kw_only=True)
