@@ -161,7 +161,8 @@ def _checked(
         if is_number(tensor).any():
             raise ValueError(f"its {name} has entries that are not finite numbers")
     nested = {"paper": PaperReading, "adaptation": AdaptationParameters}
-    own = dict(entries["parameters"])
+    # Files from before this parameter are of exact neighbours.
+    own = {"candidates_per_neighbour": 0} | entries["parameters"]
     own |= {name: _typed(made, own[name], name) for name, made in nested.items()}
     parameters = _typed(AssessmentParameters, own, "parameters")
     return parameters, _learned(parameters, entries, tensors)
