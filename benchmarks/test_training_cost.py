@@ -83,7 +83,7 @@ def fit_cost(mode: str, folder: Path, num_episodes: int) -> dict[str, float]:
     return {
         "cpu_s": cpu_s,
         "memory_gb": peak_memory_gb() - imports_gb,
-        "segments": assessment.training_points_.shape[1],
+        "segments": int(assessment.training_.counts(assessment.grid_)[0].sum()),
         **{f"{stage}, s": value for stage, value in stages.items()},
     }
 

@@ -68,11 +68,13 @@ def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_di
     cells = feedback_cells(assessment, feedback, lambda segments: slice(None))[0]
     cells = cells[cells >= 0]
     # Training that has not reached where the feedback is.
-    is_far = ~np.isin(assessment.grid_.locate(assessment.training_points_[0]), cells)
-    assessment.training_points_ = assessment.training_points_[:, is_far]
-    for name in ("heads", "score", "cause", "nearest"):
-        values = getattr(assessment, f"training_{name}_")
-        setattr(assessment, f"training_{name}_", values[is_far])
+    is_far = ~np.isin(assessment.grid_.locate(assessment.training_.points[0]), cells)
+    known = assessment.training_
+    rows = {
+        name: getattr(known, name)[is_far]
+        for name in ("heads", "score", "cause", "nearest", "multiplicity")
+    }
+    assessment.training_ = dataclasses.replace(known, points=known.points[:, is_far], **rows)
     assessment.beliefs_ = assessment.prior_beliefs()
     assert np.all(assessment.beliefs_[0, cells, UNCERTAINTY] == 1.0)
     adapted = assessment.adapt(feedback).beliefs_[0]
@@ -219,8 +221,8 @@ def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prio
     x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     difference = np.abs(segments.score - segments.nominal_score)
-    _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_points_[0])
-    cells = paper.grid_.locate(paper.training_points_[0])
+    _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_.points[0])
+    cells = paper.grid_.locate(paper.training_.points[0])
     far = np.setdiff1d(
         cells[deviation > 0.3], [*cells[deviation <= 0.3], *paper.grid_.locate(points)]
     )
@@ -235,10 +237,10 @@ def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper)
     x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     discrepancy = DiscrepancyFunction().fit(points, np.abs(segments.score - segments.nominal_score))
-    mean, deviation = discrepancy.predict(paper.training_points_[0])
+    mean, deviation = discrepancy.predict(paper.training_.points[0])
     mu = updated_uncertainty(mean, deviation, gate=0.3, least=0.1, initial=0.3)
     adapted = paper.adapt(feedback).beliefs_[0]
-    cells = paper.grid_.locate(paper.training_points_[0])
+    cells = paper.grid_.locate(paper.training_.points[0])
     visited = set(paper.grid_.locate(points))
     count = 0
     for cell in set(cells) - visited - {-1}:
@@ -246,7 +248,7 @@ def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper)
         if members.sum() < paper.parameters.min_count:
             continue
         masses = from_scores(
-            paper.training_score_[members], mu[members], paper.training_cause_[members], 2
+            paper.training_.score[members], mu[members], paper.training_.cause[members], 2
         )
         np.testing.assert_allclose(adapted[cell], fuse(masses), atol=1e-9)
         count += 1

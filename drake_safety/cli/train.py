@@ -151,6 +151,7 @@ def _learn(
         The number of segments, the share of unsafe episodes, and the CPU time [s].
     """
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.training import segments_for
     from drake_safety.simulation.dataset import load_episodes
 
     def report(stage: str, share: float) -> None:
@@ -165,4 +166,5 @@ def _learn(
     assessment = SafetyAssessment(scenario.assessment).fit(data, report)
     assessment.save(assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    return assessment.training_points_.shape[1], unsafe, time.process_time() - started
+    num_segments = len(segments_for(data, scenario.assessment)[0])
+    return num_segments, unsafe, time.process_time() - started

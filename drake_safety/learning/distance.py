@@ -4,12 +4,12 @@ The paper names "the dynamic time warping operator" without a definition. `WARPI
 definitions in use: the sum of squared distances along the warping path, its root (tslearn,
 dtaidistance), and the sum of distances (fastdtw).
 
-The Euclidean distance of two error sequences, the shorter one held at its last value, is the cost of
-one admissible warping path and so bounds DTW from above. A tree finds the candidates with the
+The Euclidean distance of two error sequences, the shorter one held at its last value, is the cost
+of one admissible warping path and so bounds DTW from above. A tree finds the candidates with the
 smallest bounds; DTW is computed for these alone, so the cost grows as N log N with the number of
 segments. Segments that are close in the tree share their candidates: one call of dtaidistance's C
-implementation treats them together, and abandons a pair as soon as it exceeds the largest bound
-that matters.
+implementation takes them together, and abandons a pair as soon as it exceeds the largest bound that
+matters.
 """
 
 from __future__ import annotations
@@ -124,14 +124,13 @@ def neighbour_graph(
 
     places = _places(held * (looseness * scale ** (1.0 / power)), score * score_weight, power)
     tree = cKDTree(places, leafsize=_ROWS)
-    is_exact = num_candidates is None or num_candidates >= num_segments - 1
     columns = np.arange(num_segments)
     distances = np.empty((num_segments, num_neighbours))
     indices = np.empty((num_segments, num_neighbours), dtype=int)
     for start in range(0, num_segments, _ROWS):
         # Successive indices of the tree are those of a leaf.
         rows = tree.indices[start : start + _ROWS]
-        if not is_exact:
+        if num_candidates is not None and num_candidates < num_segments - 1:
             columns = np.unique(tree.query(places[rows], num_candidates + 1)[1])
         bound = omega(rows, columns, looseness * _euclidean(held[rows], held[columns]))
         radius = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1].max()
