@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drake_safety.learning import adaptation
+from drake_safety.learning.adaptation import TrainingScores, prior_beliefs
 from drake_safety.learning.assessment import (
     AdaptationParameters,
     AssessmentParameters,
@@ -403,3 +404,36 @@ def test_the_adaptation_defaults_are_the_papers_table():
     assert (parameters.gate, parameters.least_uncertainty) == (0.3, 0.1)
     assert (parameters.decay_rate, parameters.first_uncertainty) == (0.4, 0.3)
     assert parameters.update_interval == 40
+
+
+def crowded_scores(num_segments, rng):
+    """Two maps with a crowded cell each, and some segments elsewhere."""
+    points = rng.normal([3.0, 3.0], 1.0, (2, num_segments, 2)).astype(np.float32)
+    is_elsewhere = rng.random(num_segments) < 0.05
+    points[:, is_elsewhere] = rng.uniform(-40.0, 40.0, (2, is_elsewhere.sum(), 2))
+    score = np.where(rng.random(num_segments) < np.where(is_elsewhere, 0.9, 0.2), 0.8, 0.0)
+    return TrainingScores(points=points, score=score, cause=np.where(score > 0.0, 0, -1))
+
+
+def test_crowded_cells_keep_few_segments_and_their_beliefs_are_those_of_all():
+    parameters, grid = AssessmentParameters(), Grid(resolution=14, cell_length=10.0)
+    few, many = (crowded_scores(n, np.random.default_rng(0)) for n in (20_000, 80_000))
+    kept = {len(one.thinned(grid, seed=0).score) for one in (few, many)}
+    assert max(kept) < 0.5 * 20_000 + 0.1 * 80_000
+    thinned = many.thinned(grid, seed=0)
+    np.testing.assert_array_equal(thinned.counts(grid), many.counts(grid))
+    np.testing.assert_allclose(thinned.multiplicity.sum(), 80_000, rtol=0.1)
+    every, some = (prior_beliefs(one, grid, parameters, 1) for one in (many, thinned))
+    np.testing.assert_array_equal(some[..., UNCERTAINTY], every[..., UNCERTAINTY])
+    # 500 draws a cell have a standard error of 0.018.
+    np.testing.assert_allclose(some, every, atol=0.07)
+
+
+def test_cells_with_few_segments_keep_them_all():
+    grid = Grid(resolution=14, cell_length=10.0)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-69.0, 69.0, (1, 5000, 2)).astype(np.float32)
+    scores = TrainingScores(points=points, score=np.zeros(5000), cause=np.full(5000, -1))
+    thinned = scores.thinned(grid, seed=0)
+    np.testing.assert_array_equal(thinned.points, points)
+    np.testing.assert_array_equal(thinned.multiplicity, 1.0)

@@ -14,6 +14,7 @@ from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import calibrate
 from drake_safety.learning.segments import split
+from drake_safety.learning.training import segments_for
 from lip_assessments import QUICK, inputs
 from lip_episodes import make_episodes
 
@@ -129,7 +130,8 @@ def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessme
             np.testing.assert_array_equal(belief[:3], EMPTY)
         else:
             # Equal uncertainties: F is the mean of the masses.
-            score = assessment.training_.score[cells == cell].mean()
+            here, training = cells == cell, assessment.training_
+            score = np.average(training.score[here], weights=training.multiplicity[here])
             np.testing.assert_allclose(belief[:3], [0.7 * (1 - score), 0.7 * score, 0.3])
 
 
@@ -440,7 +442,7 @@ def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_f
     for shortest in (0, 10, 3):
         learned = trained_on(few, shortest_segment=shortest)
         expected = split(few, stride=1, discount=0.99, shortest=shortest or None)
-        sizes[shortest] = learned.training_.score.shape[-1]
+        sizes[shortest] = len(segments_for(few, learned.parameters)[0])
         assert sizes[shortest] == len(expected)
     assert sizes[0] == sizes[10] < sizes[3]  # The horizon is 10.
 
@@ -448,7 +450,7 @@ def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_f
 def test_the_papers_mode_knows_no_short_segments(episodes):
     few = episodes[:60]
     learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
-    sizes = {assessment.training_.score.shape[-1] for assessment in learned}
+    sizes = {len(segments_for(few, assessment.parameters)[0]) for assessment in learned}
     assert sizes == {len(split(few, stride=1, discount=0.99))}
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drake_safety.cli.console import (
+    ClusterOption,
     ScenarioArgument,
     Stages,
     WorkersOption,
@@ -54,6 +55,7 @@ def train(
         ),
     ] = False,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Simulate the nominal closed loop and train Γ.
 

@@ -168,9 +168,7 @@ class SafetyAssessment:
                 if margins.shape[1]
                 else np.zeros(len(segments), dtype=np.int64)
             )
-        is_placed = (
-            not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
-        )
+        is_placed = not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
         self.training_ = TrainingScores(
             points=output.embedding.astype(np.float32),
             score=assessment_file.single(segments.score),
