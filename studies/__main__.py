@@ -8,6 +8,7 @@ from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
 from studies.converged import converged
+from studies.kills import kills
 from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
 from studies.publish import readme, ship, store
@@ -28,6 +29,7 @@ app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
 app.command()(readings)
 app.command()(converged)
+app.command()(kills)
 app.command()(scale)
 app.command()(truth)
 app.command()(store)
