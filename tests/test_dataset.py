@@ -1,6 +1,9 @@
 import dataclasses
+import errno
 import json
 import logging
+import os
+import shutil
 import subprocess
 import sys
 import time
@@ -315,6 +318,33 @@ def test_leftover_temporary_files_are_ignored(tmp_path):
     assert completed(tmp_path) == {0}
     write(tmp_path, [1])
     assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+
+
+def test_a_full_disk_is_named_and_what_was_not_written_yet_is_written_later(tmp_path, monkeypatch):
+    writer = EpisodeWriter(tmp_path, make_info())
+    writer.append(make_episode(0))
+    writer.flush()
+    writer.append(make_episode(1))
+
+    def fail(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        with pytest.raises(OSError, match=r"episodes-00001.parquet cannot be written: No space"):
+            writer.flush()
+        assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
+    writer.close()
+    assert completed(tmp_path) == {0, 1}
+
+
+def test_a_folder_that_is_gone_is_named(tmp_path):
+    with EpisodeWriter(tmp_path / "gone", make_info()) as writer:
+        writer.append(make_episode(0))
+        shutil.rmtree(tmp_path / "gone")
+        with pytest.raises(OSError, match=r"gone/episodes-00000.parquet cannot be written: No su"):
+            writer.flush()
+        (tmp_path / "gone").mkdir()
 
 
 def test_leftover_temporary_files_are_removed_by_the_next_writer(tmp_path):

@@ -81,6 +81,7 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
+    from drake_safety.learning.assessment_file import replacing
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -143,7 +144,8 @@ def adapt(
         **{key: estimate.to_json() for key, estimate in judged.items()},
     }
     file = folder / "adaptation.json"
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(_adaptation_table(adapted, differing, num_pairs, name))
     if judged:
         console.print(_judged_table(judged, variation))

@@ -127,7 +127,7 @@ def evaluate(
     from drake_safety.evaluation.report.results import Results
     from drake_safety.evaluation.report.verdicts import verdict_tables
     from drake_safety.evaluation.scorers import classifier_scorers
-    from drake_safety.learning.assessment_file import file_hash
+    from drake_safety.learning.assessment_file import file_hash, replacing
     from drake_safety.simulation.capabilities import (
         CanBePushed,
         HasBall,
@@ -242,7 +242,8 @@ def evaluate(
         **{key: estimate.to_json() for key, estimate in findings.estimates.items()},
     }
     file = folder / "evaluation.json"
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     for table in verdict_tables(Results(estimates=findings.estimates)):
         console.print(figures_table(table))
     print_path("figures", file)

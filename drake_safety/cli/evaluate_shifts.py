@@ -78,7 +78,7 @@ def evaluate_shifts_command(
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.evaluation.shift_study import evaluate_shifts, false_alarms
     from drake_safety.evaluation.shifts_figure import shifts_figure
-    from drake_safety.learning.assessment_file import file_hash
+    from drake_safety.learning.assessment_file import file_hash, replacing
     from drake_safety.simulation.dataset import load_episodes
 
     gamma = load_assessment(assessment, "sharpened")
@@ -112,7 +112,8 @@ def evaluate_shifts_command(
             for key, estimate in result.estimates.items()
         },
     }
-    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     _print_table(results)
     print_path("figures", file)
     for picture in save(shifts_figure(results), folder / "shifts"):

@@ -18,6 +18,7 @@ from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.capabilities import HasBall, judging_options
@@ -151,7 +152,8 @@ def compare_scenario(
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"made_by": made_by, "row": row}, indent=2)
     part = file.with_suffix(".part")
-    part.write_text(text + "\n", encoding="utf-8")
+    with replacing(part) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
     part.replace(file)
     return row
 

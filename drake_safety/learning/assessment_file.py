@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import UnionType
@@ -105,17 +105,39 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     # safetensors stores several entries of metadata in any order.
     text = _to_json(entries | {"sha256": _digest(entries, arrays)})
     content = save(arrays, {SCHEMA: text})
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextlib.contextmanager
+def replacing(final: Path) -> Iterator[Path]:
+    """A temporary file beside a final one, renamed to it on success and removed on any exception.
+
+    What a killed process left of the same file is removed.
+
+    Args:
+        final: Path of the complete file.
+
+    Raises:
+        OSError: It cannot be written; the message names the file.
+    """
+    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
+    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
+        for left in final.parent.glob(f".{final.name}.*.tmp"):
+            left.unlink(missing_ok=True)
+        yield temporary
+        # The bytes reach the disk before the name does.
+        with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        temporary.replace(final)
+    except OSError as error:
+        why = error.strerror if error.errno is None else os.strerror(error.errno)
+        raise OSError(
+            f"{final} cannot be written: {why}; what had been written before is kept"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:

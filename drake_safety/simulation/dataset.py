@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.robots.reading import reading, shortened
 from drake_safety.simulation.episode_shards import (
     from_table,
     read_shard,
-    replacing,
     shard_number,
     shards_in,
     to_table,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,25 +18,6 @@ if TYPE_CHECKING:
 _FAILURES = "num_controller_failures"
 _LARGEST = 1e12  # Of any quantity in SI units.
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
-
-
-@contextlib.contextmanager
-def replacing(final: Path) -> Iterator[Path]:
-    """A temporary file beside a final one, renamed to it on success and removed on any exception.
-
-    Args:
-        final: Path of the complete file.
-    """
-    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
-    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        # The bytes reach the disk before the name does.
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(final)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.simulation.dataset import open_folder
-from drake_safety.simulation.episode_shards import replacing
 from drake_safety.simulation.watched_motion import WatchedMotion
 
 Pair = tuple[WatchedMotion, WatchedMotion]
