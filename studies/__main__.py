@@ -7,6 +7,7 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
+from studies.bench import bench
 from studies.converged import converged
 from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
@@ -28,6 +29,7 @@ app.command()(adaptation)
 app.command()(readings)
 app.command()(converged)
 app.command()(truth)
+app.command()(bench)
 app.command()(store)
 app.command()(readme)
 app.command()(ship)
