@@ -28,6 +28,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "2048.",
     )
     group.addoption(
+        "--num-segments",
+        type=int,
+        default=2000,
+        help="Segments for DTW and t-SNE beside their peers, which need 5 minutes and 1.5 GB for "
+        "10000; 2000 by default.",
+    )
+    group.addoption(
         "--reference-episodes",
         type=int,
         default=10,
