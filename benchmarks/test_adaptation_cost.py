@@ -57,7 +57,7 @@ def test_one_update(
         f"adaptation by {method}, {scenario.name}",
         cost_s,
         "s CPU",
-        at_most=2.0,
+        at_most=0.5,
         peers=peers_s,
         note=f"{len(feedback)} pairs, {len(x)} rows, "
         f"{assessment.training_points_.shape[1]} training segments",
