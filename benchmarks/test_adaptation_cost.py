@@ -60,7 +60,7 @@ def test_one_update(
         at_most=0.5,
         peers=peers_s,
         note=f"{len(feedback)} pairs, {len(x)} rows, "
-        f"{assessment.training_points_.shape[1]} training segments",
+        f"{int(assessment.training_.counts(assessment.grid_)[0].sum())} training segments",
     )
 
 

@@ -65,7 +65,7 @@ def fit_cost(mode: str, folder: Path, num_episodes: int) -> dict[str, Any]:
     return {
         "cpu_s": cpu_s,
         "memory_gb": peak_memory_gb() - imports_gb,
-        "segments": assessment.training_points_.shape[1],
+        "segments": int(assessment.training_.counts(assessment.grid_)[0].sum()),
         "stages": stages,
     }
 
@@ -88,6 +88,10 @@ def our_cost(folder: Path, num_episodes: int, num_segments: int) -> dict[str, fl
 
     segments, parameters = some_segments(folder, num_episodes, num_segments)
 
+    def candidates_of(num_neighbours: int) -> int | None:
+        # As in training.
+        return parameters.candidates_per_neighbour * num_neighbours or None
+
     def distances(chosen: Any, num_neighbours: int) -> Any:
         return neighbour_graph(
             chosen.error,
@@ -95,6 +99,7 @@ def our_cost(folder: Path, num_episodes: int, num_segments: int) -> dict[str, fl
             chosen.score,
             score_weight=parameters.score_weight,
             num_neighbours=num_neighbours,
+            num_candidates=candidates_of(num_neighbours),
             cost="squared",
         )
 

@@ -13,6 +13,7 @@ from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
 from studies.publish import readme, ship, store
 from studies.readings import readings
+from studies.scale import scale
 from studies.truth import truth
 
 app = typer.Typer(
@@ -28,6 +29,7 @@ app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
 app.command()(readings)
 app.command()(converged)
+app.command()(scale)
 app.command()(truth)
 app.command()(bench)
 app.command()(store)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drake_safety.learning import adaptation
+from drake_safety.learning.adaptation import TrainingScores, prior_beliefs
 from drake_safety.learning.assessment import (
     AdaptationParameters,
     AssessmentParameters,
@@ -68,11 +69,13 @@ def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_di
     cells = feedback_cells(assessment, feedback, lambda segments: slice(None))[0]
     cells = cells[cells >= 0]
     # Training that has not reached where the feedback is.
-    is_far = ~np.isin(assessment.grid_.locate(assessment.training_points_[0]), cells)
-    assessment.training_points_ = assessment.training_points_[:, is_far]
-    for name in ("heads", "score", "cause", "nearest"):
-        values = getattr(assessment, f"training_{name}_")
-        setattr(assessment, f"training_{name}_", values[is_far])
+    is_far = ~np.isin(assessment.grid_.locate(assessment.training_.points[0]), cells)
+    known = assessment.training_
+    rows = {
+        name: getattr(known, name)[is_far]
+        for name in ("heads", "score", "cause", "nearest", "multiplicity")
+    }
+    assessment.training_ = dataclasses.replace(known, points=known.points[:, is_far], **rows)
     assessment.beliefs_ = assessment.prior_beliefs()
     assert np.all(assessment.beliefs_[0, cells, UNCERTAINTY] == 1.0)
     adapted = assessment.adapt(feedback).beliefs_[0]
@@ -219,8 +222,8 @@ def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prio
     x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     difference = np.abs(segments.score - segments.nominal_score)
-    _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_points_[0])
-    cells = paper.grid_.locate(paper.training_points_[0])
+    _, deviation = DiscrepancyFunction().fit(points, difference).predict(paper.training_.points[0])
+    cells = paper.grid_.locate(paper.training_.points[0])
     far = np.setdiff1d(
         cells[deviation > 0.3], [*cells[deviation <= 0.3], *paper.grid_.locate(points)]
     )
@@ -235,10 +238,10 @@ def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper)
     x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     discrepancy = DiscrepancyFunction().fit(points, np.abs(segments.score - segments.nominal_score))
-    mean, deviation = discrepancy.predict(paper.training_points_[0])
+    mean, deviation = discrepancy.predict(paper.training_.points[0])
     mu = updated_uncertainty(mean, deviation, gate=0.3, least=0.1, initial=0.3)
     adapted = paper.adapt(feedback).beliefs_[0]
-    cells = paper.grid_.locate(paper.training_points_[0])
+    cells = paper.grid_.locate(paper.training_.points[0])
     visited = set(paper.grid_.locate(points))
     count = 0
     for cell in set(cells) - visited - {-1}:
@@ -246,7 +249,7 @@ def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper)
         if members.sum() < paper.parameters.min_count:
             continue
         masses = from_scores(
-            paper.training_score_[members], mu[members], paper.training_cause_[members], 2
+            paper.training_.score[members], mu[members], paper.training_.cause[members], 2
         )
         np.testing.assert_allclose(adapted[cell], fuse(masses), atol=1e-9)
         count += 1
@@ -401,3 +404,36 @@ def test_the_adaptation_defaults_are_the_papers_table():
     assert (parameters.gate, parameters.least_uncertainty) == (0.3, 0.1)
     assert (parameters.decay_rate, parameters.first_uncertainty) == (0.4, 0.3)
     assert parameters.update_interval == 40
+
+
+def crowded_scores(num_segments, rng):
+    """Two maps with a crowded cell each, and some segments elsewhere."""
+    points = rng.normal([3.0, 3.0], 1.0, (2, num_segments, 2)).astype(np.float32)
+    is_elsewhere = rng.random(num_segments) < 0.05
+    points[:, is_elsewhere] = rng.uniform(-40.0, 40.0, (2, is_elsewhere.sum(), 2))
+    score = np.where(rng.random(num_segments) < np.where(is_elsewhere, 0.9, 0.2), 0.8, 0.0)
+    return TrainingScores(points=points, score=score, cause=np.where(score > 0.0, 0, -1))
+
+
+def test_crowded_cells_keep_few_segments_and_their_beliefs_are_those_of_all():
+    parameters, grid = AssessmentParameters(), Grid(resolution=14, cell_length=10.0)
+    few, many = (crowded_scores(n, np.random.default_rng(0)) for n in (20_000, 80_000))
+    kept = {len(one.thinned(grid, seed=0).score) for one in (few, many)}
+    assert max(kept) < 0.5 * 20_000 + 0.1 * 80_000
+    thinned = many.thinned(grid, seed=0)
+    np.testing.assert_array_equal(thinned.counts(grid), many.counts(grid))
+    np.testing.assert_allclose(thinned.multiplicity.sum(), 80_000, rtol=0.1)
+    every, some = (prior_beliefs(one, grid, parameters, 1) for one in (many, thinned))
+    np.testing.assert_array_equal(some[..., UNCERTAINTY], every[..., UNCERTAINTY])
+    # 500 draws a cell have a standard error of 0.018.
+    np.testing.assert_allclose(some, every, atol=0.07)
+
+
+def test_cells_with_few_segments_keep_them_all():
+    grid = Grid(resolution=14, cell_length=10.0)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-69.0, 69.0, (1, 5000, 2)).astype(np.float32)
+    scores = TrainingScores(points=points, score=np.zeros(5000), cause=np.full(5000, -1))
+    thinned = scores.thinned(grid, seed=0)
+    np.testing.assert_array_equal(thinned.points, points)
+    np.testing.assert_array_equal(thinned.multiplicity, 1.0)

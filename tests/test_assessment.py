@@ -14,6 +14,7 @@ from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import calibrate
 from drake_safety.learning.segments import split
+from drake_safety.learning.training import segments_for
 from lip_assessments import QUICK, inputs
 from lip_episodes import make_episodes
 
@@ -121,7 +122,7 @@ def test_other_beliefs_may_be_given_in_place_of_the_learned_ones(assessment, hel
 
 
 def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessment):
-    cells = assessment.grid_.locate(assessment.training_points_[0])
+    cells = assessment.grid_.locate(assessment.training_.points[0])
     filled, counts = np.unique(cells[cells >= 0], return_counts=True)
     for cell, count in zip(filled, counts, strict=True):
         belief = assessment.beliefs_[0, cell]
@@ -129,7 +130,8 @@ def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessme
             np.testing.assert_array_equal(belief[:3], EMPTY)
         else:
             # Equal uncertainties: F is the mean of the masses.
-            score = assessment.training_score_[cells == cell].mean()
+            here, training = cells == cell, assessment.training_
+            score = np.average(training.score[here], weights=training.multiplicity[here])
             np.testing.assert_allclose(belief[:3], [0.7 * (1 - score), 0.7 * score, 0.3])
 
 
@@ -155,7 +157,7 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
     before, after = (a.predict(*inputs(held_out)) for a in (assessment, loaded))
     for field in dataclasses.fields(before):
         np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
-    np.testing.assert_array_equal(loaded.training_points_, assessment.training_points_)
+    np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -320,7 +322,7 @@ def test_the_same_seed_learns_the_same_assessment(episodes):
     parameters = AssessmentParameters(**{**QUICK, "epochs": 1})
     first, again = (SafetyAssessment(parameters).fit(episodes[:60]) for _ in range(2))
     np.testing.assert_array_equal(first.beliefs_, again.beliefs_)
-    np.testing.assert_array_equal(first.training_points_, again.training_points_)
+    np.testing.assert_array_equal(first.training_.points, again.training_.points)
 
 
 def test_progress_runs_through_the_stages(episodes):
@@ -440,7 +442,7 @@ def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_f
     for shortest in (0, 10, 3):
         learned = trained_on(few, shortest_segment=shortest)
         expected = split(few, stride=1, discount=0.99, shortest=shortest or None)
-        sizes[shortest] = learned.training_score_.shape[-1]
+        sizes[shortest] = len(segments_for(few, learned.parameters)[0])
         assert sizes[shortest] == len(expected)
     assert sizes[0] == sizes[10] < sizes[3]  # The horizon is 10.
 
@@ -448,7 +450,7 @@ def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_f
 def test_the_papers_mode_knows_no_short_segments(episodes):
     few = episodes[:60]
     learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
-    sizes = {assessment.training_score_.shape[-1] for assessment in learned}
+    sizes = {len(segments_for(few, assessment.parameters)[0]) for assessment in learned}
     assert sizes == {len(split(few, stride=1, discount=0.99))}
 
 
@@ -472,8 +474,10 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
         with threadpool_limits(number):
             found.append(SafetyAssessment(AssessmentParameters(**QUICK)).fit(episodes))
     one, other = found
-    for name in ("training_points_", "training_heads_", "beliefs_"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.beliefs_, other.beliefs_)
+    for name in ("points", "heads"):
+        pair = (getattr(each.training_, name) for each in found)
+        np.testing.assert_array_equal(*pair)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
     for name, array in one.innovation_.arrays().items():
         np.testing.assert_array_equal(array, other.innovation_.arrays()[name], err_msg=name)

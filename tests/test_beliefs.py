@@ -103,3 +103,15 @@ def test_an_unsafe_score_without_a_cause_is_refused():
 def test_as_many_cells_as_beliefs_are_expected():
     with pytest.raises(ValueError, match="cells for beliefs"):
         fuse_cells(empty(3), np.zeros(2, dtype=int), num_cells=1, min_count=1)
+
+
+def test_a_multiplicity_counts_as_so_many_equal_beliefs():
+    rng = np.random.default_rng(0)
+    beliefs = from_scores(rng.random(12), rng.uniform(0.0, 1.0, 12), np.zeros(12, dtype=int), 1)
+    times, cells = rng.integers(1, 5, 12), rng.integers(0, 3, 12)
+    options = {"num_cells": 3, "min_count": 1}
+    np.testing.assert_allclose(
+        fuse_cells(beliefs, cells, multiplicity=times, **options),
+        fuse_cells(np.repeat(beliefs, times, axis=0), np.repeat(cells, times), **options),
+        atol=1e-12,
+    )

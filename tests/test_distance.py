@@ -44,10 +44,13 @@ def test_dtw_is_symmetric_and_agrees_with_its_oracle(segments):
     np.testing.assert_allclose(matrix, oracle, atol=1e-12)
 
 
-@pytest.mark.parametrize("block", [512, 37])
+@pytest.mark.parametrize("rows", [32, 7])
 @pytest.mark.parametrize("score_weight", [0.0, 0.01, 0.5])
-def test_the_graph_holds_exactly_the_nearest_neighbours(segments, block, score_weight, monkeypatch):
-    monkeypatch.setattr(distance, "_BLOCK", block)
+def test_among_all_segments_the_graph_holds_exactly_the_nearest_neighbours(
+    segments, rows, score_weight, monkeypatch
+):
+    monkeypatch.setattr(distance, "_ROWS", rows)
+    monkeypatch.setattr(distance, "_BLOCK", 4 * rows)
     graph = graph_of(segments, score_weight=score_weight)
     oracle = graph_of(segments, score_weight=score_weight, backend="tslearn")
     assert graph.max_dtw == pytest.approx(oracle.max_dtw, rel=1e-12)
@@ -77,6 +80,31 @@ def test_every_cost_of_a_warping_path_gives_its_exact_neighbours(segments, cost)
     np.fill_diagonal(omega, np.inf)
     nearest = np.sort(omega, axis=1)[:, : graph.distances.shape[1]]
     np.testing.assert_allclose(graph.distances, nearest, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cost", "score_weight"),
+    [("squared", 0.0), ("squared", 0.5), ("rooted", 0.01), ("absolute", 0.01)],
+)
+def test_candidates_with_the_smallest_bounds_hold_most_of_the_neighbours(cost, score_weight):
+    segments = split(make_episodes(150), stride=2, discount=0.99)
+    options = {"cost": cost, "score_weight": score_weight}
+    exact = graph_of(segments, **options)
+    found = graph_of(segments, **options, num_candidates=30)
+    assert len(segments) > 40 * 30
+    assert found.max_dtw == exact.max_dtw
+    # No candidate is nearer than a neighbour, and the distances are not the bounds.
+    assert np.all(found.distances >= exact.distances - 1e-12)
+    pairs = zip(found.indices, exact.indices, strict=True)
+    share = np.mean([np.isin(a, b, assume_unique=True).mean() for a, b in pairs])
+    assert share > 0.9
+    every = graph_of(segments, **options, num_candidates=len(segments) - 1)
+    np.testing.assert_array_equal(every.indices, exact.indices)
+
+
+def test_fewer_candidates_than_neighbours_are_refused(segments):
+    with pytest.raises(ValueError, match="got 14 candidates for 15 neighbours"):
+        graph_of(segments, num_candidates=14)
 
 
 def test_the_costs_of_a_path_are_the_values_worked_by_hand():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.embedding_figure import embedding_figure
+from drake_safety.learning.adaptation import TrainingScores
 from drake_safety.learning.beliefs import from_scores, fuse_cells
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
@@ -20,9 +21,10 @@ class StandIn:
         )
         self.grid_ = Grid(resolution=6, cell_length=0.1)
         segments = split(episodes, stride=1, discount=0.99)
-        self.training_points_ = segments.state[None, :, :2]
+        points = segments.state[None, :, :2]
+        self.training_ = TrainingScores(points=points, score=segments.score, cause=segments.cause)
         masses = from_scores(segments.score, 0.3, segments.cause, 2)
-        cells = self.grid_.locate(self.training_points_[0])
+        cells = self.grid_.locate(points[0])
         self.beliefs_ = fuse_cells(masses, cells, num_cells=36, min_count=5)[None]
 
     def predict(self, state, desired_preview, features):
@@ -47,7 +49,7 @@ def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fr
     expected = np.lexsort(segments.state[:, :2].T)
     np.testing.assert_allclose(drawn.get_offsets()[order], segments.state[expected, :2], rtol=1e-12)
     np.testing.assert_allclose(np.sort(drawn.get_array()), np.sort(segments.score))
-    points = assessment.training_points_[0]
+    points = assessment.training_.points[0]
     inside = np.abs(points).max(axis=1) < assessment.grid_.half_width
     assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
 

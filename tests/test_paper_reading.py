@@ -146,14 +146,14 @@ def test_the_discrepancy_is_predicted_where_t_sne_has_put_the_segments(episodes,
     settings = AdaptationParameters(discrepancy_at="tsne")
     prior = SafetyAssessment(paper(adaptation=settings, paper=PaperReading(epochs=2)))
     prior.fit(episodes)
-    assert prior.training_target_.shape == (len(prior.training_score_), 2)
+    assert prior.training_.target.shape == (len(prior.training_.score), 2)
     prior.save(tmp_path / "paper.safetensors")
     loaded = SafetyAssessment.load(tmp_path / "paper.safetensors")
-    np.testing.assert_array_equal(loaded.training_target_, prior.training_target_)
+    np.testing.assert_array_equal(loaded.training_.target, prior.training_.target)
     assert loaded.parameters == prior.parameters
     feedback = worse()
     adapted = loaded.adapt(feedback)
-    prior.training_target_ = None
+    prior.training_ = replace(prior.training_, target=None)
     assert not np.array_equal(adapted.beliefs_, prior.adapt(feedback).beliefs_)
 
 

@@ -186,7 +186,7 @@ def test_a_cell_says_the_belief_and_the_count_that_the_assessment_has(whole):
     np.testing.assert_allclose([c["causes"] for c in cells], beliefs[:, 3:], atol=1e-4)
     grid = whole.assessment.grid_
     assert sum(c["count"] for c in cells) == np.sum(
-        grid.locate(whole.assessment.training_points_[0]) >= 0
+        grid.locate(whole.assessment.training_.points[0]) >= 0
     )
     assert len(whole.page.all("rect", **{"class": "cell"})) == 2 * grid.num_cells
     labels = [a["aria-label"] for a in whole.page.all("rect", **{"class": "cell"})]

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from drake_safety.cli.console import (
     AssessmentOption,
+    ClusterOption,
     ScenarioArgument,
     Stages,
     WorkersOption,
@@ -72,6 +73,7 @@ def adapt(
         int, typer.Option(help="Seed of the feedback; that of the evaluation follows.")
     ] = ADAPTATION.first,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Adapt Γ to an actual robot, and evaluate it before and after.
 

@@ -9,6 +9,7 @@ import typer
 
 from drake_safety.cli.console import (
     AssessmentOption,
+    ClusterOption,
     ScenarioArgument,
     WorkersOption,
     console,
@@ -63,6 +64,7 @@ def calibrate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Choose thresholds with a promised miss rate on fresh episodes.
 

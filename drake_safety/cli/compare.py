@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from drake_safety.cli.console import (
+    ClusterOption,
     WorkersOption,
     command_line,
     console,
@@ -34,6 +35,7 @@ def compare(
     ] = 300,
     seed: Annotated[int, typer.Option(help="Seed.")] = 0,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Train and evaluate scenarios in one table: recalls, falls with and without recovery.
 

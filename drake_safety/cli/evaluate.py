@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import (
+    ClusterOption,
     ScenarioArgument,
     TrainingOption,
     WorkersOption,
@@ -112,6 +113,7 @@ def evaluate(
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Evaluate Γ on fresh episodes and throws, beside the paper's form and baseline classifiers.
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drake_safety.cli.console import (
+    ClusterOption,
     ScenarioArgument,
     Stages,
     WorkersOption,
@@ -54,6 +55,7 @@ def train(
         ),
     ] = False,
     workers: WorkersOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Simulate the nominal closed loop and train Γ.
 
@@ -151,6 +153,7 @@ def _learn(
         The number of segments, the share of unsafe episodes, and the CPU time [s].
     """
     from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.training import segments_for
     from drake_safety.simulation.dataset import load_episodes
 
     def report(stage: str, share: float) -> None:
@@ -165,4 +168,5 @@ def _learn(
     assessment = SafetyAssessment(scenario.assessment).fit(data, report)
     assessment.save(assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    return assessment.training_points_.shape[1], unsafe, time.process_time() - started
+    num_segments = len(segments_for(data, scenario.assessment)[0])
+    return num_segments, unsafe, time.process_time() - started

@@ -18,7 +18,7 @@ from drake_safety.evaluation.figure_style import (
     spoken,
 )
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
-from drake_safety.learning.grid import OUTSIDE, Grid
+from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def embedding_figure(
         )
     cells = (assessment.beliefs_ if beliefs is None else beliefs)[0]
     grid = assessment.grid_
-    inside = grid.locate(assessment.training_points_[0])
-    count = np.bincount(inside[inside != OUTSIDE], minlength=grid.num_cells)
+    count = assessment.training_.counts(grid)[0]
     with drawing_style():
         fig = new_figure(14.0, 4.6)
         left, middle, last = fig.subplots(1, 3)

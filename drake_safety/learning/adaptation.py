@@ -12,6 +12,8 @@ from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncer
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
 
+_KEPT_IN_CELL = 500
+
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptation:
@@ -41,14 +43,67 @@ class TrainingScores:
         heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
         nearest: Column of the constraint with the smallest predicted margin, (N,).
         target: Points in t-SNE, (N, 2); None if not used.
+        multiplicity: Number of segments that each stands for, (N,); None for one each.
+        count: Number of all training segments in every map's cells, (K, R*R); None if none of them
+            was left out.
     """
 
     points: np.ndarray
     score: np.ndarray
     cause: np.ndarray
-    heads: np.ndarray | None
-    nearest: np.ndarray | None
+    heads: np.ndarray | None = None
+    nearest: np.ndarray | None = None
     target: np.ndarray | None = None
+    multiplicity: np.ndarray | None = None
+    count: np.ndarray | None = None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Number of segments that each stands for, (N,)."""
+        return np.ones(len(self.score)) if self.multiplicity is None else self.multiplicity
+
+    def counts(self, grid: Grid) -> np.ndarray:
+        """Counts all training segments in every map's cells, (K, R*R)."""
+        if self.count is not None:
+            return self.count
+        located = [grid.locate(points) for points in self.points]
+        return np.stack(
+            [np.bincount(cells[cells >= 0], minlength=grid.num_cells) for cells in located]
+        )
+
+    def thinned(self, grid: Grid, seed: int) -> TrainingScores:
+        """Draws segments of crowded cells, so that a file does not grow with the number of all.
+
+        A segment is kept with probability p = min(1, c / n), n the number of segments in its cell
+        and c = 500; with several maps, the largest p. It then stands for 1 / p segments, so that
+        sums over cells keep their expectations (Horvitz and Thompson, 1952).
+
+        Args:
+            grid: The grid.
+            seed: Seed of the draws.
+        """
+        probability, count = np.zeros(len(self.score)), self.counts(grid)
+        for points, member_count in zip(self.points, count, strict=True):
+            cells = grid.locate(points)
+            # A point outside the grid is in no cell.
+            own = np.where(cells >= 0, _KEPT_IN_CELL / np.maximum(member_count[cells], 1), 0.0)
+            probability = np.maximum(probability, np.minimum(own, 1.0))
+        kept = np.random.default_rng(seed).random(len(self.score)) < probability
+
+        def rows(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values[kept]
+
+        return TrainingScores(
+            points=self.points[:, kept],
+            score=self.score[kept],
+            cause=self.cause[kept],
+            heads=rows(self.heads),
+            nearest=rows(self.nearest),
+            target=rows(self.target),
+            # As files store it.
+            multiplicity=(1.0 / probability[kept]).astype(np.float32).astype(float),
+            count=count,
+        )
 
 
 def prior_beliefs(
@@ -77,6 +132,7 @@ def prior_beliefs(
                 grid.locate(points),
                 num_cells=grid.num_cells,
                 min_count=parameters.min_count,
+                multiplicity=training.times,
             )
             for points, mu in zip(training.points, uncertainty, strict=True)
         ]

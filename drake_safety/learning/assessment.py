@@ -63,10 +63,8 @@ class SafetyAssessment:
     - `innovation_`: the `Innovation`, the error of predicting the next state, for a monitor.
     - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
       predictions take other beliefs as an argument.
-    - `training_points_`, `training_score_`, `training_cause_`: Psi(x), lambda and the cause of the
-      training segments, (K, N, 2), (N,), (N,), from which adaptation starts; for maps with heads
-      also `training_heads_` and `training_nearest_`, and `training_target_` if the discrepancy is
-      predicted there, see `TrainingScores`, (N, 2), (N,), (N, 2).
+    - `training_`: the `TrainingScores`, the embedded training segments, from which adaptation
+      starts; crowded cells keep some of their segments.
     - `novelty_`: the `Novelty`, which says which inputs are unlike those of training.
     - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
@@ -160,27 +158,31 @@ class SafetyAssessment:
         if progress is not None:
             progress("innovation", 1.0)
         output = self.embedding_.evaluate(x)
-        self.training_points_ = output.embedding.astype(np.float32)
-        self.training_score_ = assessment_file.single(segments.score)
-        self.training_cause_ = segments.cause
         self.base_logit_: BaseLogit | None = base_logit
-        self.training_heads_ = self.training_nearest_ = self.training_target_ = None
-        if not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne":
-            self.training_target_ = target.astype(np.float32)
+        heads = nearest = None
         if base_logit is not None:
             margins = output.margins.mean(axis=0)
-            self.training_heads_ = assessment_file.single(base_logit.heads(output))
-            self.training_nearest_ = (
+            heads = assessment_file.single(base_logit.heads(output))
+            nearest = (
                 margins.argmin(axis=1)
                 if margins.shape[1]
                 else np.zeros(len(segments), dtype=np.int64)
             )
+        is_placed = not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
+        self.training_ = TrainingScores(
+            points=output.embedding.astype(np.float32),
+            score=assessment_file.single(segments.score),
+            cause=segments.cause,
+            heads=heads,
+            nearest=nearest,
+            target=target.astype(np.float32) if is_placed else None,
+        ).thinned(self.grid_, parameters.seed)
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
         self.used_ = [UsedEpisodes.of("training", info, len(episodes))]
         self.correction_ = Correction.none(self.embedding_, self.grid_)
         self.beliefs_ = adaptation.prior_beliefs(
-            self._training, self.grid_, parameters, self.num_causes
+            self.training_, self.grid_, parameters, self.num_causes
         )
         if progress is not None:
             progress("beliefs", 1.0)
@@ -189,18 +191,7 @@ class SafetyAssessment:
         """Computes the beliefs of every map's cells before any feedback, (K, R*R, 3 + n_c)."""
         self._check_fitted()
         return adaptation.prior_beliefs(
-            self._training, self.grid_, self.parameters, self.num_causes
-        )
-
-    @property
-    def _training(self) -> TrainingScores:
-        return TrainingScores(
-            points=self.training_points_,
-            score=self.training_score_,
-            cause=self.training_cause_,
-            heads=self.training_heads_,
-            nearest=self.training_nearest_,
-            target=self.training_target_,
+            self.training_, self.grid_, self.parameters, self.num_causes
         )
 
     def adapt(
@@ -255,7 +246,7 @@ class SafetyAssessment:
         adapted.correction_ = Correction.none(self.embedding_, self.grid_)
         if method == "paper":
             adapted.beliefs_ = adaptation.paper_beliefs(
-                self._training, segments, points, *arguments
+                self.training_, segments, points, *arguments
             )
         elif self.base_logit_ is not None:
             adapted.correction_ = recalibration.fitted_correction(
@@ -270,7 +261,7 @@ class SafetyAssessment:
             )
             residual = adapted.correction_.residual(self.embedding_, x)
             adapted.beliefs_ = recalibration.recalibrated_beliefs(
-                self._training,
+                self.training_,
                 self.base_logit_,
                 adapted.correction_,
                 segments,

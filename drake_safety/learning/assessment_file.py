@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from drake_safety.learning.adaptation import Adaptation
+from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
     AssessmentParameters,
@@ -38,15 +38,17 @@ _MAPS, _CORRECTION = "embedding.", "correction."
 _INNOVATION = "innovation."
 _NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
-    "training_points": (np.float32, np.float32),
-    "training_score": (np.float32, float),
-    "training_cause": (np.int16, np.int64),
-    "training_heads": (np.float32, float),
-    "training_nearest": (np.int16, np.int64),
-    "training_target": (np.float32, np.float32),
+    "points": (np.float32, np.float32),
+    "score": (np.float32, float),
+    "cause": (np.int16, np.int64),
+    "heads": (np.float32, float),
+    "nearest": (np.int16, np.int64),
+    "target": (np.float32, np.float32),
+    "multiplicity": (np.float32, float),
+    "count": (np.int32, np.int64),
 }
-"""Arrays of the training segments: the type on disk and in memory."""
-_OPTIONAL = ("training_heads", "training_nearest", "training_target")
+"""Arrays of `TrainingScores`: the type on disk and in memory."""
+_OPTIONAL = ("heads", "nearest", "target", "multiplicity", "count")
 _INFINITE = ("innovation.chart_limits", "innovation.sums")
 """Arrays with limits, which are infinite if training had too little motion."""
 _MASS_TOLERANCE = 1e-6
@@ -81,8 +83,8 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         is_layer = name.startswith("layer.")
         tensors[f"{_INNOVATION}{name}"] = value.astype(np.float32) if is_layer else value
     for name, (stored, _) in _TRAINING.items():
-        if learned[f"{name}_"] is not None:
-            tensors[name] = learned[f"{name}_"].astype(stored)
+        if (values := getattr(learned["training_"], name)) is not None:
+            tensors[f"training_{name}"] = values.astype(stored)
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,
@@ -161,7 +163,8 @@ def _checked(
         if is_number(tensor).any():
             raise ValueError(f"its {name} has entries that are not finite numbers")
     nested = {"paper": PaperReading, "adaptation": AdaptationParameters}
-    own = dict(entries["parameters"])
+    # Files from before this parameter are of exact neighbours.
+    own = {"candidates_per_neighbour": 0} | entries["parameters"]
     own |= {name: _typed(made, own[name], name) for name, made in nested.items()}
     parameters = _typed(AssessmentParameters, own, "parameters")
     return parameters, _learned(parameters, entries, tensors)
@@ -247,11 +250,14 @@ def _learned(
         "used_": [_typed(UsedEpisodes, one, "used") for one in numbers["used"]],
         "adaptation_": None if adaptation is None else _typed(Adaptation, adaptation, "adaptation"),
     }
-    for name, (_, used) in _TRAINING.items():
-        is_absent = name in _OPTIONAL and name not in tensors
-        learned[f"{name}_"] = None if is_absent else tensors[name].astype(used)
-    if base_logit is not None and learned["training_heads_"] is None:
+    stored: dict[str, Any] = {
+        name: tensors[f"training_{name}"].astype(used)
+        for name, (_, used) in _TRAINING.items()
+        if name not in _OPTIONAL or f"training_{name}" in tensors
+    }
+    if base_logit is not None and "heads" not in stored:
         raise KeyError("training_heads")
+    learned["training_"] = TrainingScores(**stored)
     cells = (embedding.num_members, grid.num_cells)
     expected = {
         "beliefs": (*cells, 3 + len(info.constraint_names)),
@@ -274,7 +280,7 @@ def _learned(
 
 def _check_names(tensors: Mapping[str, np.ndarray], learned: Mapping[str, Any]) -> None:
     """Checks that all tensors belong to what was learned."""
-    known = {"beliefs", *_TRAINING}
+    known = {"beliefs", *(f"training_{name}" for name in _TRAINING)}
     known |= {f"{_MAPS}{name}" for name in learned["embedding_"].weights}
     known |= {f"{_CORRECTION}{field.name}" for field in fields(Correction)}
     known |= {f"{_INNOVATION}{name}" for name in learned["innovation_"].arrays()}

@@ -157,6 +157,9 @@ class AssessmentParameters:
         distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
             which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
+        candidates_per_neighbour: Segments among which each of t-SNE's neighbours is sought, those
+            with the smallest bounds of Omega; 0 for all segments, with which the neighbours are
+            exact and the cost grows as the square of the number of segments.
         exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE. A larger
             one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
         initialization: Initial points of t-SNE: "spectral", which keeps the global order, or
@@ -202,6 +205,7 @@ class AssessmentParameters:
     warping_cost: str = "squared"
     distance_backend: str = "dtaidistance"
     perplexity: float = 30.0
+    candidates_per_neighbour: int = 2
     exaggeration: float = 4.0
     initialization: str = "spectral"
     novelty_rate: float = 0.01
@@ -270,6 +274,7 @@ class AssessmentParameters:
             0 <= self.shortest_segment <= self.horizon,
             "a value in 0..horizon",
         )
+        _expect(self, "candidates_per_neighbour", self.candidates_per_neighbour >= 0, ">= 0")
         _expect(self, "novelty_rate", 0.0 < self.novelty_rate < 1.0, "a value in (0, 1)")
         for name in ("perplexity", "exaggeration"):
             _expect(self, name, getattr(self, name) >= 1.0, ">= 1")

@@ -89,7 +89,12 @@ def fuse(beliefs: np.ndarray) -> np.ndarray:
 
 
 def fuse_cells(
-    beliefs: np.ndarray, cells: np.ndarray, *, num_cells: int, min_count: int
+    beliefs: np.ndarray,
+    cells: np.ndarray,
+    *,
+    num_cells: int,
+    min_count: int,
+    multiplicity: np.ndarray | None = None,
 ) -> np.ndarray:
     """Fuses the beliefs in every grid cell jointly.
 
@@ -98,6 +103,7 @@ def fuse_cells(
         cells: Cell of each belief, -1 for outside, (N,).
         num_cells: Number of cells V.
         min_count: k_min, the number of beliefs below which a cell stays empty.
+        multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
 
     Returns:
         Beliefs (V, 3 + n_c).
@@ -112,6 +118,7 @@ def fuse_cells(
             f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
         )
     is_inside = cells >= 0
+    times = np.ones(int(is_inside.sum())) if multiplicity is None else multiplicity[is_inside]
     beliefs, cells = beliefs[is_inside], cells[is_inside]
     num_columns = beliefs.shape[1]
     uncertainty = beliefs[:, UNCERTAINTY]
@@ -123,7 +130,7 @@ def fuse_cells(
     np.minimum.at(smallest, cells, uncertainty)
     is_certain = uncertainty == 0.0
     ratio = np.where(is_certain, 1.0, smallest[cells] / np.where(is_certain, 1.0, uncertainty))
-    weight = (1.0 - uncertainty) * ratio
+    weight = times * (1.0 - uncertainty) * ratio
     total = np.bincount(cells, weights=weight, minlength=num_cells)
 
     fused = empty(num_cells, num_columns - 3)
@@ -133,7 +140,8 @@ def fuse_cells(
     for column in range(num_columns):
         if column == UNCERTAINTY:
             # Eq. (fuse_op): mu = sum(1 - mu) / sum(w)
-            summed = np.bincount(cells, weights=1.0 - uncertainty, minlength=num_cells)
+            known = times * (1.0 - uncertainty)
+            summed = np.bincount(cells, weights=known, minlength=num_cells)
             summed = summed * np.where(np.isfinite(smallest), smallest, 0.0)
         else:
             # Eq. (fuse_op): b = sum(w b) / sum(w)

@@ -4,16 +4,17 @@ The paper names "the dynamic time warping operator" without a definition. `WARPI
 definitions in use: the sum of squared distances along the warping path, its root (tslearn,
 dtaidistance), and the sum of distances (fastdtw).
 
-Two exact bounds make the graph cheap. The Euclidean distance of two error sequences, the shorter
-one held at its last value, is the cost of one admissible warping path and so bounds DTW from above;
-it gives each segment a radius that contains its neighbours. Sorted by that radius, a block of
-segments needs DTW only up to its own largest radius, and dtaidistance's C implementation abandons
-a pair as soon as it exceeds it.
+The Euclidean distance of two error sequences, the shorter one held at its last value, is the cost
+of one admissible warping path and so bounds DTW from above. A tree finds the candidates with the
+smallest bounds; DTW is computed for these alone, so the cost grows as N log N with the number of
+segments. Segments that are close in the tree share their candidates: one call of dtaidistance's C
+implementation takes them together, and abandons a pair as soon as it exceeds the largest bound that
+matters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -23,8 +24,11 @@ BACKENDS = ("dtaidistance", "tslearn")
 WARPING_COSTS = ("squared", "rooted", "absolute")
 """Cost of a warping path: sum ||.||^2, its square root, or sum ||.||."""
 
+_ROWS = 32  # Segments that share their candidates.
 _BLOCK = 512
 _SLACK = 1e-9
+_SCORE_STEPS = 64
+_KEPT_VARIANCE = 0.999
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,11 +54,12 @@ def neighbour_graph(
     *,
     score_weight: float,
     num_neighbours: int,
+    num_candidates: int | None = None,
     cost: str = "squared",
     backend: str = "dtaidistance",
     progress: Callable[[float], None] | None = None,
 ) -> NeighbourGraph:
-    """Finds the exact nearest neighbours under the safety distance Omega.
+    """Finds the nearest neighbours under the safety distance Omega.
 
     Args:
         error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H,
@@ -63,6 +68,9 @@ def neighbour_graph(
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
+        num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
+            segment are sought, at least k; None for all others, with which they are exact and the
+            cost grows as N^2.
         cost: One of `WARPING_COSTS`.
         backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
         progress: Called with the fraction done.
@@ -71,7 +79,8 @@ def neighbour_graph(
         The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
 
     Raises:
-        ValueError: Unknown backend or cost, errors that are not finite, or too few segments.
+        ValueError: Unknown backend or cost, errors that are not finite, or too few segments or
+            candidates.
     """
     for name, value, known in (("backend", backend, BACKENDS), ("cost", cost, WARPING_COSTS)):
         if value not in known:
@@ -86,8 +95,15 @@ def neighbour_graph(
             f"neighbour_graph: got {num_neighbours} neighbours among {num_segments} segments, "
             "expected fewer neighbours than segments"
         )
+    if num_candidates is not None and num_candidates < num_neighbours:
+        raise ValueError(
+            f"neighbour_graph: got {num_candidates} candidates for {num_neighbours} neighbours, "
+            "expected no fewer candidates than neighbours"
+        )
     if not np.all(np.isfinite(error)):
         raise ValueError("neighbour_graph: the errors contain values that are not finite")
+    from scipy.spatial import cKDTree
+
     series = _series(error, length)
     held = _hold_last(error, length)
     # Omega is 1 / w_max * DTW ** power; bounds and DTW itself are those without the power.
@@ -97,45 +113,66 @@ def neighbour_graph(
     dtw = partial(_dtw_block, backend=backend, is_absolute=cost == "absolute")
     largest = _max_dtw(series, held, dtw, looseness)
     scale = largest**-power if largest > 0.0 else 0.0
-    radius = np.empty(num_segments)
-    for rows, bound in _euclidean_blocks(held):
-        bound *= looseness
-        bound **= power
-        bound *= scale
-        bound += score_weight * np.abs(score[rows, None] - score)
-        bound[np.arange(len(bound)), np.arange(rows.start, rows.stop)] = np.inf
-        radius[rows] = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1]
-    radius *= 1.0 + _SLACK
 
-    order = np.argsort(radius, kind="stable")
-    radius, sorted_score = radius[order], score[order]
-    series = [series[i] for i in order]
-    distances = np.full((num_segments, num_neighbours), np.inf)
-    indices = np.full((num_segments, num_neighbours), -1)
-    for start in range(0, num_segments, _BLOCK):
-        stop = min(start + _BLOCK, num_segments)
-        limit = radius[stop - 1] ** (1.0 / power) * largest * (1.0 + _SLACK)
-        omega = dtw(series, slice(0, stop), slice(start, stop), limit=limit)
+    def omega(rows: np.ndarray, columns: np.ndarray, warping: np.ndarray) -> np.ndarray:
         # Omega^ij = w^ij / w_max + delta |lambda^i - lambda^j|
-        omega **= power
-        omega *= scale
-        omega += score_weight * np.abs(sorted_score[:stop, None] - sorted_score[start:stop])
-        omega[np.arange(start, stop), np.arange(stop - start)] = np.inf
-        columns = np.broadcast_to(np.arange(stop), (stop - start, stop))
-        _keep_nearest(distances, indices, np.arange(start, stop), omega.T, columns)
-        earlier = np.flatnonzero(np.any(omega[:start] <= radius[:start, None], axis=1))
-        columns = np.broadcast_to(np.arange(start, stop), (len(earlier), stop - start))
-        _keep_nearest(distances, indices, earlier, omega[earlier], columns)
+        warping **= power
+        warping *= scale
+        warping += score_weight * np.abs(score[rows, None] - score[columns])
+        warping[rows[:, None] == columns] = np.inf
+        return warping
+
+    places = _places(held * (looseness * scale ** (1.0 / power)), score * score_weight, power)
+    tree = cKDTree(places, leafsize=_ROWS)
+    columns = np.arange(num_segments)
+    distances = np.empty((num_segments, num_neighbours))
+    indices = np.empty((num_segments, num_neighbours), dtype=int)
+    for start in range(0, num_segments, _ROWS):
+        # Successive indices of the tree are those of a leaf.
+        rows = tree.indices[start : start + _ROWS]
+        if num_candidates is not None and num_candidates < num_segments - 1:
+            columns = np.unique(tree.query(places[rows], num_candidates + 1)[1])
+        bound = omega(rows, columns, looseness * _euclidean(held[rows], held[columns]))
+        radius = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1].max()
+        limit = (radius * (1.0 + _SLACK)) ** (1.0 / power) * largest * (1.0 + _SLACK)
+        pool = [series[i] for i in (*rows, *columns)]
+        split = len(rows)
+        found = omega(
+            rows, columns, dtw(pool, slice(0, split), slice(split, len(pool)), limit=limit)
+        )
+        nearest = np.argpartition(found, num_neighbours - 1, axis=1)[:, :num_neighbours]
+        found = np.take_along_axis(found, nearest, axis=1)
+        order = np.lexsort((columns[nearest], found), axis=1)
+        distances[rows] = np.take_along_axis(found, order, axis=1)
+        indices[rows] = np.take_along_axis(columns[nearest], order, axis=1)
         if progress is not None:
-            progress((stop / num_segments) ** 2)
-    original = order[indices]
-    rank = np.lexsort((original, distances), axis=1)
-    result_indices, result_distances = np.empty_like(original), np.empty_like(distances)
-    result_indices[order] = np.take_along_axis(original, rank, axis=1)
-    result_distances[order] = np.take_along_axis(distances, rank, axis=1)
-    return NeighbourGraph(
-        indices=result_indices, distances=result_distances, max_dtw=largest**power
-    )
+            progress(min(start + _ROWS, num_segments) / num_segments)
+    return NeighbourGraph(indices=indices, distances=distances, max_dtw=largest**power)
+
+
+def _places(held: np.ndarray, score: np.ndarray, power: float) -> np.ndarray:
+    """Points whose Euclidean distances order pairs as the bounds of Omega do, nearly, (N, m).
+
+    For the cost "squared" the squared distance of two points is the bound itself, but for the
+    rounding of scores and the components with the least variance.
+
+    Args:
+        held: Error sequences in units of w_max's root, (N, H*n_z).
+        score: Scores times their weight, (N,).
+        power: 2 for the cost "squared", else 1.
+    """
+    part = score[:, None]
+    if power == 2.0:
+        # Points on a staircase of steps of equal size: ||p_i - p_j||^2 = |lambda_i - lambda_j|.
+        step = max(float(score.max()), np.finfo(float).tiny) / _SCORE_STEPS
+        part = np.sqrt(step) * (part > step * (np.arange(_SCORE_STEPS) + 0.5))
+    points = np.hstack([held, part])
+    points -= points.mean(axis=0)
+    variance, axes = np.linalg.eigh(points.T @ points)
+    share = np.cumsum(variance[::-1]) / max(variance.sum(), np.finfo(float).tiny)
+    # A tree is quick in few dimensions.
+    num_kept = int(np.searchsorted(share, _KEPT_VARIANCE)) + 1
+    return points @ axes[:, ::-1][:, :num_kept]
 
 
 def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
@@ -178,24 +215,21 @@ def _dtw_block(
         block=((rows.start, rows.stop), (columns.start, columns.stop), False),
         max_dist=max(limit, np.finfo(float).tiny) if np.isfinite(limit) else None,
         compact=True,
-        parallel=True,
+        parallel=False,
         inner_dist="euclidean" if is_absolute else "squared euclidean",
     )
     shape = (rows.stop - rows.start, columns.stop - columns.start)
     return np.frombuffer(distances, dtype=float).reshape(shape).copy()
 
 
-def _euclidean_blocks(held: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Row blocks of the Euclidean distance matrix, rounded up."""
-    squares = np.einsum("ij,ij->i", held, held)
-    for start in range(0, len(held), _BLOCK):
-        rows = slice(start, min(start + _BLOCK, len(held)))
-        block = held[rows] @ held.T
-        block *= -2.0
-        block += (1.0 + 1e-12) * squares[rows, None]
-        block += (1.0 + 1e-12) * squares
-        np.maximum(block, 0.0, out=block)
-        yield rows, np.sqrt(block, out=block)
+def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Euclidean distances of points, (M, m) and (N, m), rounded up, (M, N)."""
+    block = rows @ columns.T
+    block *= -2.0
+    block += (1.0 + 1e-12) * np.einsum("ij,ij->i", rows, rows)[:, None]
+    block += (1.0 + 1e-12) * np.einsum("ij,ij->i", columns, columns)
+    np.maximum(block, 0.0, out=block)
+    return np.sqrt(block, out=block)
 
 
 def _max_dtw(
@@ -205,15 +239,22 @@ def _max_dtw(
     looseness: float,
 ) -> float:
     """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
-    by_size = np.argsort(-np.linalg.norm(held - held.mean(axis=0), axis=1), kind="stable")
-    held = held[by_size] - held.mean(axis=0)
+    held = held - held.mean(axis=0)
+    size = np.linalg.norm(held, axis=1)
+    by_size = np.argsort(-size, kind="stable")
+    held, size = held[by_size], size[by_size]
     first = [series[i] for i in by_size[:64]]
     largest = float(dtw(first, slice(0, len(first)), slice(0, len(first))).max())
-    for rows, bound in _euclidean_blocks(held):
+    for start in range(0, len(held), _BLOCK):
+        # Two segments are no further apart than their distances from the mean together.
+        reach = largest / looseness * (1.0 - _SLACK) - size[start]
+        end = int(np.searchsorted(-size, -reach, side="right"))
+        if end <= start:
+            break
+        bound = _euclidean(held[start : start + _BLOCK], held[start:end])
         is_open = looseness * bound > largest
-        is_open[:, : rows.start] = False
-        open_rows = rows.start + np.flatnonzero(is_open.any(axis=1))
-        open_columns = np.flatnonzero(is_open.any(axis=0))
+        open_rows = start + np.flatnonzero(is_open.any(axis=1))
+        open_columns = start + np.flatnonzero(is_open.any(axis=0))
         for first_column in range(0, len(open_columns), 8 * _BLOCK):
             chosen = open_columns[first_column : first_column + 8 * _BLOCK]
             pool = [series[by_size[i]] for i in (*open_rows, *chosen)]
@@ -221,21 +262,3 @@ def _max_dtw(
             block = dtw(pool, slice(0, split), slice(split, len(pool)))
             largest = max(largest, float(block.max()))
     return largest
-
-
-def _keep_nearest(
-    distances: np.ndarray,
-    indices: np.ndarray,
-    rows: np.ndarray,
-    candidates: np.ndarray,
-    candidate_indices: np.ndarray,
-) -> None:
-    """Merges candidates (M, c) into the k nearest neighbours of `rows` (M,), in place."""
-    if len(rows) == 0:
-        return
-    num_neighbours = distances.shape[1]
-    pool = np.concatenate([distances[rows], candidates], axis=1)
-    pool_indices = np.concatenate([indices[rows], candidate_indices], axis=1)
-    nearest = np.argpartition(pool, num_neighbours - 1, axis=1)[:, :num_neighbours]
-    distances[rows] = np.take_along_axis(pool, nearest, axis=1)
-    indices[rows] = np.take_along_axis(pool_indices, nearest, axis=1)

@@ -276,10 +276,14 @@ def recalibrated_beliefs(
         # Newly unsafe segments get the constraint with the smallest margin.
         cause = np.where(cause >= 0, cause, training.nearest[inside])
         masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
-        learned = fuse(masses, here)
+        times = (
+            np.ones(len(here)) if training.multiplicity is None else training.multiplicity[inside]
+        )
+        learned = fuse(masses, here, multiplicity=times)
         both = fuse(
             np.concatenate([masses, actual]),
             np.concatenate([here, grid.locate(actual_points)]),
+            multiplicity=np.concatenate([times, np.ones(len(actual))]),
         )
         is_empty = learned[:, belief_masses.UNCERTAINTY] == 1.0
         fused.append(np.where(is_empty[:, None], both, learned))

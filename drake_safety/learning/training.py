@@ -96,13 +96,15 @@ def learned_maps(
         return None if progress is None else lambda fraction: progress(name, fraction)
 
     targeted = segments.take(has_target)
+    num_neighbours = int(3 * parameters.perplexity)
     graph = neighbour_graph(
         targeted.error,
         targeted.length,
         targeted.score,
         score_weight=parameters.score_weight,
         cost=parameters.warping_cost,
-        num_neighbours=int(3 * parameters.perplexity),
+        num_neighbours=num_neighbours,
+        num_candidates=parameters.candidates_per_neighbour * num_neighbours or None,
         backend=parameters.distance_backend,
         progress=stage("distances"),
     )

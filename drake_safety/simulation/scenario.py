@@ -190,7 +190,7 @@ class Scenario:
 
         Modules in the folder of the task's module that it imports are included.
         """
-        return source_digest(_own_files(sys.modules[self.task_class().__module__]))
+        return source_digest(own_files(sys.modules[self.task_class().__module__]))
 
 
 def source_digest(files: Iterable[Path] = ()) -> str:
@@ -212,8 +212,12 @@ def source_digest(files: Iterable[Path] = ()) -> str:
 _SIMULATING_ROOMS = ("control", "plants", "robots", "simulation", "systems")
 
 
-def _own_files(module: ModuleType) -> set[Path]:
-    """The files of a module and of the modules in its folder that it imports, recursively."""
+def own_files(module: ModuleType) -> set[Path]:
+    """The files of a module and of the modules in its folder that it imports, recursively.
+
+    Args:
+        module: The module, such as a task's.
+    """
     files: dict[Path, ModuleType] = {}
     waiting = [module]
     while waiting:

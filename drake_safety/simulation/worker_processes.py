@@ -19,6 +19,7 @@ from pydrake.systems.framework import LeafSystem
 
 _BATCH = 4  # Episodes, or throws, per call of a worker.
 _WATCH_PERIOD_S = 1.0
+_LOCAL_BACKENDS = ("LokyBackend", "SequentialBackend")
 
 Progress = Callable[[int, int], None]
 """Called with the number done and in all."""
@@ -63,6 +64,9 @@ def parallel_map(
 ) -> Generator[Any, None, None]:
     """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
 
+    Within ``joblib.parallel_config`` of another backend than loky, or :func:`cluster.connected`,
+    that backend's workers are used; scenarios travel as text, with the user's files.
+
     Every worker has one BLAS thread, and so has this process if it does the work, so that results
     do not depend on the number of workers. On Ctrl-C or any error the workers end; when this
     process is killed they end within a second or two.
@@ -74,11 +78,17 @@ def parallel_map(
 
     Raises:
         ChildProcessError: A worker was killed.
+        ValueError: A number of processes is given, but another backend has its own.
     """
     import joblib
     from joblib.externals.loky.process_executor import BrokenProcessPool
+    from joblib.parallel import get_active_backend
     from threadpoolctl import threadpool_limits
 
+    backend = get_active_backend()[0]
+    if type(backend).__name__ not in _LOCAL_BACKENDS:
+        yield from _map_remotely(function, arguments, num_workers)
+        return
     num_workers = num_workers or joblib.cpu_count()
     if num_workers == 1 or len(arguments) <= 1:
         with threadpool_limits(1):
@@ -109,6 +119,49 @@ def parallel_map(
                 warnings.simplefilter("ignore")
                 results.close()
             raise
+
+
+def _map_remotely(
+    function: Callable[..., Any], arguments: list[tuple], num_workers: int | None
+) -> Generator[Any, None, None]:
+    """`parallel_map` by the active backend of joblib, which does lost calls again."""
+    import joblib
+
+    from drake_safety.simulation.cluster import Parcel, RemoteCall, local_versions, packed
+    from drake_safety.simulation.scenario import Scenario
+
+    if num_workers is not None:
+        raise ValueError(
+            f"a cluster has its own number of workers; got {num_workers}: leave out num_workers, "
+            "on the command line --workers"
+        )
+    parcels: dict[int, Parcel] = {}
+
+    def to_send(argument: Any) -> Any:
+        if not isinstance(argument, Scenario):
+            return argument
+        if id(argument) not in parcels:
+            parcels[id(argument)] = packed(argument)
+        return parcels[id(argument)]
+
+    call = joblib.delayed(RemoteCall(function=function, versions=local_versions()))
+    calls = [call(*map(to_send, args)) for args in arguments]
+    results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
+    try:
+        for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
+            yield result
+    except BaseException as error:
+        with warnings.catch_warnings():
+            # Joblib warns that not all results were consumed.
+            warnings.simplefilter("ignore")
+            results.close()
+        if type(error).__name__ == "KilledWorker":
+            raise ChildProcessError(
+                "workers of the cluster were killed again and again at the same episodes, perhaps "
+                "because memory ran out; what had finished is kept: run the same again to continue "
+                "(train: with --resume)"
+            ) from None
+        raise
 
 
 def _call_in_worker(parent: int, function: Callable[..., Any], arguments: tuple) -> Any:

@@ -47,8 +47,7 @@ def map_cells(
         margins [cm, degrees]; or None.
     """
     grid, beliefs = assessment.grid_, assessment.beliefs_[0]
-    inside = grid.locate(assessment.training_points_[0])
-    count = np.bincount(inside[inside != OUTSIDE], minlength=grid.num_cells)
+    count = assessment.training_.counts(grid)[0]
     typical: dict[int, dict[str, Any]] = {}
     if episodes is not None:
         typical = _typical_episodes(assessment, episodes, set(angular_constraints))

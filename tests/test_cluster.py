@@ -1,0 +1,169 @@
+"""Simulation on a cluster: a scheduler and workers in processes of their own."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cart_episodes import ARRAYS
+from command_line import call
+from drake_safety import load_scenario, run_episodes
+from drake_safety.models import robot_files
+from drake_safety.simulation import cluster
+from drake_safety.simulation.cluster import RemoteCall, connected, local_versions, packed
+from drake_safety.simulation.scenario import Scenario
+from gliding_task import gliding
+
+NUM_EPISODES, PATIENCE_S = 120, 60.0
+# Sockets of dask's client are closed by its own threads, after the test.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+
+
+def start(folder, *arguments):
+    command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", "scheduler.json"]
+    log = (folder / f"{arguments[0]}-{time.monotonic_ns()}.log").open("w")
+    with log:
+        return subprocess.Popen(
+            [*command, "--no-dashboard"], cwd=folder, stdout=log, stderr=subprocess.STDOUT
+        )
+
+
+@contextlib.contextmanager
+def running_scheduler(folder):
+    """The address of a scheduler."""
+    process = start(folder, "scheduler", "--host", "127.0.0.1", "--port", "0")
+    try:
+        file, end = folder / "scheduler.json", time.monotonic() + PATIENCE_S
+        while not (file.is_file() and file.read_text().rstrip().endswith("}")):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+@pytest.fixture
+def two_workers(tmp_path):
+    """A scheduler's address and two workers, which cannot import what stands beside the tests."""
+    with running_scheduler(tmp_path) as address:
+        one = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
+        workers = [start(tmp_path, *one) for _ in range(2)]
+        try:
+            yield address, workers
+        finally:
+            for worker in workers:
+                worker.terminate()
+                worker.wait(PATIENCE_S)
+
+
+def assert_same(found, expected):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert (one.index, one.cause) == (other.index, other.cause)
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
+    address, workers = two_workers
+    pendulum, own_task = load_scenario("pendulum"), gliding()
+    seen = []
+
+    def kill_one(done, wanted):
+        seen.append(done)
+        if done >= 24 and workers[0].poll() is None:
+            os.kill(workers[0].pid, signal.SIGKILL)
+            workers[0].wait()
+
+    with connected(address):
+        glided = run_episodes(own_task, 8)
+        found = run_episodes(pendulum, NUM_EPISODES, progress=kill_one)
+        with pytest.raises(ValueError, match="a cluster has its own number of workers; got 2"):
+            run_episodes(pendulum, 8, num_workers=2)
+    assert workers[0].poll() == -signal.SIGKILL
+    assert seen == sorted(seen)
+    assert seen[-1] == NUM_EPISODES
+    assert_same(found, run_episodes(pendulum, NUM_EPISODES, num_workers=1))
+    assert_same(glided, run_episodes(own_task, 8, num_workers=1))
+
+
+def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path):
+    with (
+        pytest.raises(ValueError, match=r"no dask scheduler answers at 'tcp://127.0.0.1:9'"),
+        connected("tcp://127.0.0.1:9", timeout_s=1.0),
+    ):
+        pass
+    with (
+        running_scheduler(tmp_path) as address,
+        pytest.raises(ValueError, match=r"has no workers: start some, `dask worker"),
+        connected(address, timeout_s=1.0),
+    ):
+        pass
+
+
+@pytest.fixture
+def own_robot(tmp_path):
+    """A scenario whose robot lies in a folder of the user's."""
+    shutil.copytree(Path(robot_files("laikago")[0]).parent, tmp_path / "dog")
+    package = Path(cluster.__file__).parents[2] / "diagrams" / "laikago_balancing.yaml"
+    text = package.read_text().replace("robot: laikago", "robot: dog/robot.yaml")
+    (tmp_path / "dog_balancing.yaml").write_text(text)
+    return load_scenario(tmp_path / "dog_balancing.yaml")
+
+
+def test_a_robot_of_the_users_travels_as_its_files(own_robot, tmp_path):
+    found = []
+
+    def keep(scenario):
+        found.append(scenario)
+
+    parcel = packed(own_robot)
+    assert str(tmp_path) not in parcel.text
+    RemoteCall(function=keep, versions=local_versions())(parcel)
+    (there,) = found
+    assert isinstance(there, Scenario)
+    assert not Path(there.robot).is_relative_to(tmp_path)
+    for variation in own_robot.variations:
+        assert there.simulation_hash(variation) == own_robot.simulation_hash(variation)
+    changed = dataclasses.replace(parcel, text=parcel.text + "# changed\n")
+    assert changed.digest != parcel.digest
+
+
+def test_a_folder_that_is_too_large_is_refused(own_robot, monkeypatch):
+    monkeypatch.setattr(cluster, "_LARGEST_PARCEL", 1000)
+    with pytest.raises(ValueError, match="its robot's folder and its task have"):
+        packed(own_robot)
+
+
+def test_a_worker_with_other_versions_is_refused_by_name():
+    call = RemoteCall(function=print, versions=local_versions() | {"drake": "0.1"})
+    with pytest.raises(ValueError, match=r"has drake 1\S+, expected 0.1, as here"):
+        call()
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "calibrate", "adapt", "compare"])
+def test_every_long_command_takes_a_cluster(command, monkeypatch, tmp_path):
+    seen = []
+
+    @contextlib.contextmanager
+    def recorded(address):
+        seen.append(address)
+        try:
+            yield
+        finally:
+            seen.append("left")
+
+    monkeypatch.setattr(cluster, "connected", recorded)
+    out = ["--out" if command in ("train", "compare") else "--assessment", str(tmp_path)]
+    assert call(monkeypatch, command, "no_such_scenario", *out, "--cluster", "tcp://here:1") == 2
+    assert seen == ["tcp://here:1", "left"]
