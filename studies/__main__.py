@@ -9,6 +9,7 @@ from studies.ablate import ablate
 from studies.adaptation import adaptation
 from studies.bench import bench
 from studies.converged import converged
+from studies.kills import kills
 from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
 from studies.publish import readme, ship, store
@@ -29,6 +30,7 @@ app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
 app.command()(readings)
 app.command()(converged)
+app.command()(kills)
 app.command()(scale)
 app.command()(truth)
 app.command()(bench)

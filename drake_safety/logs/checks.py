@@ -13,6 +13,7 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
 
+_LARGEST = 1e12  # Of any quantity in SI units.
 _MIN_ROWS = 3  # For derivatives.
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _NORM_TOLERANCE = 0.01
@@ -72,19 +73,19 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
 
 
 def check_finite(channel: Channel) -> None:
-    """Checks that all values exist and are finite.
+    """Checks that all values exist, are finite and of a size that quantities in SI units have.
 
     Raises:
         ValueError: A value is not; the message names the first row and the column.
     """
-    bad = {name: ~np.isfinite(values) for name, values in channel.columns.items()}
+    bad = {name: ~(np.abs(values) < _LARGEST) for name, values in channel.columns.items()}
     rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
     if rows:
         name = min(rows, key=lambda key: rows[key])
         row = rows[name]
         raise ValueError(
             f"{channel.where(row, name)}: the value is {channel.columns[name][row]}, expected a "
-            f"finite number"
+            f"finite number below {_LARGEST:g}"
         )
 
 
