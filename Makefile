@@ -5,6 +5,8 @@ BIN := .venv/bin
 # What the demonstration needs, and on top of it, in the same environment, what development does.
 INSTALLED := .venv/.installed
 DEVELOPED := .venv/.developed
+# Where `make bench` stores its table.
+BENCH ?= runs/bench.json
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint bench docs clean
@@ -27,8 +29,9 @@ lint: $(DEVELOPED) ## Check style, format and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy drake_safety studies
 
-bench: $(DEVELOPED) ## Measure the costs of rollouts, training and one assessment
-	$(BIN)/python -m pytest benchmarks --benchmark-only
+bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table, and runs/bench.json
+	mkdir -p $(dir $(BENCH))
+	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-quiet --benchmark-json=$(BENCH)
 
 docs: $(DEVELOPED) ## Build the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict

@@ -1,148 +1,83 @@
-"""Cost of an update from feedback, and of adopting it in a running diagram."""
+"""Cost of adaptation: an update from feedback, and its adoption by a running diagram."""
 
-import dataclasses
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from costs import alternate
+from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
-from drake_safety.learning.adaptation import TrainingScores, paper_beliefs
-from drake_safety.learning.assessment_parameters import AssessmentParameters
-from drake_safety.learning.feedback import FeedbackSegments
-from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum
-from drake_safety.learning.recalibration import (
-    Outcomes,
-    cell_means,
-    fitted_change,
-    guarded_cells,
-    recalibrated_beliefs,
-    row_weights,
-)
+from drake_safety import Scenario, load_assessment
+from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.simulation.feedback import run_pairs
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
-NUM_TRAINING, NUM_FEEDBACK, NUM_CAUSES = 20_000, 1_000, 2
-MAX_UPDATE_S, MAX_ADOPT_MS = 2.0, 1.0
+NUM_PAIRS = 40
+ROUNDS = 3
+NUM_ADOPTIONS = 100  # In a round.
 
 
-def training(num_members: int) -> TrainingScores:
-    rng = np.random.default_rng(0)
-    score = np.where(rng.random(NUM_TRAINING) < 0.4, rng.uniform(0.6, 1.0, NUM_TRAINING), 0.0)
-    return TrainingScores(
-        points=rng.uniform(-65.0, 65.0, (num_members, NUM_TRAINING, 2)).astype(np.float32),
-        score=score,
-        cause=np.where(score > 0.0, 0, -1),
-        heads=rng.normal(0.0, 3.0, (NUM_TRAINING, 2)),
-        nearest=np.zeros(NUM_TRAINING, dtype=int),
-    )
-
-
-def feedback() -> FeedbackSegments:
-    rng = np.random.default_rng(1)
-    nominal = rng.random(NUM_FEEDBACK) < 0.4
-    actual = nominal ^ (rng.random(NUM_FEEDBACK) < 0.15)
-    empty = np.zeros((NUM_FEEDBACK, 0))
-    return FeedbackSegments(
-        set_index=np.arange(NUM_FEEDBACK) // 5,
-        state=empty,
-        desired_preview=empty,
-        features=empty,
-        score=np.where(actual, 0.8, 0.0),
-        nominal_score=np.where(nominal, 0.8, 0.0),
-        is_unsafe=actual,
-        nominal_is_unsafe=nominal,
-        cause=np.where(actual, 0, -1),
-    )
+@pytest.fixture(scope="module")
+def feedback(scenario: Scenario) -> list[FeedbackSet]:
+    return run_pairs(scenario, NUM_PAIRS).feedback()
 
 
 @pytest.mark.benchmark(timer=time.process_time)
-@pytest.mark.parametrize("method", ["paper", "recalibration"])
-def test_one_update(benchmark: Any, report: Callable[..., None], method: str) -> None:
-    mode, num_members = ("paper", 1) if method == "paper" else ("sharpened", 3)
-    parameters = AssessmentParameters(mode=mode)
-    grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-    scores, segments = training(num_members), feedback()
-    rng = np.random.default_rng(2)
-    points = rng.uniform(-65.0, 65.0, (num_members, NUM_FEEDBACK, 2))
-    base_logit = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1))
-    heads = rng.normal(0.0, 3.0, (NUM_FEEDBACK, 2))
-    activations = np.maximum(rng.normal(size=(num_members, NUM_FEEDBACK, 128)), 0.0)
-    num_rows = np.bincount(segments.set_index)
-    weight = row_weights(num_rows)
-    actual = Outcomes(
-        heads=heads, activations=activations, is_unsafe=segments.is_unsafe, weight=weight
+@pytest.mark.parametrize(("mode", "method"), [("paper", "paper"), ("sharpened", "recalibration")])
+def test_one_update(
+    benchmark: Any,
+    report: Callable[..., None],
+    scenario: Scenario,
+    feedback: list[FeedbackSet],
+    mode: str,
+    method: str,
+) -> None:
+    assessment = load_assessment(scenario.name, mode)
+    assert any(one.differs for one in feedback)
+    x = np.concatenate(
+        [assessment.inputs_of(one.state, one.desired_preview, one.features) for one in feedback]
     )
-    first = weight > 1.0
-    twins = Outcomes(
-        heads=heads[first],
-        activations=activations[:, first],
-        is_unsafe=segments.nominal_is_unsafe[first],
-        weight=np.ones(len(num_rows)),
-    )
-
-    def update() -> float:
-        started = time.process_time()
-        if method == "paper":
-            paper_beliefs(scores, segments, points, grid, parameters, NUM_CAUSES)
-        else:
-            change, hidden, hidden_range = fitted_change(
-                actual, twins, base_logit, parameters.adaptation
-            )
-            guard = guarded_cells(segments, points, grid)
-            correction = Correction(
-                change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
-            )
-            residual = cell_means(hidden_sum(activations, hidden), points, grid)
-            recalibrated_beliefs(
-                scores,
-                base_logit,
-                correction,
-                segments,
-                points,
-                residual,
-                grid,
-                parameters,
-                NUM_CAUSES,
-            )
-        return time.process_time() - started
-
+    label = np.concatenate([np.full(len(one), one.is_unsafe) for one in feedback])
+    standardised = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-6)
     with threadpool_limits(1):
-        update()
-        costs = [update() for _ in range(3)]
-        benchmark.pedantic(update, rounds=1)
+        cost_s, peers_s = alternate(
+            benchmark,
+            lambda: assessment.adapt(feedback, method=method),
+            {
+                "scikit-learn's LogisticRegression of the same rows": lambda: LogisticRegression(
+                    max_iter=1000
+                ).fit(standardised, label)
+            },
+            rounds=ROUNDS,
+        )
     report(
-        f"one update by '{method}'",
-        statistics.median(costs),
+        f"adaptation by {method}, {scenario.name}",
+        cost_s,
         "s CPU",
-        at_most=MAX_UPDATE_S,
-        note=f"{NUM_FEEDBACK} feedback segments, {NUM_TRAINING} training segments",
+        at_most=0.5,
+        peers=peers_s,
+        note=f"{len(feedback)} pairs, {len(x)} rows, "
+        f"{int(assessment.training_.counts(assessment.grid_)[0].sum())} training segments",
     )
 
 
 @pytest.mark.benchmark(timer=time.process_time)
-def test_adopting_beliefs(benchmark: Any, report: Callable[..., None], scenario: Any) -> None:
-    from drake_safety import SafetyAssessment, run_episodes
-
-    settings = dataclasses.replace(scenario.assessment, epochs=1)
-    assessment = SafetyAssessment(settings).fit(run_episodes(scenario, 64))
-    assessor = SafetyAssessor(assessment, period_s=0.02)
+def test_adopting_beliefs(benchmark: Any, report: Callable[..., None], scenario: Scenario) -> None:
+    assessment = load_assessment(scenario.name)
+    assessor = SafetyAssessor(assessment, period_s=scenario.control_period_s)
     context = assessor.CreateDefaultContext()
 
-    def adopt() -> float:
-        started = time.process_time()
-        for _ in range(100):
+    def adopt() -> None:
+        for _ in range(NUM_ADOPTIONS):
             assessor.adopt(context, assessment)
-        return 10.0 * (time.process_time() - started)
 
-    costs = [adopt() for _ in range(5)]
-    benchmark.pedantic(adopt, rounds=1)
+    cost_s, _ = alternate(benchmark, adopt, {}, rounds=5)
     report(
-        "beliefs and correction into a Context",
-        statistics.median(costs),
-        "ms",
-        at_most=MAX_ADOPT_MS,
+        "adopting an adapted assessment in a Context",
+        1e3 * cost_s / NUM_ADOPTIONS,
+        "ms CPU",
+        at_most=1.0,
     )

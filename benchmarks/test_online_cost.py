@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from costs import alternate
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     BasicVector,
@@ -21,7 +21,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 from threadpoolctl import threadpool_limits
 
-from drake_safety import SafetyAssessment, Scenario, run_episodes
+from drake_safety import SafetyAssessment, Scenario
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.systems.novelty_monitor import NoveltyMonitor
@@ -88,13 +88,11 @@ class Running:
         context = self.system.GetMyContextFromRoot(self._simulator.get_context())
         return self.system.GetOutputPort(name).Eval(context)
 
-    def cost_us(self) -> float:
-        """CPU time of one update, the simulator's own share included."""
-        started = time.process_time()
+    def update(self) -> None:
+        """Simulates all updates of a round."""
         # To the middle between two ticks: rounding cannot move a tick out of its round.
         self._num_updates += NUM_UPDATES
         self._simulator.AdvanceTo((self._num_updates - 0.5) * PERIOD_S)
-        return 1e6 * (time.process_time() - started) / NUM_UPDATES
 
 
 class EagerNetworks:
@@ -120,16 +118,24 @@ class EagerNetworks:
             z = torch.from_numpy(x)
             return [network(z) for network in self._networks]
 
-    def cost_us(self, x: np.ndarray) -> float:
-        started = time.process_time()
+
+def per_update_us(seconds: float) -> float:
+    return 1e6 * seconds / NUM_UPDATES
+
+
+def repeat(function: Callable[[], Any]) -> Callable[[], None]:
+    """As often as a round has updates."""
+
+    def run() -> None:
         for _ in range(NUM_UPDATES):
-            self.evaluate(x)
-        return 1e6 * (time.process_time() - started) / NUM_UPDATES
+            function()
+
+    return run
 
 
 @pytest.fixture(scope="module")
-def episodes(scenario: Scenario) -> Episodes:
-    return run_episodes(scenario, NUM_EPISODES)
+def some(episodes: Episodes) -> Episodes:
+    return episodes[:NUM_EPISODES]
 
 
 @pytest.mark.benchmark(timer=time.process_time)
@@ -138,14 +144,14 @@ def test_one_evaluation_inside_a_diagram(
     benchmark: Any,
     report: Callable[..., None],
     scenario: Scenario,
-    episodes: Episodes,
+    some: Episodes,
     case: str,
 ) -> None:
     parameters = copy.deepcopy(scenario.assessment)
     for name, value in CASES[case].items():
         setattr(parameters, name, value)
-    assessment = SafetyAssessment(parameters).fit(episodes)
-    starts = [np.stack([getattr(e, name)[0] for e in episodes]) for name in INPUT_NAMES]
+    assessment = SafetyAssessment(parameters).fit(some)
+    starts = [np.stack([getattr(e, name)[0] for e in some]) for name in INPUT_NAMES]
     safest = int(np.argmax(assessment.predict(*starts).belief[:, 0]))
     inputs = {name: rows[safest] for name, rows in zip(INPUT_NAMES, starts, strict=True)}
     names = list(inputs) if assessment.uses_features else ["state", "desired_preview"]
@@ -164,29 +170,25 @@ def test_one_evaluation_inside_a_diagram(
             theirs = np.stack([z.numpy() for z in eager.evaluate(x)])
             np.testing.assert_allclose(ours.embedding[:, 0], theirs[:, :2], rtol=1e-3, atol=1e-3)
             np.testing.assert_allclose(ours.margins[:, 0], theirs[:, 2:], rtol=1e-3, atol=1e-3)
-            costs: dict[str, list[float]] = {"ours": [], "empty": [], "torch": []}
-
-            def measure_peers() -> None:
-                costs["empty"].append(empty.cost_us())
-                costs["torch"].append(eager.cost_us(x))
-
-            def measure() -> None:
-                costs["ours"].append(running.cost_us())
-
-            for cost in (running.cost_us, empty.cost_us):
-                cost()
-            benchmark.pedantic(measure, setup=measure_peers, rounds=ROUNDS)
+            cost_s, peers_s = alternate(
+                benchmark,
+                running.update,
+                {
+                    "empty LeafSystem": empty.update,
+                    "torch, forward pass": repeat(lambda: eager.evaluate(x)),
+                },
+                rounds=ROUNDS,
+            )
     finally:
         torch.set_num_threads(previous_threads)
-    cost_us = {name: statistics.median(values) for name, values in costs.items()}
     weights = assessment.embedding_.weights
     widths = [weights[f"trunk.{i}.bias"].shape[1] for i in range(assessment.embedding_.num_layers)]
     report(
-        f"one Γ in a LeafSystem, {case}",
-        cost_us["ours"],
-        "us",
+        f"Γ in a diagram, {case}",
+        per_update_us(cost_s),
+        "us CPU",
         at_most=MAX_US,
-        peers={"empty LeafSystem": cost_us["empty"], "torch eager": cost_us["torch"]},
+        peers={name: per_update_us(seconds) for name, seconds in peers_s.items()},
         note=f"{assessment.embedding_.num_members} maps, {len(x)} inputs, layers {widths}",
     )
 
@@ -196,42 +198,35 @@ def test_novelty_and_monitor_beside_an_evaluation(
     benchmark: Any,
     report: Callable[..., None],
     scenario: Scenario,
-    episodes: Episodes,
+    some: Episodes,
 ) -> None:
-    assessment = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes)
+    assessment = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(some)
     assessment.info_ = dataclasses.replace(assessment.info_, step_s=PERIOD_S)
-    inputs = {name: getattr(episodes[0], name)[0] for name in INPUT_NAMES}
+    inputs = {name: getattr(some[0], name)[0] for name in INPUT_NAMES}
     x = assessment.inputs_of(*inputs.values())[None]
     with threadpool_limits(1):
         gamma = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
         monitor = Running(NoveltyMonitor(assessment), {**inputs, "novelty": np.zeros(1)})
 
-        def novelty_us() -> float:
-            started = time.process_time()
-            for _ in range(NUM_UPDATES):
-                assessment.novelty_.of(x)
-            return 1e6 * (time.process_time() - started) / NUM_UPDATES
+        novelty = repeat(lambda: assessment.novelty_.of(x))
 
-        costs: dict[str, list[float]] = {"gamma": [], "ours": []}
+        def update() -> None:
+            monitor.update()
+            novelty()
 
-        def measure_gamma() -> None:
-            costs["gamma"].append(gamma.cost_us())
-
-        def measure() -> None:
-            costs["ours"].append(monitor.cost_us() + novelty_us())
-
-        for cost in (gamma.cost_us, monitor.cost_us):
-            cost()
         # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
+        monitor.update()
         assert monitor.output("alarm")[0] == 1.0
         assert monitor.output("levels")[2:].min() > 0.0
-        benchmark.pedantic(measure, setup=measure_gamma, rounds=ROUNDS)
-    gamma_us = statistics.median(costs["gamma"])
+        cost_s, peers_s = alternate(
+            benchmark, update, {"Γ in a diagram": gamma.update}, rounds=ROUNDS
+        )
+    peers = {name: per_update_us(seconds) for name, seconds in peers_s.items()}
     report(
-        "novelty and one step of the monitor",
-        statistics.median(costs["ours"]),
-        "us",
-        at_most=0.75 * gamma_us,
-        peers={"one Γ in a LeafSystem": gamma_us},
+        "novelty and monitor in a diagram",
+        per_update_us(cost_s),
+        "us CPU",
+        at_most=0.75 * peers["Γ in a diagram"],
+        peers=peers,
         note=f"{x.shape[1]} inputs, {assessment.innovation_.num_states} states",
     )

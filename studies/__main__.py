@@ -7,6 +7,7 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
+from studies.bench import bench
 from studies.converged import converged
 from studies.kills import kills
 from studies.learning_curve import train_fewer
@@ -32,6 +33,7 @@ app.command()(converged)
 app.command()(kills)
 app.command()(scale)
 app.command()(truth)
+app.command()(bench)
 app.command()(store)
 app.command()(readme)
 app.command()(ship)

@@ -1,0 +1,87 @@
+"""CPU time, wall time and memory, measured so that they can be compared."""
+
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
+
+
+def alternate(
+    benchmark: Any,  # pytest-benchmark has no types.
+    ours: Callable[[], Any],
+    peers: Mapping[str, Callable[[], Any]],
+    *,
+    rounds: int,
+    clock: Callable[[], float] = time.process_time,
+) -> tuple[float, dict[str, float]]:
+    """Seconds of a function, and of each peer, by a clock.
+
+    They take turns, so that all meet the same state of the machine, and the quickest of the rounds
+    counts: what else runs on the machine only ever adds. One turn of each goes before, uncounted.
+    """
+    peer_s: dict[str, list[float]] = {name: [] for name in peers}
+    our_s: list[float] = []
+
+    def measure(function: Callable[[], Any], seconds: list[float]) -> None:
+        started = clock()
+        function()
+        seconds.append(clock() - started)
+
+    def measure_peers() -> None:
+        for name, function in peers.items():
+            measure(function, peer_s[name])
+
+    for function in (*peers.values(), ours):
+        function()
+    benchmark.pedantic(measure, args=(ours, our_s), setup=measure_peers, rounds=rounds)
+    return min(our_s), {name: min(seconds) for name, seconds in peer_s.items()}
+
+
+def tick_costs_us(
+    controller: LeafSystem, context: Context, inputs: Mapping[str, np.ndarray], output: str
+) -> np.ndarray:
+    """CPU time of every tick of a controller alone, (ticks,): inputs set, then output evaluated.
+
+    Args:
+        controller: Has one periodic discrete update.
+        context: Its own; advanced by the ticks.
+        inputs: Rows by input port, (ticks, size).
+        output: The port of its command.
+    """
+    ports = {controller.GetInputPort(name): rows for name, rows in inputs.items()}
+    command = controller.GetOutputPort(output)
+    costs = []
+    for tick in range(len(next(iter(inputs.values())))):
+        for port, rows in ports.items():
+            port.FixValue(context, rows[tick])
+        started = time.process_time()
+        context.SetDiscreteState(controller.EvalUniquePeriodicDiscreteUpdate(context))
+        value = command.Eval(context)
+        costs.append(1e6 * (time.process_time() - started))
+        assert np.any(value)
+    return np.array(costs)
+
+
+def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """The result of a function in a process of its own, whose peak memory is its own."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def peak_memory_gb() -> float:
+    """Peak memory of this process."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        # getrusage would count the parent's memory at the time of the fork.
+        fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        return int(fields["VmHWM"].split()[0]) / 1024**2
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1024**3

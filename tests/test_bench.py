@@ -1,0 +1,165 @@
+"""The table of `make bench` and its JSON, of benchmarks that measure nothing."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from studies.__main__ import main
+from studies.bench import comparison_text, read_run, run_text
+
+pytest_plugins = ["pytester"]
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+THREE = """
+def test_three(benchmark, report):
+    benchmark.pedantic(lambda: None, rounds=1)
+    report("tick, arm", 2.0, "us CPU", at_most=2.5, peers={"solver alone": 4.0}, note="7 joints")
+    report("speed-up, arm", 1.7, "x", at_least=1.8, peers={"one worker": 3})
+    report("memory, arm", 0.25, "GB")
+"""
+
+
+@pytest.fixture
+def run_benchmarks(pytester, monkeypatch):
+    """Runs a file of benchmarks with the table's plugin; returns pytest's result and the JSON."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    # In a worker of xdist, pytest-benchmark would measure nothing.
+    monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
+
+    def run(source, *options):
+        pytester.makepyfile(source)
+        file = pytester.path / "bench.json"
+        result = pytester.runpytest_inprocess(
+            *("-p", "figures", "-p", "no:xdist", "-p", "no:cacheprovider"),
+            *("--benchmark-only", "--benchmark-quiet", f"--benchmark-json={file}", *options),
+        )
+        return result, file
+
+    return run
+
+
+def run_of(*figures, cpu="Some CPU"):
+    machine = {"cpu": {"brand_raw": cpu, "count": 2}, "python_version": "3.11.7"}
+    machine["packages"] = {"drake": "1.0"}
+    commit = {"id": "0123456789abcdef", "dirty": False}
+    rows = [{"limit": "", "verdict": "", "note": "", "peers": {}} | one for one in figures]
+    return {
+        "machine_info": machine,
+        "commit_info": commit,
+        "datetime": "2030-01-02T03:04:05+00:00",
+        "figures": rows,
+    }
+
+
+def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(run_benchmarks):
+    result, file = run_benchmarks(THREE)
+    result.assert_outcomes(passed=1)
+    lines = [line for line in result.outlines if ", arm" in line]
+    assert [line.split("  ")[0] for line in lines] == ["tick, arm", "speed-up, arm", "memory, arm"]
+    tick, speed_up, memory = lines
+    for part in ("2 us CPU", "<= 2.5", "OK", "solver alone 4", "7 joints"):
+        assert part in tick
+    for part in ("1.7 x", ">= 1.8", "UNDER THE LIMIT", "one worker 3"):
+        assert part in speed_up
+    assert "OK" not in memory and "LIMIT" not in memory
+    printed = result.stdout.str()
+    assert "1 of 2 within their limits" in printed and f"stored in {file}" in printed
+    # pytest-benchmark's own table would be a second one.
+    assert "StdDev" not in printed
+
+
+def test_the_json_holds_every_row_and_where_and_when_it_was_measured(run_benchmarks):
+    _, file = run_benchmarks(THREE)
+    content = json.loads(file.read_text())
+    assert content["datetime"] and content["commit_info"]["id"]
+    assert content["machine_info"]["packages"]["drake"]
+    tick, speed_up, memory = content["figures"]
+    assert tick == {
+        "name": "tick, arm",
+        "value": 2.0,
+        "unit": "us CPU",
+        "at_most": 2.5,
+        "at_least": None,
+        "peers": {"solver alone": 4.0},
+        "note": "7 joints",
+        "limit": "<= 2.5",
+        "verdict": "OK",
+    }
+    assert speed_up["verdict"] == "UNDER THE LIMIT" and memory["verdict"] == ""
+    assert read_run(file) == content
+
+
+def test_a_value_that_is_no_number_is_within_no_limit(run_benchmarks):
+    body = "def test_nan(benchmark, report):\n    benchmark(int)\n"
+    body += "    for key in ('at_most', 'at_least'):\n"
+    body += "        report(key, float('nan'), 's', **{key: 1.0})\n"
+    result, _ = run_benchmarks(body)
+    assert "0 of 2 within their limits" in result.stdout.str()
+
+
+def test_two_figures_of_one_name_are_refused(run_benchmarks):
+    body = "def test_twice(benchmark, report):\n    benchmark(int)\n"
+    body += "    report('tick', 1.0, 's')\n    report('tick', 2.0, 's')\n"
+    result, _ = run_benchmarks(body)
+    result.assert_outcomes(failed=1)
+    assert "there is a figure 'tick' already" in result.stdout.str()
+
+
+def test_runs_are_compared_by_the_ratio_to_their_peers():
+    tick = {"name": "tick", "unit": "us"}
+    before = run_of(tick | {"value": 10.0, "peers": {"solver": 20.0}}, cpu="Quick CPU")
+    # Half as fast a machine, and the tick is a fifth better beside its peer.
+    after = run_of(tick | {"value": 16.0, "peers": {"solver": 40.0}}, cpu="Slow CPU")
+    text = comparison_text(before, after)
+    assert "| tick | 0.5 | 0.4 | of solver | -20.0 % |" in text
+    assert "Quick CPU (2 cores)" in text and "Slow CPU (2 cores)" in text
+
+
+def test_ratios_and_figures_without_peers_are_compared_as_they_are():
+    speed_up = {"name": "speed-up", "unit": "x"}
+    before = run_of(
+        speed_up | {"value": 1.6, "peers": {"one": 5.0}},
+        {"name": "memory", "unit": "GB", "value": 2.0},
+        {"name": "gone", "unit": "s", "value": 1.0},
+    )
+    after = run_of(
+        speed_up | {"value": 2.0, "peers": {"one": 9.0}},
+        {"name": "memory", "unit": "GB", "value": 1.0},
+        {"name": "new", "unit": "s", "value": 1.0},
+    )
+    text = comparison_text(before, after)
+    assert "| speed-up | 1.6 | 2 | x | +25.0 % |" in text
+    assert "| memory | 2 | 1 | GB | -50.0 % |" in text
+    assert "Only before: gone." in text and "Only after: new." in text
+
+
+def test_a_run_is_printed_as_markdown_with_its_machine(tmp_path, monkeypatch, capsys):
+    row = {"name": "tick", "unit": "us", "value": 10.0, "peers": {"solver": 20.0}, "note": "n"}
+    content = run_of(row | {"limit": "<= 12", "verdict": "OK"})
+    file = tmp_path / "bench.json"
+    file.write_text(json.dumps(content))
+    monkeypatch.setattr(sys, "argv", ["studies", "bench", str(file)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code in (0, None)
+    printed = capsys.readouterr().out
+    assert run_text(content) in printed
+    assert "| tick | 10 us | <= 12 | OK | solver 20 | n |" in printed
+    assert "2030-01-02, commit 0123456789, Some CPU (2 cores), Python 3.11.7, drake 1.0." in printed
+
+
+@pytest.mark.parametrize("text", ["{}", '{"figures": 1}', "[]", "{"])
+def test_a_file_that_is_no_run_is_refused_by_name(tmp_path, text):
+    file = tmp_path / "other.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=r"other\.json"):
+        read_run(file)
+
+
+def test_a_run_with_a_damaged_figure_is_refused_by_name(tmp_path):
+    file = tmp_path / "other.json"
+    file.write_text(json.dumps(run_of({"name": "tick", "value": 1.0})))
+    with pytest.raises(ValueError, match=r"other\.json holds no figures of benchmarks"):
+        read_run(file)
