@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from typing import Any
 
 import typer
 from rich.logging import RichHandler
@@ -47,6 +48,21 @@ _COMMANDS = (
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 
+
+class _Command(TargetCommand):
+    """A command whose ``--cluster`` is connected while it runs."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command."""
+        address = ctx.params.get("cluster")
+        if address is None:
+            return super().invoke(ctx)
+        from drake_safety.simulation.cluster import connected
+
+        with connected(address):
+            return super().invoke(ctx)
+
+
 app = typer.Typer(
     help="Learn safety assessments of robot motions from simulations, and use them before and "
     f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
@@ -56,7 +72,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for _command in _COMMANDS:
-    app.command(cls=TargetCommand)(_command)
+    app.command(cls=_Command)(_command)
 
 
 def main() -> None:

@@ -55,23 +55,12 @@ TrainingOption = Annotated[
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", help="Worker processes; one a core by default.")
 ]
-
-
-def _connect(context: typer.Context, address: str | None) -> str | None:
-    if address is not None:
-        from drake_safety.simulation.cluster import connected
-
-        context.with_resource(connected(address))
-    return address
-
-
 ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
         help="Address of dask's scheduler, such as tcp://10.0.0.1:8786, whose workers simulate in "
         "place of processes of this machine.",
-        callback=_connect,
     ),
 ]
 LOOPBACK = "127.0.0.1"

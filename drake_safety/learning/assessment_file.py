@@ -132,7 +132,7 @@ def replacing(final: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(final)
     except OSError as error:
-        why = error.strerror if error.errno is None else os.strerror(error.errno)
+        why = str(error) if error.errno is None else os.strerror(error.errno)
         raise OSError(
             f"{final} cannot be written: {why}; what had been written before is kept"
         ) from error

@@ -47,7 +47,8 @@ def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
         ) from None
     try:
         client = Client(address, timeout=timeout_s)
-    except (OSError, TimeoutError, ValueError) as error:
+    # Another server's answer may be taken for the size of a huge message.
+    except (MemoryError, OSError, TimeoutError, ValueError) as error:
         raise ValueError(f"no dask scheduler answers at '{address}': {error}") from error
     with client:
         try:
