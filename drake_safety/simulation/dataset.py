@@ -128,7 +128,7 @@ class EpisodeWriter:
             self.flush()
         except OSError as error:
             # They are still pending: the next flush tries again, and raises.
-            _LOGGER.warning("%s: episodes could not be written yet: %s", self.path, error)
+            _LOGGER.warning("episodes are not written yet: %s", error)
 
     def flush(self) -> None:
         """Writes the pending episodes as one shard."""
