@@ -15,6 +15,7 @@ from studies.plan_study import plan_study
 from studies.publish import readme, ship, store
 from studies.readings import readings
 from studies.scale import scale
+from studies.soak import soak
 from studies.truth import truth
 
 app = typer.Typer(
@@ -32,6 +33,7 @@ app.command()(readings)
 app.command()(converged)
 app.command()(kills)
 app.command()(scale)
+app.command()(soak)
 app.command()(truth)
 app.command()(bench)
 app.command()(store)

@@ -107,3 +107,14 @@ def test_a_task_without_a_robot_cannot_begin_with_a_start_nor_a_start_with_a_goa
     with pytest.raises(ValueError, match="leave out the goal"):
         run_episode(porter(), start=start, goal=EASY)
     assert started(porter()).get_time() == 0.0
+
+
+def test_a_start_from_a_quaternion_that_has_drifted_is_that_of_unit_norm(loop):
+    good = loop.standing_start()
+    drifted = replace(good, q=np.concatenate([1.03 * good.q[:4], good.q[4:]]))
+    states = []
+    for start in (good, drifted):
+        context = loop.CreateDefaultContext()
+        loop.reset_to(context, None, start)
+        states.append(loop.GetOutputPort("plant_state").Eval(context))
+    np.testing.assert_allclose(states[1], states[0], atol=1e-12)

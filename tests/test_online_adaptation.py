@@ -47,7 +47,7 @@ class Prior:
         return [row for one in feedback for row in range(NUM_STEPS)]
 
 
-def run(duration_s, **settings):
+def run(duration_s, capacity=400, **settings):
     builder = DiagramBuilder()
     recorder = builder.AddSystem(
         FeedbackRecorder(INFO, num_steps=NUM_STEPS, plant_state_size=2, watch_period_s=STEP_S)
@@ -67,7 +67,7 @@ def run(duration_s, **settings):
         return Episodes(info, [window.episode for window in windows])
 
     adaptation = OnlineAdaptation(
-        None, Prior(**settings), recorder, assessor, method="paper", run=twins
+        None, Prior(**settings), recorder, assessor, method="paper", run=twins, capacity=capacity
     )
     simulator = Simulator(diagram)
     simulator.set_monitor(adaptation)
@@ -92,6 +92,14 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(settings
     assert [adapted for _, adapted in adopted] == adaptation.adapted
     times = [0.4 * number for number in numbers]
     assert [time_s for time_s, _ in adopted] == pytest.approx(times, abs=1.5 * STEP_S)
+
+
+def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_memory():
+    adaptation, adopted = run(4.05, capacity=3, update_interval=1)
+    # Ten windows, the last three of which are kept.
+    assert len(adopted) == 10
+    assert [one.index for one in adaptation.feedback] == [7, 8, 9]
+    assert [number for _, number in adaptation.adapted] == [3] * 8  # Of the newest updates.
 
 
 def test_nothing_is_adapted_before_the_first_window_ends():

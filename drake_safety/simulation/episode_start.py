@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
+
+
+_DRIFT, _ROUNDING = 0.2, 1e-6  # Of a quaternion's norm.
 
 
 @dataclass(kw_only=True, eq=False)
@@ -66,20 +69,22 @@ class EpisodeStart:
             if np.shape(value) != (size,) or not np.isfinite(value).all():
                 raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
 
-    def check_robot(self, kinematics: RobotKinematics) -> None:
-        """Checks that the start fits a robot.
+    def of_robot(self, kinematics: RobotKinematics) -> EpisodeStart:
+        """Checks that the start fits a robot, and returns it with a quaternion of unit norm.
+
+        The quaternion of a simulated plant drifts: its norm changes by up to 1e-4 a second.
 
         Args:
             kinematics: The robot.
 
         Raises:
-            ValueError: A part has another size than the robot or is not finite, or the quaternion
-                has not unit norm.
+            ValueError: A part has another size than the robot or is not finite, or the quaternion's
+                norm is not near 1.
         """
         who = f"start of robot '{kinematics.robot.name}'"
         self.check(who, kinematics.num_positions, kinematics.num_velocities)
         norm = float(np.linalg.norm(self.q[:4]))
-        if not abs(norm - 1.0) < 1e-3:
+        if not abs(norm - 1.0) < _DRIFT:
             raise ValueError(f"{who}: the quaternion must have a norm of 1; got {norm}")
         feet = self.foot_positions
         if feet is not None and (
@@ -88,6 +93,9 @@ class EpisodeStart:
             raise ValueError(
                 f"{who}: foot_positions must be {kinematics.num_contacts} finite points; got {feet}"
             )
+        if abs(norm - 1.0) < _ROUNDING:
+            return self
+        return replace(self, q=np.concatenate([self.q[:4] / norm, self.q[4:]]))
 
 
 @dataclass(frozen=True, kw_only=True)

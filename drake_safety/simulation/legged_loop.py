@@ -246,8 +246,7 @@ class LeggedLoop(PlannedLoop):
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
         """Sets the robot's state and plan; see `CanStartAnywhere`."""
-        start.check_robot(self.kinematics)
-        self._enter(context, start)
+        self._enter(context, start.of_robot(self.kinematics))
         self._observers.reseed(context, rng)
         if rng is None:
             self._observers.silence(context)

@@ -15,6 +15,8 @@ from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
+_KEPT_UPDATES = 8
+
 
 class OnlineAdaptation:
     """Adapts the assessor of a running diagram; a monitor of Drake's `Simulator`.
@@ -22,7 +24,7 @@ class OnlineAdaptation:
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Whenever the recorder has finished windows, their nominal twins are
     simulated; after every k_u windows or segments (`AdaptationParameters.update_unit`) the prior
-    assessment is adapted to all feedback so far, and the assessor adopts the result. The simulation
+    assessment is adapted to the feedback so far, and the assessor adopts the result. The simulation
     waits meanwhile. The object keeps feedback of one simulation; use another one for another
     Context.
 
@@ -39,10 +41,11 @@ class OnlineAdaptation:
         monitor: The monitor, if the diagram has one.
         method: Method of `SafetyAssessment.adapt`.
         run: Function that simulates the twins; see `feedback_of_windows`.
+        capacity: Largest number of feedback sets kept; the oldest are dropped.
 
     Attributes:
-        feedback: All feedback so far.
-        adapted: The assessment after each update.
+        feedback: All feedback so far, up to the capacity.
+        adapted: The assessments after the newest eight updates.
     """
 
     def __init__(
@@ -55,11 +58,14 @@ class OnlineAdaptation:
         monitor: NoveltyMonitor | None = None,
         method: str | None = None,
         run: Callable[..., Episodes] = run_twins,
+        capacity: int = 400,
     ):
+        if capacity < 1:
+            raise ValueError(f"OnlineAdaptation: capacity is {capacity}, expected >= 1")
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor, self._run = recorder, assessor, run
         self._monitor = monitor
-        self._num_used = 0
+        self._capacity, self._num_new = capacity, 0
         self.feedback: list[FeedbackSet] = []
         self.adapted: list[SafetyAssessment] = []
 
@@ -72,12 +78,14 @@ class OnlineAdaptation:
         windows = self._recorder.take_windows(
             self._recorder.GetMyMutableContextFromRoot(root_context)
         )
-        self.feedback += feedback_of_windows(self._scenario, self._recorder, windows, run=self._run)
-        available = self._num_available()
-        if available - self._num_used < self._prior.parameters.adaptation.update_interval:
+        new = feedback_of_windows(self._scenario, self._recorder, windows, run=self._run)
+        self.feedback = [*self.feedback, *new][-self._capacity :]
+        self._num_new += self._count(new)
+        if self._num_new < self._prior.parameters.adaptation.update_interval:
             return EventStatus.Succeeded()
-        self._num_used = available
-        self.adapted.append(self._prior.adapt(self.feedback, method=self._method))
+        self._num_new = 0
+        adapted = self._prior.adapt(self.feedback, method=self._method)
+        self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self._assessor.adopt(
             self._assessor.GetMyMutableContextFromRoot(root_context), self.adapted[-1]
         )
@@ -87,8 +95,8 @@ class OnlineAdaptation:
             self._monitor.reset(own_context)
         return EventStatus.Succeeded()
 
-    def _num_available(self) -> int:
-        """Feedback so far in the unit of k_u."""
-        if self._prior.parameters.adaptation.update_unit == "pairs" or not self.feedback:
-            return len(self.feedback)
-        return len(self._prior.feedback_segments(self.feedback))
+    def _count(self, feedback: list[FeedbackSet]) -> int:
+        """Counts feedback in the unit of k_u."""
+        if self._prior.parameters.adaptation.update_unit == "pairs" or not feedback:
+            return len(feedback)
+        return len(self._prior.feedback_segments(feedback))
