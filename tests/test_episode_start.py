@@ -1,6 +1,7 @@
 """Episodes that begin with a given state and plan: the twin of what another loop did."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -109,12 +110,12 @@ def test_a_task_without_a_robot_cannot_begin_with_a_start_nor_a_start_with_a_goa
     assert started(porter()).get_time() == 0.0
 
 
-def test_a_start_from_a_quaternion_that_has_drifted_is_that_of_unit_norm(loop):
-    good = loop.standing_start()
-    drifted = replace(good, q=np.concatenate([1.03 * good.q[:4], good.q[4:]]))
+def test_a_start_from_a_quaternion_that_has_drifted_is_that_of_unit_norm(balancing):
+    good = start_at(balancing, 0)
+    drifted = dataclasses.replace(good, q=np.concatenate([1.03 * good.q[:4], good.q[4:]]))
     states = []
     for start in (good, drifted):
-        context = loop.CreateDefaultContext()
-        loop.reset_to(context, None, start)
-        states.append(loop.GetOutputPort("plant_state").Eval(context))
+        context = balancing.CreateDefaultContext()
+        balancing.reset_to(context, None, start)
+        states.append(evaluated(balancing, context, "plant_state").copy())
     np.testing.assert_allclose(states[1], states[0], atol=1e-12)

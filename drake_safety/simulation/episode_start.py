@@ -10,7 +10,6 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 
-
 _DRIFT, _ROUNDING = 0.2, 1e-6  # Of a quaternion's norm.
 
 
