@@ -56,5 +56,5 @@ def scale_figure(rows: Sequence[dict[str, Any]]) -> Figure:
             axes.set_xlabel("segments")
             axes.grid(axis="y", color="#eceef0", linewidth=0.7)
             axes.set_axisbelow(True)
-        left.legend(loc="upper right")
+        fig.legend(loc="outside lower center", ncols=5)
     return fig

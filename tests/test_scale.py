@@ -37,6 +37,7 @@ def test_a_row_says_what_each_stage_costs_and_how_good_the_assessment_is(folder)
         assert row["peak_gb"] > 0.1
         assert len(row["score"]) > 20
     np.testing.assert_allclose(rows[0]["score"], rows[1]["score"], atol=0.2)
-    left, right = scale_figure(rows).axes
-    assert [text.get_text() for text in left.get_legend().get_texts()][:4] == list(STAGES)
+    figure = scale_figure(rows)
+    _, right = figure.axes
+    assert [text.get_text() for text in figure.legends[0].get_texts()][:4] == list(STAGES)
     assert right.lines[0].get_xdata()[0] == rows[0]["segments"]
