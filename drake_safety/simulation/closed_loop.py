@@ -131,6 +131,30 @@ class ClosedLoop(FloatSystem, Diagram):
         del scenario
         return []
 
+    def GetMyContextFromRoot(self, root_context: Context) -> Context:
+        """Finds this diagram's Context in that of the outermost diagram.
+
+        Args:
+            root_context: The root Context.
+        """
+        # A root Context that pydrake returns as its own part keeps itself alive for ever.
+        if self._is_outermost():
+            return root_context
+        return super().GetMyContextFromRoot(root_context)
+
+    def GetMyMutableContextFromRoot(self, root_context: Context) -> Context:
+        """See :meth:`GetMyContextFromRoot`.
+
+        Args:
+            root_context: The root Context.
+        """
+        if self._is_outermost():
+            return root_context
+        return super().GetMyMutableContextFromRoot(root_context)
+
+    def _is_outermost(self) -> bool:
+        return str(self.GetSystemPathname()).count("::") == 1
+
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan into the root Context.
 
