@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety import run_episode
+from drake_safety import Scenario, load_assessment, run_episode
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
@@ -61,6 +61,11 @@ class BarePlant:
         simulator.Initialize()
         simulator.AdvanceTo(motion.duration_s)
         return self._plant.GetPositionsAndVelocities(plant_context)
+
+
+def loop_with_everything(scenario: Scenario) -> ClosedLoop:
+    """The nominal loop with the shipped assessment: assessor, monitor, seen margins, recovery."""
+    return scenario.make_loop(assessment=load_assessment(scenario.name))
 
 
 def log_motion(loop: ClosedLoop, index: int, port: InputPort) -> Motion:
