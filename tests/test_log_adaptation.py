@@ -86,7 +86,7 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
         np.testing.assert_allclose(
-            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.01)
+            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.02)
         )
         np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
 

@@ -225,7 +225,7 @@ def test_the_digest_of_the_code_knows_the_tasks_module_wherever_it_lies(tmp_path
 
 
 def test_the_digest_of_the_code_knows_the_modules_beside_the_task():
-    files = scenario_module._own_files(sys.modules["drake_safety.diagrams.balancing"])
+    files = scenario_module.own_files(sys.modules["drake_safety.diagrams.balancing"])
     assert {path.name for path in files} == {"balancing.py", "balancing_parameters.py"}
 
 
