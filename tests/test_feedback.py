@@ -87,6 +87,21 @@ def test_a_recorded_window_gives_the_twin_that_the_episode_would_have(kept):
     assert feedback.nominal_hash == pairs.nominal.info.scenario_hash
 
 
+def test_twins_of_one_simulation_share_a_loop_for_pydrake_frees_none(kept, monkeypatch):
+    scenario = quick()
+    _, pairs = kept
+    loop = scenario.make_loop("nominal")
+    context = loop.CreateDefaultContext()
+    plant_state = loop.GetOutputPort("plant_state").Eval(context)
+    window = RecordedWindow(episode=pairs.actual[0], plant_state=plant_state, start_time_s=0.0)
+    run_twins(scenario, [window], num_workers=1)
+    made = []
+    monkeypatch.setattr(type(scenario), "make_loop", lambda *given, **options: made.append(given))
+    run_twins(scenario, [window], num_workers=1)
+    run_twins(scenario, [window], num_workers=1)
+    assert not made
+
+
 def test_the_plan_of_a_window_goes_through_what_was_desired(kept):
     _, pairs = kept
     loop = quick().make_loop()

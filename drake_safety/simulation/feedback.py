@@ -181,7 +181,8 @@ def run_twins(
     Raises:
         ValueError: The task cannot begin with a given start.
     """
-    info = episodes_info(scenario.make_loop(), seed)
+    # pydrake never frees a system in Python: one loop serves every call.
+    info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(
         _twin_batch,
         list(range(len(windows))),
@@ -210,7 +211,7 @@ def pair_starts(
     Raises:
         ValueError: The task cannot begin with a given start.
     """
-    loop = scenario.make_loop(_TWINS)
+    loop = worker_loop(scenario, _TWINS, {})
     twins = [
         run_episode(loop, episode.index, seed=seed, start=start)
         for episode, start in zip(actual, starts, strict=True)
