@@ -5,20 +5,23 @@ BIN := .venv/bin
 # What the demonstration needs, and on top of it, in the same environment, what development does.
 INSTALLED := .venv/.installed
 DEVELOPED := .venv/.developed
+WALKING := .venv/.walking
 # Where `make bench` stores its table.
 BENCH ?= runs/bench.json
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench docs clean
+.PHONY: help demo walking test lint bench docs clean
 
 help: ## Show these targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the robot
 	$(BIN)/drake-safety train laikago_balancing --episodes 300 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
 		--episodes 128 --calibration-episodes 60 --throws 30 --no-baselines
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
+
+walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies
 
 test: $(DEVELOPED) ## Run the tests, a process a core
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 \
@@ -45,6 +48,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable .
 	touch $@
 
-$(DEVELOPED): $(INSTALLED)
+$(DEVELOPED): $(INSTALLED) $(WALKING)
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+$(WALKING): $(INSTALLED) policies.txt
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[robots,walking]"
+	$(BIN)/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@

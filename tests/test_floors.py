@@ -40,12 +40,13 @@ EXTRAS = {
     "mujoco": "drake_safety/plants/mujoco",
     "report": "drake_safety/evaluation/report/page",
     "robots": "drake_safety/robots/mesh_cache",
+    "walking": "drake_safety/control/policy_network.py",
 }
 ONLY_IN = {
-    "torch": "drake_safety/learning/embedding.py",
-    "tslearn": "drake_safety/learning/distance.py",
-    "dtaidistance": "drake_safety/learning/distance.py",
-    "mujoco": "drake_safety/plants/mujoco_model.py",
+    "torch": ("drake_safety/learning/embedding.py", "drake_safety/control/policy_network.py"),
+    "tslearn": ("drake_safety/learning/distance.py",),
+    "dtaidistance": ("drake_safety/learning/distance.py",),
+    "mujoco": ("drake_safety/plants/mujoco_model.py",),
 }
 PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}
@@ -146,8 +147,9 @@ def forbidden_imports(source, name):
         top = dotted.split(".")[0]
         if room == "learning" and top == "pydrake":
             offences.append(f"{name}:{line} learning imports {dotted}")
-        if name != ONLY_IN.get(top, name):
-            offences.append(f"{name}:{line} imports {dotted}, which belongs in {ONLY_IN[top]}")
+        if name not in ONLY_IN.get(top, [name]):
+            rooms = " or ".join(ONLY_IN[top])
+            offences.append(f"{name}:{line} imports {dotted}, which belongs in {rooms}")
         if top in HEAVY and runs:
             offences.append(f"{name}:{line} imports {dotted} outside a function")
     return offences

@@ -72,6 +72,52 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     )
 
 
+def walking_state_names(kinematics: RobotKinematics) -> list[str]:
+    """Returns the names of the entries of :func:`walking_state`."""
+    names = ["base_height", "gravity_x", "gravity_y", "gravity_z"]
+    names += [f"angular_velocity_{axis}" for axis in "xyz"]
+    names += [f"velocity_{axis}" for axis in "xyz"]
+    names += list(kinematics.joint_names)
+    return names + [f"{name}_rate" for name in kinematics.joint_names]
+
+
+def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Returns the state s_k of a walking robot, which does not depend on its place and heading.
+
+    Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
+    direction of gravity and the velocities are in the base's frame.
+
+    Args:
+        kinematics: The robot.
+        q: Positions (n_q,).
+        v: Velocities (n_v,).
+
+    Returns:
+        (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; all NaN if
+        a position or velocity is not finite.
+    """
+    if not q.dot(q) + v.dot(v) < math.inf:
+        return np.full(10 + 2 * kinematics.num_joints, np.nan)
+    R_BW = RotationMatrix(quaternion_of(q)).matrix().T
+    return np.concatenate([q[6:7], -R_BW[:, 2], R_BW @ v[:3], R_BW @ v[3:6], q[7:], v[6:]])
+
+
+def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Returns the base's planar velocity in its heading frame, and its yaw rate.
+
+    Args:
+        q: Positions (n_q,).
+        v: Velocities (n_v,).
+
+    Returns:
+        (v_x, v_y, ω_z) (3,) [m/s, rad/s], the output of a walking robot.
+    """
+    x_axis = RotationMatrix(quaternion_of(q)).matrix()[:2, 0]
+    length = math.hypot(*x_axis)
+    c, s = x_axis / length if length > 0 else (1.0, 0.0)
+    return np.array([c * v[3] + s * v[4], c * v[4] - s * v[3], v[2]])
+
+
 def gravity_in_foot_plane(
     kinematics: RobotKinematics, q: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:

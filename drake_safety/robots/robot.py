@@ -217,6 +217,10 @@ def add_robot(
         if gains is not None and servos:
             p, d = shift.stiffness_scale * gains.stiffness, shift.stiffness_scale * gains.damping
             actuator.set_controller_gains(PdControllerGains(p=p, d=d))
+        inertia = by_pattern(robot.rotor_inertia, name, "rotor inertia", robot.name)
+        if inertia:
+            actuator.set_default_rotor_inertia(inertia)
+            actuator.set_default_gear_ratio(1.0)
         speed = by_pattern(robot.velocity_limits, name, "velocity limit", robot.name)
         if speed is not None:
             joint.set_velocity_limits([-speed], [speed])

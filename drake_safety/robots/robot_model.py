@@ -179,6 +179,8 @@ class RobotModel:
     expression."""
     velocity_limits: dict[str, float] = field(default_factory=dict)
     """Joint speed limits [rad/s] that replace the model file's, by regular expression."""
+    rotor_inertia: dict[str, float] = field(default_factory=dict)
+    """Inertia of the motors' rotors as the joints feel it [kg·m²], by regular expression."""
     collision: str = "model_file"
     """``model_file``: the model file's collision geometry. ``stated``: only the contact points of
     the feet and ``shapes``, for files with meshes or without shapes (URDF only)."""

@@ -149,11 +149,13 @@ class LeggedLoop(PlannedLoop):
         *,
         outlook: OutputPort | None = None,
         servo_command: OutputPort | None = None,
+        controller_features: tuple[OutputPort, list[str]] | None = None,
+        has_stance: bool = True,
     ) -> None:
         """Adds monitor and features; see :meth:`_add_safe_set`.
 
-        Features after those of the safe set are gravity in the plane of the feet and, with position
-        servos, the servos' load.
+        Features after those of the safe set are gravity in the plane of the feet, with position
+        servos the servos' load, and what the controller tells of itself.
 
         Args:
             builder: The diagram's builder.
@@ -161,6 +163,8 @@ class LeggedLoop(PlannedLoop):
             outlook: Port of the outlook.
             servo_command: Port of the joints' commanded positions and rates, (2 n_j,); None without
                 servos.
+            controller_features: Port of further features, and their names.
+            has_stance: Whether the feet stand, so that they define a plane.
         """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
@@ -173,9 +177,13 @@ class LeggedLoop(PlannedLoop):
             seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
             outlook=outlook,
         )
-        parts = [(self._features, self.feature_names), self._add_gravity(builder)]
+        parts = [(self._features, self.feature_names)]
+        if has_stance:
+            parts.append(self._add_gravity(builder))
         if servo_command is not None:
             parts.append(self._add_servo_load(builder, servo_command))
+        if controller_features is not None:
+            parts.append(controller_features)
         features = builder.AddNamedSystem("features", Multiplexer([p.size() for p, _ in parts]))
         for i, (port, _) in enumerate(parts):
             builder.Connect(port, features.get_input_port(i))

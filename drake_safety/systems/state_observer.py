@@ -7,7 +7,14 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.observation import add_noise, stance_state, state_names
+from drake_safety.control.observation import (
+    add_noise,
+    heading_velocity,
+    stance_state,
+    state_names,
+    walking_state,
+    walking_state_names,
+)
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.systems.float_system import FloatSystem
 
@@ -35,6 +42,8 @@ class StateObserver(FloatSystem, LeafSystem):
             2 n_v entries: for positions (tangent space), then for velocities.
         hand: Name of the reaching frame whose position is the output z_k; the base by default.
         mirror: If given, the state s_k is that of the robot's mirror image.
+        is_walking: Whether s_k is :func:`~drake_safety.control.observation.walking_state`, and z_k
+            the velocity (v_x, v_y, ω_z) in the heading frame [m/s, rad/s].
 
     Raises:
         ValueError: The robot has no such reaching frame.
@@ -47,17 +56,20 @@ class StateObserver(FloatSystem, LeafSystem):
         *,
         hand: str | None = None,
         mirror: Mirror | None = None,
+        is_walking: bool = False,
     ):
         super().__init__()
-        self._mirror = mirror
+        self._mirror, self._is_walking = mirror, is_walking
         self._hand = None if hand is None else kinematics.robot.reaching_frame(hand)
         self._kinematics = kinematics
         self._noise = noise or ObservationNoise()
         self._is_exact = self._noise.position == 0 and self._noise.velocity == 0
         n_q, n_v = kinematics.num_positions, kinematics.num_velocities
         self._n_q = n_q
-        self.state_names = state_names(kinematics)
+        self.state_names = (walking_state_names if is_walking else state_names)(kinematics)
         self.output_names = [f"{'base' if hand is None else 'hand'}_{axis}" for axis in "xyz"]
+        if is_walking:
+            self.output_names = ["forward_velocity", "left_velocity", "yaw_rate"]
         self._state_port = self.DeclareVectorInputPort("plant_state", n_q + n_v)
         self._noise_port = self.DeclareVectorInputPort("noise", 2 * n_v)
         measured = self.DeclareVectorOutputPort(
@@ -79,12 +91,15 @@ class StateObserver(FloatSystem, LeafSystem):
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         measured = self._measured_port.Eval(context)
-        state = stance_state(self._kinematics, measured[: self._n_q], measured[self._n_q :])
+        state_of = walking_state if self._is_walking else stance_state
+        state = state_of(self._kinematics, measured[: self._n_q], measured[self._n_q :])
         output.SetFromVector(state if self._mirror is None else self._mirror.stance_state(state))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         measured = self._measured_port.Eval(context)
-        if self._hand is None:
+        if self._is_walking and np.isfinite(measured).all():
+            output.SetFromVector(heading_velocity(measured[: self._n_q], measured[self._n_q :]))
+        elif self._hand is None:
             output.SetFromVector(measured[4:7])
         elif np.isfinite(measured).all():
             q = measured[: self._n_q]

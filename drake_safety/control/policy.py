@@ -1,0 +1,424 @@
+"""Locomotion policies as data: observation terms, actions, gait clock and command limits."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RotationMatrix
+
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    RobotKinematics,
+)
+from drake_safety.control.observation import quaternion_of
+from drake_safety.control.policy_network import PolicyNetwork, load_network
+from drake_safety.robots.model_files import MissingExtraError, is_installed, model_file
+from drake_safety.robots.robot_model import JointGains, by_pattern, load_typed_file
+
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@dataclass(kw_only=True)
+class ObservationTerm:
+    """A part of the network's input."""
+
+    name: str = ""
+    """One of the registered terms; see :func:`observation_term`."""
+    scale: list[float] = field(default_factory=lambda: [1.0])
+    """Factor, one number or one per entry."""
+    clip: float = 100.0
+    """Largest absolute value after scaling."""
+    history: int = 1
+    """Number of samples, the oldest first."""
+
+    def __post_init__(self) -> None:
+        if self.history < 1:
+            raise ValueError(f"term '{self.name}': history must be at least 1; got {self.history}")
+        if not self.clip > 0:
+            raise ValueError(f"term '{self.name}': clip must be positive; got {self.clip}")
+
+
+@dataclass(kw_only=True)
+class GaitClock:
+    """A clock whose phases are part of the observation."""
+
+    period_s: float = 0.0
+    """Of a cycle [s]; 0 for policies without a clock."""
+    offsets: list[float] = field(default_factory=lambda: [0.0, 0.5])
+    """Phase of each foot at the start, as a share of the period."""
+    standing_below: float = 0.01
+    """Norm of the command below which every phase is half a period."""
+
+
+@dataclass(kw_only=True)
+class CommandLimits:
+    """Commands (v_x, v_y, ω_z) for which the policy was trained [m/s, m/s, rad/s]."""
+
+    lowest: list[float] = field(default_factory=lambda: [-1.0, -1.0, -1.0])
+    highest: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    change: list[float] = field(default_factory=lambda: [math.inf, math.inf, math.inf])
+    """Largest change in one period."""
+
+    def __post_init__(self) -> None:
+        for name in ("lowest", "highest", "change"):
+            if len(getattr(self, name)) != 3:
+                raise ValueError(
+                    f"command: {name} must be three numbers, of v_x, v_y and ω_z; got "
+                    f"{getattr(self, name)}"
+                )
+        if not np.all(np.less_equal(self.lowest, self.highest)):
+            raise ValueError(
+                f"command: lowest must not exceed highest; got {self.lowest}, {self.highest}"
+            )
+
+
+@dataclass(kw_only=True)
+class PolicyParameters:
+    """The schema of ``policy.yaml``."""
+
+    network: str = ""
+    """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
+    requires: str = ""
+    """Requirement by which pip installs the network's package without its dependencies."""
+    joints: list[str] = field(default_factory=list)
+    """Joints in the network's order; by default those of the network's metadata."""
+    default_positions: dict[str, float] = field(default_factory=dict)
+    """Joint positions at zero action [rad], by regular expression over joint names; by default
+    those of the network's metadata, else 0."""
+    action_scale: dict[str, float] = field(default_factory=dict)
+    """Joint positions per unit of action [rad], by regular expression; by default those of the
+    network's metadata."""
+    action_clip: float = 100.0
+    """Largest absolute action."""
+    gains: dict[str, JointGains] = field(default_factory=dict)
+    """Servo gains, by regular expression; by default those of the network's metadata."""
+    rotor_inertia: dict[str, float] = field(default_factory=dict)
+    """Reflected rotor inertia of the joints [kg·m²], by regular expression."""
+    period_s: float = 0.02
+    """Time between two actions [s]."""
+    observation: list[ObservationTerm] = field(default_factory=list)
+    """Terms in the network's order."""
+    gait: GaitClock = field(default_factory=GaitClock)
+    command: CommandLimits = field(default_factory=CommandLimits)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.period_s < math.inf:
+            raise ValueError(f"policy: period_s must be finite and positive; got {self.period_s}")
+        if not self.action_clip > 0:
+            raise ValueError(f"policy: action_clip must be positive; got {self.action_clip}")
+
+
+@dataclass(kw_only=True, eq=False)
+class PolicyInput:
+    """What observation terms are functions of.
+
+    Attributes:
+        R_WB: Orientation of the base, (3, 3).
+        w_WB: Angular velocity of the base in the world, (3,) [rad/s].
+        v_WB: Velocity of the base in the world, (3,) [m/s].
+        positions: Joint positions less those of zero action, in the policy's order, (n_a,) [rad].
+        rates: Joint rates, (n_a,) [rad/s].
+        command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
+        action: The last action, (n_a,).
+        phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
+    """
+
+    R_WB: np.ndarray
+    w_WB: np.ndarray
+    v_WB: np.ndarray
+    positions: np.ndarray
+    rates: np.ndarray
+    command: np.ndarray
+    action: np.ndarray
+    phases: np.ndarray
+
+
+Term = Callable[[PolicyInput], np.ndarray]
+_TERMS: dict[str, Term] = {}
+
+
+def observation_term(name: str) -> Callable[[Term], Term]:
+    """Registers a function of a :class:`PolicyInput` as an observation term.
+
+    Args:
+        name: The term's name in ``policy.yaml``.
+
+    Raises:
+        ValueError: Another function has this name.
+    """
+
+    def register(term: Term) -> Term:
+        if _TERMS.setdefault(name, term) is not term:
+            raise ValueError(f"observation term '{name}' is already registered")
+        return term
+
+    return register
+
+
+# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
+observation_term("base_lin_vel")(lambda seen: seen.R_WB.T @ seen.v_WB)
+observation_term("base_ang_vel")(lambda seen: seen.R_WB.T @ seen.w_WB)
+observation_term("projected_gravity")(lambda seen: seen.R_WB.T @ _DOWN)
+observation_term("velocity_commands")(lambda seen: seen.command)
+observation_term("command_lin_vel")(lambda seen: seen.command[:2])
+observation_term("command_ang_vel")(lambda seen: seen.command[2:])
+observation_term("joint_pos_rel")(lambda seen: seen.positions)
+observation_term("joint_vel_rel")(lambda seen: seen.rates)
+observation_term("last_action")(lambda seen: seen.action)
+observation_term("sin_phase")(lambda seen: np.sin(seen.phases))
+observation_term("cos_phase")(lambda seen: np.cos(seen.phases))
+
+
+class Policy:
+    """A network with its observation, for one robot.
+
+    Args:
+        parameters: Contents of ``policy.yaml``.
+        joint_names: The robot's joints, in the order of its positions.
+        robot: Name of the robot, for messages.
+        folder: Folder of the YAML file.
+
+    Raises:
+        ValueError: A joint or term does not exist, or the network has other widths.
+
+    Attributes:
+        parameters: Contents of ``policy.yaml``.
+        joints: The policy's joints as indices into the robot's, (n_a,).
+        default_positions: Of all joints of the robot at zero action, (n_j,) [rad].
+        action_scale: (n_a,) [rad].
+        sizes: Width of every term.
+    """
+
+    def __init__(
+        self,
+        parameters: PolicyParameters,
+        joint_names: list[str],
+        *,
+        robot: str = "",
+        folder: str = "",
+    ):
+        self.parameters = parameters
+        who = f"policy '{parameters.network}' for robot '{robot}'"
+        self.network: PolicyNetwork = load_network(network_file(parameters, folder))
+        names = parameters.joints or self.network.metadata.joints
+        unknown = [name for name in names if name not in joint_names]
+        if unknown or not names or len(set(names)) != len(names):
+            raise ValueError(
+                f"{who}: joints must be different joints of the robot; got {names}, of which it "
+                f"lacks {unknown}; it has {joint_names}"
+            )
+        self.joint_names = list(names)
+        self.joints = np.array([joint_names.index(name) for name in names])
+        stated = parameters.default_positions, self.network.metadata.default_positions
+        self.default_positions = np.array(
+            [self._value("default position", *stated, name, robot, 0.0) for name in joint_names]
+        )
+        scales = parameters.action_scale, self.network.metadata.action_scale
+        self.action_scale = np.array(
+            [self._value("action scale", *scales, name, robot, math.nan) for name in names]
+        )
+        missing = [n for n, x in zip(names, self.action_scale, strict=True) if math.isnan(x)]
+        if missing:
+            raise ValueError(
+                f"{who}: action_scale has no pattern for joints {missing}; it has "
+                f"{list(parameters.action_scale)}"
+            )
+        self.gains = self._gains(who, robot)
+        gait = parameters.gait
+        self.initial_phases = (
+            _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
+        )
+        self._terms = self._registered(who)
+        still = self._still()
+        widths = [np.asarray(term(still)).size for term, _ in self._terms]
+        for (_, spec), width in zip(self._terms, widths, strict=True):
+            if len(spec.scale) not in (1, width):
+                raise ValueError(
+                    f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
+                )
+        self.sizes = [
+            width * spec.history for width, (_, spec) in zip(widths, self._terms, strict=True)
+        ]
+        self.network.check(who, sum(self.sizes), len(names), self._described(widths))
+
+    def _value(
+        self,
+        what: str,
+        patterns: dict[str, float],
+        values: list[float],
+        joint: str,
+        robot: str,
+        default: float,
+    ) -> float:
+        """A joint's value: stated by a pattern, else of the metadata, else the default."""
+        value = by_pattern(patterns, joint, what, robot)
+        if value is None and values and joint in self.network.metadata.joints:
+            value = values[self.network.metadata.joints.index(joint)]
+        return default if value is None else float(value)
+
+    def _gains(self, who: str, robot: str) -> dict[str, JointGains]:
+        parameters, metadata = self.parameters, self.network.metadata
+        found = {}
+        for i, name in enumerate(self.joint_names):
+            gains = by_pattern(parameters.gains, name, "gains", robot)
+            if gains is None and metadata.stiffness:
+                j = metadata.joints.index(name)
+                gains = JointGains(stiffness=metadata.stiffness[j], damping=metadata.damping[j])
+            if gains is None:
+                raise ValueError(
+                    f"{who}: joint '{self.joint_names[i]}' has no gains; gains has patterns "
+                    f"{list(parameters.gains)}, and the network no metadata of them"
+                )
+            found[name] = gains
+        return found
+
+    def _registered(self, who: str) -> list[tuple[Term, ObservationTerm]]:
+        unknown = [one.name for one in self.parameters.observation if one.name not in _TERMS]
+        if unknown or not self.parameters.observation:
+            raise ValueError(
+                f"{who}: observation must list terms; got unknown ones {unknown}; registered are "
+                f"{sorted(_TERMS)}"
+            )
+        return [(_TERMS[one.name], one) for one in self.parameters.observation]
+
+    def _described(self, widths: list[int]) -> str:
+        return ", ".join(
+            f"{spec.name} {width}" + (f" x {spec.history}" if spec.history > 1 else "")
+            for width, (_, spec) in zip(widths, self._terms, strict=True)
+        )
+
+    def _still(self) -> PolicyInput:
+        n = len(self.joint_names)
+        zero = np.zeros(3)
+        return PolicyInput(
+            R_WB=np.eye(3),
+            w_WB=zero,
+            v_WB=zero,
+            positions=np.zeros(n),
+            rates=np.zeros(n),
+            command=zero,
+            action=np.zeros(n),
+            phases=self.initial_phases,
+        )
+
+    def see(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        command: np.ndarray,
+        action: np.ndarray,
+        phases: np.ndarray,
+    ) -> PolicyInput:
+        """Returns the input of the observation terms in a state.
+
+        Args:
+            q: Positions (n_q,).
+            v: Velocities (n_v,).
+            command: (3,) [m/s, rad/s].
+            action: The last action, (n_a,).
+            phases: (n_p,) [rad].
+        """
+        joints = q[NUM_BASE_POSITIONS:] - self.default_positions
+        return PolicyInput(
+            R_WB=RotationMatrix(quaternion_of(q)).matrix(),
+            w_WB=v[:3],
+            v_WB=v[3:NUM_BASE_VELOCITIES],
+            positions=joints[self.joints],
+            rates=v[NUM_BASE_VELOCITIES:][self.joints],
+            command=command,
+            action=action,
+            phases=phases,
+        )
+
+    def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
+        """Returns the network's input, in which every term's newest sample is the last.
+
+        Args:
+            seen: The present input.
+            history: The last input of the network, (n_o,); NaN before the first.
+        """
+        parts, first = [], 0
+        for (term, spec), size in zip(self._terms, self.sizes, strict=True):
+            value = np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)
+            if spec.history > 1:
+                earlier = history[first + len(value) : first + size]
+                if not np.isfinite(earlier).all():
+                    earlier = np.tile(value, spec.history - 1)
+                value = np.concatenate([earlier, value])
+            parts.append(value)
+            first += size
+        return np.concatenate(parts)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Returns the action (n_a,) for a network's input (n_o,)."""
+        clip = self.parameters.action_clip
+        return np.clip(self.network(observation), -clip, clip)
+
+    def targets(self, action: np.ndarray) -> np.ndarray:
+        """Returns the set points of all joints of the robot, (n_j,) [rad]."""
+        targets = self.default_positions.copy()
+        targets[self.joints] += self.action_scale * action
+        return targets
+
+    def next_phases(self, phases: np.ndarray, command: np.ndarray) -> np.ndarray:
+        """Returns the phases one period later, (n_p,) [rad]."""
+        gait = self.parameters.gait
+        if not len(phases):
+            return phases
+        if np.linalg.norm(command) < gait.standing_below:
+            return np.full(len(phases), math.pi)
+        if np.all(phases == math.pi):  # It stood.
+            phases = self.initial_phases
+        return _wrapped(phases + 2 * math.pi * self.parameters.period_s / gait.period_s)
+
+    def next_command(self, applied: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Returns the command of the next period, of limited change, (3,)."""
+        change = np.asarray(self.parameters.command.change)
+        return np.minimum(np.maximum(wanted, applied - change), applied + change)
+
+
+def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
+    """Returns the file of a policy's network.
+
+    Args:
+        parameters: Contents of ``policy.yaml``.
+        folder: Folder of the YAML file.
+
+    Raises:
+        MissingExtraError: The package that has it is not installed.
+        ValueError: No network is named, or its package is unknown.
+    """
+    if not parameters.network:
+        raise ValueError("policy: network must name an ONNX or TorchScript file")
+    if parameters.requires and not is_installed(parameters.network):
+        raise MissingExtraError(
+            f"'{parameters.network}': the package of this policy is not installed: "
+            f"pip install --no-deps {parameters.requires}"
+        )
+    return model_file(parameters.network, folder)
+
+
+def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
+    """Loads a ``policy.yaml`` for a robot.
+
+    Args:
+        path: The file.
+        kinematics: The robot.
+
+    Raises:
+        ValueError: The file does not fit the schema, the robot or the network.
+    """
+    parameters = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
+    return Policy(
+        parameters,
+        kinematics.joint_names,
+        robot=kinematics.robot.name,
+        folder=str(Path(path).parent),
+    )
+
+
+def _wrapped(phases: np.ndarray) -> np.ndarray:
+    return np.fmod(phases + math.pi, 2 * math.pi) - math.pi

@@ -1,0 +1,218 @@
+"""The safe set of a walking robot: upright, high enough, and only its feet on the ground."""
+
+import math
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.observation import heading_velocity
+from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+
+_GRAVITY = 9.81
+
+
+@dataclass(kw_only=True)
+class WalkingLimits:
+    """Limits of :class:`WalkingSafeSet`."""
+
+    tilt_rad: float = 0.7
+    """Largest angle between the base's z axis and the vertical [rad]."""
+    height_share: float = 0.6
+    """Lowest height of the base, as a share of the standing height."""
+    clearance_m: dict[str, float] = field(default_factory=dict)
+    """Least height of the origins of bodies that must not touch the ground [m], by name."""
+    stop_rad: float = 0.1
+    """How far a joint may be driven beyond a stop, which in simulation is soft [rad]."""
+    fall_height_share: float = 0.45
+    """Height of the base below which the robot has fallen, as a share of the standing height."""
+    fall_tilt_rad: float = 1.2
+    """Tilt beyond which it has fallen [rad]."""
+
+    def __post_init__(self) -> None:
+        for name in ("tilt_rad", "fall_tilt_rad"):
+            if not 0 < getattr(self, name) < math.pi:
+                raise ValueError(f"safe set: {name} must be in (0, π); got {getattr(self, name)}")
+        if not 0 < self.fall_height_share <= self.height_share < 1:
+            raise ValueError(
+                "safe set: 0 < fall_height_share <= height_share < 1; got "
+                f"{self.fall_height_share}, {self.height_share}"
+            )
+        if not self.tilt_rad <= self.fall_tilt_rad:
+            raise ValueError(
+                f"safe set: tilt_rad must not exceed fall_tilt_rad; got {self.tilt_rad}, "
+                f"{self.fall_tilt_rad}"
+            )
+
+
+class WalkingSafeSet:
+    """Safe set of a walking robot.
+
+    The constraints, in the order of :attr:`names`:
+
+    - ``tilt``: angle left until ``tilt_rad`` [rad];
+    - ``height``: height of the base over ``height_share`` of the standing height [m];
+    - ``clearance``: least height of a listed body's origin over its limit [m];
+    - ``joint_limits``: distance of the joint nearest to a stop, more ``stop_rad`` [rad];
+    - ``fall``: the smaller of the height over the fallen height [m] and the tilt left until
+      ``fall_tilt_rad``, times the standing height [m].
+
+    Args:
+        kinematics: The robot.
+        limits: The limits.
+
+    Raises:
+        ValueError: A listed body does not exist.
+    """
+
+    names = ("tilt", "height", "clearance", "joint_limits", "fall")
+    fall_name = "fall"
+    angular_names = ("tilt", "joint_limits")
+    watched_features = MappingProxyType(
+        {"tilt": "tilt_margin", "capture_point_margin": "capture_point_support"}
+    )
+    """Features for baseline monitors, by name of the monitor."""
+
+    def __init__(self, kinematics: RobotKinematics, limits: WalkingLimits):
+        self.kinematics = kinematics
+        self.limits = limits
+        plant = kinematics.plant
+        known = [
+            plant.get_body(i).name()
+            for i in plant.GetBodyIndices(plant.GetModelInstanceByName(kinematics.robot.name))
+        ]
+        unknown = [name for name in limits.clearance_m if name not in known]
+        if unknown:
+            raise ValueError(
+                f"robot '{kinematics.robot.name}' has no bodies {unknown} for clearance_m; it has "
+                f"{known}"
+            )
+        self._clear = [(plant.GetBodyByName(n), h) for n, h in limits.clearance_m.items()]
+        self._lowest_m = limits.height_share * kinematics.standing_height
+        self._fallen_m = limits.fall_height_share * kinematics.standing_height
+        axes = ("forward", "left", "yaw")
+        self.feature_names = [
+            "tilt_margin",
+            "height_margin",
+            "clearance_margin",
+            "joint_margin",
+            *(f"command_{axis}" for axis in axes),
+            *(f"last_command_{axis}" for axis in axes),
+            *(f"largest_command_{axis}" for axis in axes),
+            *(f"tracking_error_{axis}" for axis in axes),
+            "tilt_rate",
+            "capture_point_support",
+            "capture_point_x",
+            "capture_point_y",
+            *(f"foot_height_{i}" for i in range(kinematics.num_contacts)),
+        ]
+        self.rate_features = [
+            "tilt_rate",
+            *(f"tracking_error_{axis}" for axis in axes),
+            *(name for name in self.feature_names if name.startswith("capture_point")),
+        ]
+
+    def _joint_margin(self, q: np.ndarray) -> float:
+        lowest, highest = self.kinematics.position_limits.T
+        joints = q[NUM_BASE_POSITIONS:]
+        distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
+        return float(distance.min()) + self.limits.stop_rad
+
+    def _clearance(self, q: np.ndarray) -> float:
+        if not self._clear:
+            return self.kinematics.standing_height
+        self.kinematics.set_positions(q)
+        context = self.kinematics.context
+        return min(
+            float(body.EvalPoseInWorld(context).translation()[2]) - least
+            for body, least in self._clear
+        )
+
+    def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Returns the signed margins (5,) of a state, always finite.
+
+        Args:
+            q: Positions (n_q,).
+            v: Velocities (n_v,); unused by these constraints.
+        """
+        del v
+        tilt, height = _tilt(q), float(q[6])
+        fallen = min(
+            height - self._fallen_m,
+            self.kinematics.standing_height * (self.limits.fall_tilt_rad - tilt),
+        )
+        return np.array(
+            [
+                self.limits.tilt_rad - tilt,
+                height - self._lowest_m,
+                self._clearance(q),
+                self._joint_margin(q),
+                fallen,
+            ]
+        )
+
+    def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
+        """Returns the margins now, the coming commands, the tracking error and the capture point.
+
+        Args:
+            q: Positions (n_q,), measured.
+            v: Velocities (n_v,), measured.
+            preview: Commands from now on, (M, 3) [m/s, rad/s].
+
+        Returns:
+            Features (n_f,), in the order of :attr:`feature_names`; all NaN if an argument is not
+            finite.
+        """
+        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+            return np.full(len(self.feature_names), np.nan)
+        kinematics = self.kinematics
+        p_WC = kinematics.contact_positions(q)
+        heights = p_WC[:, 2] - kinematics.foot_radii
+        x_axis = _heading(q)
+        to_heading = np.array([x_axis, [-x_axis[1], x_axis[0]]])
+        center = kinematics.center_of_mass(q)
+        rate = math.sqrt(max(center[2], 0.1 * kinematics.standing_height) / _GRAVITY)
+        capture = center[:2] + rate * v[3:5]
+        largest = preview[np.abs(preview).argmax(axis=0), np.arange(preview.shape[1])]
+        return np.concatenate(
+            [
+                self.margins(q, v)[:4],
+                preview[0],
+                preview[-1],
+                largest,
+                preview[0] - heading_velocity(q, v),
+                [_tilt_rate(q, v), signed_distance_to_polygon(capture, convex_hull(p_WC[:, :2]))],
+                to_heading @ (capture - p_WC[:, :2].mean(axis=0)),
+                heights,
+            ]
+        )
+
+
+def _up(q: np.ndarray) -> tuple[float, float, float]:
+    """The vertical's components along the base's axes."""
+    w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
+    return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+
+
+def _tilt(q: np.ndarray) -> float:
+    x, y, z = _up(q)
+    return math.atan2(math.hypot(x, y), z)
+
+
+def _tilt_rate(q: np.ndarray, v: np.ndarray) -> float:
+    """Rate of the angle between the base's z axis and the vertical [rad/s]."""
+    w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
+    z_axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x)])
+    length = math.hypot(*z_axis)
+    if length < 1e-9:
+        return math.hypot(v[0], v[1])
+    # The axis (z_x, z_y) tilts farther by rotation about the horizontal normal (-z_y, z_x).
+    return float((-z_axis[1] * v[0] + z_axis[0] * v[1]) / length)
+
+
+def _heading(q: np.ndarray) -> np.ndarray:
+    w, x, y, z = q[:4].tolist()
+    forward = np.array([w * w + x * x - y * y - z * z, 2 * (x * y + w * z)])
+    length = math.hypot(*forward)
+    return forward / length if length > 0 else np.array([1.0, 0.0])

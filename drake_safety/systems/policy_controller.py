@@ -1,0 +1,111 @@
+"""PolicyController: joint set points from a trained locomotion policy."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.policy import Policy
+from drake_safety.systems.float_system import FloatSystem
+
+ACTING, HELD = 0.0, 1.0
+"""Values of ``status``: the network's action, or the last finite one."""
+
+
+class PolicyController(FloatSystem, LeafSystem):
+    """Evaluates a policy every period and holds its joint set points.
+
+    .. pydrake_system::
+
+        name: PolicyController
+        input_ports:
+        - plant_state
+        - command
+        output_ports:
+        - desired_joint_state
+        - action_state
+        - status
+
+    ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs are
+    discrete states, so that a cloned Context continues from its phase of the gait.
+    ``action_state`` is the last action (n_a,), its largest change in the last period (1,), and
+    sine and cosine of the phases (2 n_p,). An action that is not finite is replaced by the last
+    one, and ``status`` is ``HELD``.
+
+    Args:
+        kinematics: The robot.
+        policy: The policy.
+        offset_s: Time of the first update [s].
+    """
+
+    def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):
+        super().__init__()
+        self.policy = policy
+        self._n_q = kinematics.num_positions
+        n_a, n_p, n_j = len(policy.joints), len(policy.initial_phases), kinematics.num_joints
+        self._state_port = self.DeclareVectorInputPort(
+            "plant_state", kinematics.num_positions + kinematics.num_velocities
+        )
+        self._command_port = self.DeclareVectorInputPort("command", 3)
+        standing = np.concatenate([policy.default_positions, np.zeros(n_j)])
+        self._set_point = self.DeclareDiscreteState(standing)
+        phases = policy.initial_phases
+        memory = np.concatenate([np.zeros(n_a), [0.0], np.sin(phases), np.cos(phases)])
+        self._action = self.DeclareDiscreteState(memory)
+        self._phases = self.DeclareDiscreteState(phases if n_p else np.zeros(1))
+        self._applied = self.DeclareDiscreteState(3)
+        self._history = self.DeclareDiscreteState(np.full(sum(policy.sizes), np.nan))
+        self._status = self.DeclareDiscreteState([ACTING])
+        self.action_names = [
+            *(f"action_{name}" for name in policy.joint_names),
+            "action_change",
+            *(f"{wave}_phase_{i}" for wave in ("sin", "cos") for i in range(n_p)),
+        ]
+        self._num_actions, self._num_phases = n_a, n_p
+        self.DeclarePeriodicDiscreteUpdateEvent(policy.parameters.period_s, offset_s, self._update)
+        self.DeclareStateOutputPort("desired_joint_state", self._set_point)
+        self.DeclareStateOutputPort("action_state", self._action)
+        self.DeclareStateOutputPort("status", self._status)
+
+    def state_of(self, context: Context) -> list[np.ndarray]:
+        """The controller's memory in a Context, for :meth:`set_state`."""
+        return [
+            context.get_discrete_state(i).get_value().copy()
+            for i in range(context.num_discrete_state_groups())
+        ]
+
+    def set_state(self, context: Context, state: list[np.ndarray]) -> None:
+        """Sets the controller's memory to that of :meth:`state_of`."""
+        for i, value in enumerate(state):
+            context.SetDiscreteState(i, value)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        policy, n_a = self.policy, self._num_actions
+        action = context.get_discrete_state(self._action).get_value()[:n_a]
+        phases = context.get_discrete_state(self._phases).get_value()[: self._num_phases]
+        applied = context.get_discrete_state(self._applied).get_value()
+        wanted = self._command_port.Eval(context)
+        plant_state = self._state_port.Eval(context)
+        new, status = action, HELD
+        if np.isfinite(wanted).all() and np.isfinite(plant_state).all():
+            applied = policy.next_command(applied, wanted)
+            q, v = plant_state[: self._n_q], plant_state[self._n_q :]
+            seen = policy.see(q, v, applied, action, phases)
+            history = context.get_discrete_state(self._history).get_value()
+            observation = policy.observe(seen, history)
+            found = policy.act(observation)
+            if np.isfinite(found).all():
+                new, status = found, ACTING
+                discrete_state.set_value(self._history, observation)
+        phases = policy.next_phases(phases, applied)
+        set_point = np.zeros(2 * len(policy.default_positions))
+        set_point[: len(set_point) // 2] = policy.targets(new)
+        change = float(np.abs(new - action).max())
+        memory = np.concatenate([new, [change], np.sin(phases), np.cos(phases)])
+        discrete_state.set_value(self._set_point, set_point)
+        discrete_state.set_value(self._action, memory)
+        if self._num_phases:
+            discrete_state.set_value(self._phases, phases)
+        discrete_state.set_value(self._applied, applied)
+        discrete_state.set_value(self._status, [status])

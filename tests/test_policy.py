@@ -1,0 +1,195 @@
+"""Policies as data: observation, action, gait clock, and networks that do not fit."""
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pydrake.math import RotationMatrix
+
+from drake_safety.control.policy import (
+    CommandLimits,
+    GaitClock,
+    ObservationTerm,
+    Policy,
+    PolicyParameters,
+    network_file,
+    observation_term,
+)
+from drake_safety.control.policy_network import _read_metadata, load_network
+from drake_safety.robots.model_files import MissingExtraError
+from drake_safety.robots.robot_model import JointGains
+
+JOINTS = ["hip", "knee", "tail"]  # The robot's; the policy moves two, in another order.
+TERMS = ["base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
+
+
+class Linear(torch.nn.Module):
+    def __init__(self, num_inputs, num_outputs):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.arange(num_inputs * num_outputs) * 0.01)
+        self.num_outputs: int = num_outputs
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x @ self.weight.reshape(-1, self.num_outputs)
+
+
+def saved(tmp_path, num_inputs=13, num_outputs=2):
+    path = tmp_path / f"net_{num_inputs}_{num_outputs}.pt"
+    with warnings.catch_warnings():
+        # Torch deprecates the format, in which policies are nevertheless published.
+        warnings.simplefilter("ignore")
+        torch.jit.script(Linear(num_inputs, num_outputs)).save(str(path))
+    return path
+
+
+def parameters(tmp_path, **changed):
+    given = {
+        "network": str(saved(tmp_path)),
+        "joints": ["knee", "hip"],
+        "default_positions": {"knee": 0.5},
+        "action_scale": {".*": 0.25},
+        "gains": {".*": JointGains(stiffness=20.0, damping=0.5)},
+        "observation": [ObservationTerm(name=name) for name in TERMS],
+    }
+    return PolicyParameters(**(given | changed))
+
+
+def policy(tmp_path, **changed):
+    return Policy(parameters(tmp_path, **changed), JOINTS, robot="r")
+
+
+def see(made, q=None, v=None, command=(0.1, 0.2, 0.3)):
+    q = np.array([1.0, 0, 0, 0, 0, 0, 0.4, 0.1, 0.9, 2.0]) if q is None else q
+    v = np.arange(9.0) if v is None else v
+    return made.see(q, v, np.array(command), np.array([3.0, 4.0]), made.initial_phases)
+
+
+def test_joints_are_in_the_policys_order_relative_to_zero_action(tmp_path):
+    made = policy(tmp_path)
+    seen = see(made)
+    np.testing.assert_allclose(seen.positions, [0.9 - 0.5, 0.1])
+    np.testing.assert_allclose(seen.rates, [7.0, 6.0])
+    np.testing.assert_allclose(made.targets(np.array([1.0, 2.0])), [0.5, 0.5 + 0.25, 0.0])
+
+
+def test_the_observation_has_its_terms_in_order_scaled_and_clipped(tmp_path):
+    terms = [ObservationTerm(name=name) for name in TERMS]
+    terms[0].scale, terms[4].clip = [0.25], 3.5
+    made = policy(tmp_path, observation=terms)
+    observation = made.observe(see(made), np.full(13, np.nan))
+    expected = [0, 0.25, 0.5, 0, 0, -1, 0.1, 0.2, 0.3, 0.4, 0.1, 3.0, 3.5]
+    np.testing.assert_allclose(observation, expected)
+
+
+def test_gravity_and_velocities_do_not_depend_on_the_heading(tmp_path):
+    made = policy(tmp_path)
+    tilted = RotationMatrix.MakeXRotation(0.3)
+    results = []
+    for yaw in (0.0, 2.0):
+        R_WB = RotationMatrix.MakeZRotation(yaw) @ tilted
+        q = np.concatenate([R_WB.ToQuaternion().wxyz(), [0, 0, 0.4, 0, 0, 0]])
+        v = np.zeros(9)
+        v[:3] = R_WB.matrix() @ [0.1, 0.2, 0.3]
+        results.append(made.observe(see(made, q, v), np.full(13, np.nan)))
+    np.testing.assert_allclose(results[0], results[1], atol=1e-12)
+    np.testing.assert_allclose(results[0][3:6], [0, -math.sin(0.3), -math.cos(0.3)])
+
+
+def test_history_is_oldest_first_and_begins_with_what_is_seen_first(tmp_path):
+    path = saved(tmp_path, 6)
+    terms = [ObservationTerm(name="last_action", history=3)]
+    made = policy(tmp_path, network=str(path), observation=terms)
+    history = np.full(6, np.nan)
+    seen = see(made)
+    history = made.observe(seen, history)
+    np.testing.assert_allclose(history, [3, 4, 3, 4, 3, 4])
+    seen.action = np.array([5.0, 6.0])
+    np.testing.assert_allclose(made.observe(seen, history), [3, 4, 3, 4, 5, 6])
+
+
+def test_the_gait_clock_runs_once_a_period_and_rests_while_standing(tmp_path):
+    made = policy(tmp_path, gait=GaitClock(period_s=1.0))
+    walking, standing = np.array([0.5, 0, 0]), np.zeros(3)
+    phases = made.initial_phases
+    np.testing.assert_allclose(np.abs(phases), [0, math.pi])
+    for _ in range(50):
+        phases = made.next_phases(phases, walking)
+    np.testing.assert_allclose(np.cos(phases), [1, -1], atol=1e-9)
+    np.testing.assert_allclose(made.next_phases(phases, standing), [math.pi, math.pi])
+
+
+def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
+    made = policy(tmp_path, command=CommandLimits(change=[0.05, 0.04, 0.1]))
+    np.testing.assert_allclose(
+        made.next_command(np.zeros(3), np.array([1.0, -1.0, 0.02])), [0.05, -0.04, 0.02]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"joints": ["knee", "elbow"]}, r"lacks \['elbow'\]; it has \['hip', 'knee', 'tail'\]"),
+        ({"joints": ["knee"]}, r"takes no observation of 11 entries .*joint_pos_rel 1"),
+        ({"observation": []}, "observation must list terms"),
+        ({"observation": [ObservationTerm(name="lidar")]}, r"unknown ones \['lidar'\]"),
+        ({"gains": {"knee": JointGains()}}, "joint 'hip' has no gains"),
+        ({"action_scale": {"knee": 1.0}}, r"no pattern for joints \['hip'\]"),
+        (
+            {"observation": [ObservationTerm(name="last_action", scale=[1.0, 2.0, 3.0])]},
+            "has 2 entries; got 3 scales",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_what_was_expected(tmp_path, changed, message):
+    with pytest.raises(ValueError, match=message):
+        policy(tmp_path, **changed)
+
+
+def test_a_network_with_another_number_of_actions_is_refused(tmp_path):
+    path = saved(tmp_path, 13, 5)
+    with pytest.raises(ValueError, match="returns 5 actions, expected one for each of 2 joints"):
+        policy(tmp_path, network=str(path))
+
+
+def test_files_that_are_no_networks_are_named(tmp_path):
+    for name, text, message in (
+        ("a.onnx", "no network", "not an ONNX network"),
+        ("a.pt", "no network", "not a TorchScript network"),
+        ("a.txt", "", "is one of"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match=message) as error:
+            load_network(tmp_path / name)
+        assert name in str(error.value)
+    with pytest.raises(ValueError, match="does not exist"):
+        load_network(tmp_path / "none.onnx")
+
+
+def test_a_policy_of_a_missing_package_says_how_to_install_it():
+    stated = PolicyParameters(network="package://no-such-policy/a.onnx", requires="no-such==1.0")
+    with pytest.raises(MissingExtraError, match=r"pip install --no-deps no-such==1\.0"):
+        network_file(stated)
+
+
+def test_a_term_of_ones_own_is_one_function(tmp_path):
+    observation_term("test_twice_the_height")(lambda seen: 2.0 * seen.action)
+    terms = [ObservationTerm(name="test_twice_the_height")]
+    made = policy(tmp_path, network=str(saved(tmp_path, 2)), observation=terms)
+    np.testing.assert_allclose(made.observe(see(made), np.full(2, np.nan)), [6.0, 8.0])
+    with pytest.raises(ValueError, match="already registered"):
+        observation_term("last_action")(lambda seen: seen.action)
+
+
+def test_metadata_of_both_styles_is_read_and_checked():
+    path = Path("p.onnx")
+    isaac = {"joint_names": "a,b", "joint_stiffness": "20.0,30.0", "action_scale": "0.25,0.5"}
+    metadata = _read_metadata(path, isaac)
+    assert metadata.joints == ["a", "b"]
+    assert (metadata.stiffness, metadata.action_scale) == ([20.0, 30.0], [0.25, 0.5])
+    holosoma = {"dof_names": '["a"]', "kp": "[1.5]", "command_ranges": '{"lin_vel_x": [-1, 1]}'}
+    assert _read_metadata(path, holosoma).command == {"lin_vel_x": [-1, 1]}
+    with pytest.raises(ValueError, match="a number for each of the joints"):
+        _read_metadata(path, {"dof_names": '["a"]', "kp": "[1, 2]"})
