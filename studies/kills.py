@@ -150,7 +150,10 @@ def _killed(
     """Starts a command, kills it or a worker, and returns its exit code and what it left."""
     import psutil
 
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    # A file: a pipe would be open as long as a worker that is left behind.
+    log = folder.with_suffix(".log")
+    with log.open("w", encoding="utf-8") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     time.sleep(after_s)
     children: list[psutil.Process] = []
     try:
@@ -160,10 +163,12 @@ def _killed(
         victim.send_signal(what)
     except psutil.NoSuchProcess:
         pass  # It had finished.
-    output = process.communicate()[0]
+    process.wait()
     _, alive = psutil.wait_procs(children, timeout=_WITHIN_S)
     left = [f"process {one.pid}" for one in alive]
-    if "Traceback" in output:
+    for one in alive:
+        one.kill()
+    if "Traceback" in log.read_text(encoding="utf-8"):
         left.append("a traceback")
     # A killed process cannot tidy up: what it leaves is swept when its folder is opened again.
     if what != signal.SIGKILL:

@@ -87,3 +87,15 @@ def test_a_killed_worker_is_one_line_that_says_how_to_go_on(tmp_path, undisturbe
     _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
     assert not alive
     assert_kept(tmp_path / "episodes", undisturbed)
+
+
+def test_a_worker_whose_parent_ended_while_it_started_ends_at_once():
+    code = (
+        "import os\n"
+        "from drake_safety.simulation.worker_processes import end_with_parent\n"
+        "end_with_parent(os.getppid() + 1)\n"
+        "print('goes on')"
+    )
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (ended.returncode, ended.stdout) == (1, "")

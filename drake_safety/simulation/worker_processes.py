@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copyreg
-import functools
 import importlib
 import os
 import sys
@@ -95,12 +94,12 @@ def parallel_map(
             for args in arguments:
                 yield function(*args)
         return
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+    backend_options = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1, **backend_options):
         parallel = joblib.Parallel(
             n_jobs=num_workers, return_as="generator_unordered", batch_size=1
         )
-        calls = (joblib.delayed(_call_in_worker)(os.getpid(), function, args) for args in arguments)
-        results = parallel(calls)
+        results = parallel(joblib.delayed(function)(*args) for args in arguments)
         try:
             for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
                 yield result
@@ -164,26 +163,23 @@ def _map_remotely(
         raise
 
 
-def _call_in_worker(parent: int, function: Callable[..., Any], arguments: tuple) -> Any:
-    end_with_parent(parent)
-    return function(*arguments)
-
-
-@functools.cache
 def end_with_parent(parent: int) -> None:
-    """Ends this process soon after its parent, however that ends.
+    """Ends this worker soon after its parent, however that ends; at once if it has.
+
+    A worker whose parent is killed while it starts would else wait for minutes, or for ever, when
+    it sends a result that nobody reads.
 
     Args:
-        parent: Process ID of the parent; nothing happens if another process is.
+        parent: Process ID of the parent.
     """
-    if os.getppid() != parent:
-        return
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_WATCH_PERIOD_S)
         os._exit(1)
 
+    if os.getppid() != parent:
+        os._exit(1)
     threading.Thread(target=watch, name="end_with_parent", daemon=True).start()
 
 
