@@ -153,12 +153,14 @@ def _killed(
     # A file: a pipe would be open as long as a worker that is left behind.
     log = folder.with_suffix(".log")
     with log.open("w", encoding="utf-8") as file:
+        # A shell's background job ignores SIGINT, and so would what it starts.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     time.sleep(after_s)
     children: list[psutil.Process] = []
     try:
         children = psutil.Process(process.pid).children(recursive=True)
-        workers = [one for one in children if "loky" in " ".join(one.cmdline())]
+        workers = [one for one in children if "LokyProcess" in " ".join(one.cmdline())]
         victim = psutil.Process(process.pid) if whom == "main" or not workers else workers[0]
         victim.send_signal(what)
     except psutil.NoSuchProcess:

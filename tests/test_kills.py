@@ -17,6 +17,14 @@ from drake_safety.simulation.dataset import completed, load_episodes
 NUM_EPISODES, WITHIN_S, PATIENCE_S = 1500, 10.0, 60.0
 
 
+@pytest.fixture(autouse=True)
+def answered_sigint():
+    """SIGINT as in a terminal: a shell's background job ignores it, and so would its children."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def start(folder):
     """`drake-safety train` of the pendulum with two workers, once some episodes are on disk."""
     command = [sys.executable, "-m", "drake_safety.cli", "train", "pendulum", "--workers", "2"]
