@@ -112,8 +112,8 @@ def parallel_map(
         except BaseException:
             from joblib.externals.loky import get_reusable_executor
 
-            # With other arguments than joblib's it would replace the executor, and wait for a thread
-            # that waits for its lock.
+            # With other arguments than joblib's it would replace the executor, and wait for a
+            # thread that waits for its lock.
             get_reusable_executor(reuse=True).shutdown(wait=False, kill_workers=True)
             with warnings.catch_warnings():
                 # Joblib warns that not all results were consumed.
