@@ -1,145 +1,69 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
-import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.policy import (
-    CommandLimits,
-    Policy,
-    PolicyParameters,
-    load_policy,
-    network_file,
-)
-from drake_safety.control.walking_safe_set import WalkingLimits, WalkingSafeSet
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.policy import Policy, PolicyParameters, load_policy, network_file
+from drake_safety.control.walking_safe_set import WalkingSafeSet
+from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
-from drake_safety.robots.robot_model import RobotModel, load_typed_file
+from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed_file
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.systems.command_guard import CommandGuard
+from drake_safety.systems.crouch_controller import CrouchController
 from drake_safety.systems.policy_controller import PolicyController
+from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 _NUM_OUTLOOK = 9  # Samples of the commands from now to the end, for the features.
-_RAMP_S = 0.1  # From one command to the next.
-
-
-@dataclass(kw_only=True)
-class CommandSampling:
-    """Random velocity profiles."""
-
-    reach: float = 1.6
-    """How far commands go beyond the policy's ranges, as a factor on them."""
-    num_segments: list[int] = field(default_factory=lambda: [1, 3])
-    """Least and largest number of constant commands in an episode."""
-    standing_share: float = 0.1
-    """Share of commands that are zero."""
-
-    def __post_init__(self) -> None:
-        if not self.reach > 0:
-            raise ValueError(f"commands: reach must be positive; got {self.reach}")
-        low, high = self.num_segments
-        if not 1 <= low <= high:
-            raise ValueError(f"commands: num_segments must be [1 or more, ...]; got {[low, high]}")
-
-    def sample(
-        self, limits: CommandLimits, rng: np.random.Generator, duration_s: float
-    ) -> PiecewisePolynomial:
-        """Samples a profile of constant commands with short ramps between them.
-
-        Args:
-            limits: The policy's ranges.
-            rng: Random generator.
-            duration_s: Of the profile [s].
-        """
-        low, high = self.reach * np.array(limits.lowest), self.reach * np.array(limits.highest)
-        count = int(rng.integers(self.num_segments[0], self.num_segments[1] + 1))
-        commands = [
-            np.zeros(3) if rng.random() < self.standing_share else rng.uniform(low, high)
-            for _ in range(count)
-        ]
-        changes = np.sort(rng.uniform(0.1 * duration_s, 0.9 * duration_s, count - 1))
-        return profile(commands, changes.tolist(), duration_s)
-
-
-def profile(
-    commands: list[np.ndarray], changes_s: list[float], duration_s: float
-) -> PiecewisePolynomial:
-    """A profile of constant commands.
-
-    Args:
-        commands: (v_x, v_y, ω_z) each, (3,) [m/s, rad/s].
-        changes_s: Ascending times at which the next command begins [s].
-        duration_s: Of the profile [s].
-    """
-    times, values = [0.0], [commands[0]]
-    for change_s, before, after in zip(changes_s, commands[:-1], commands[1:], strict=True):
-        begins = max(change_s, times[-1] + 1e-3)
-        times += [begins, begins + _RAMP_S]
-        values += [before, after]
-    times.append(max(duration_s, times[-1] + 1e-3))
-    values.append(values[-1])
-    return PiecewisePolynomial.FirstOrderHold(times, np.transpose(values))
-
-
-@dataclass(kw_only=True)
-class WalkingStart:
-    """Random initial states: a phase of the undisturbed gait, and an offset as after a push."""
-
-    walked_s: list[float] = field(default_factory=lambda: [0.6, 1.6])
-    """Shortest and longest time since the robot stood [s]."""
-    push_share: float = 0.7
-    """Share of episodes with an offset."""
-    velocity_m_s: float = 2.0
-    """Largest horizontal velocity offset of the base."""
-    angular_velocity_rad_s: float = 1.5
-    """Half-width of the base's angular velocity offset, per axis."""
-    tilt_rad: float = 0.15
-    """Half-width of roll and pitch offsets."""
-    joint_rad: float = 0.05
-    """Standard deviation of the joints' offsets."""
-
-
-@dataclass(kw_only=True)
-class WalkingParameters:
-    """The task's part of the scenario file."""
-
-    policy: str = "policy.yaml"
-    """Policy file, relative to the folder of the robot's YAML file."""
-    safe_set: WalkingLimits = field(default_factory=WalkingLimits)
-    commands: CommandSampling = field(default_factory=CommandSampling)
-    start: WalkingStart = field(default_factory=WalkingStart)
-    assessment_period_s: float = 0.02
-    """Time between two evaluations of Γ [s]."""
 
 
 class Walking(LeggedLoop):
     """The diagram of the walking task, for any robot.yaml with feet and a policy.yaml.
 
     Plans are velocity profiles (v_x, v_y, ω_z) in the heading frame [m/s, rad/s]; the output z is
-    the measured velocity.
+    the measured velocity, and a goal is a constant command.
 
     Args:
         scenario: The scenario.
         variation: Name of the plant variation.
         assessment: Adds an assessor.
         meshcat: Adds a visualiser.
+        disturbed: Whether some episodes begin with an offset of the state.
+        command_s: Duration of a goal's command [s], after which the command is zero; that of the
+            episode by default.
+        guard: Whether a :class:`CommandGuard` passes on commands; requires an assessment.
+        recovery: Whether to recover when Γ falls below a threshold. Without an assessment the
+            diagram then has an input port ``safety_probability``.
 
     Raises:
-        ValueError: The policy does not fit the robot, or an assessment is that of another diagram.
+        ValueError: The policy does not fit the robot, an assessment is that of another diagram, or
+            there is none for the guard.
     """
 
     Parameters = WalkingParameters
     angular_constraints = WalkingSafeSet.angular_names
+    # Commands are judged before the robot walks, and pushes are those of a run.
+    judging_options: Mapping[str, Any] = MappingProxyType({"disturbed": False})
+    online_parameters = ("guard", "recovery", "named_commands", "assessment_period_s")
+    hand = None
+    goal_words = ("command", "m/s, m/s, rad/s")
 
     def __init__(
         self,
@@ -148,13 +72,22 @@ class Walking(LeggedLoop):
         *,
         assessment: SafetyAssessment | None = None,
         meshcat: Meshcat | None = None,
+        disturbed: bool = True,
+        command_s: float | None = None,
+        guard: bool = False,
+        recovery: bool = False,
     ):
         super().__init__(scenario, variation, assessment)
+        if guard and assessment is None:
+            raise ValueError("walking: guard=True needs an assessment; got none")
         parameters = scenario.parameters
+        self._is_disturbed, self._command_s = disturbed, command_s
+        self.named_targets = parameters.named_commands
         self.policy = load_policy(policy_file(scenario), self.kinematics)
         # The servos' gains are part of the policy, and its default posture is how it stands.
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
+        # Assessor, guard or trigger, and controller update in this order in one plant step.
         tick_offset_s = 0.25 * scenario.time_step_s
         builder = DiagramBuilder()
         physics = self._add_robot(builder, Scene(), servos=True)
@@ -162,32 +95,174 @@ class Walking(LeggedLoop):
         planner = self._add_planner(
             builder, outlook_s=scenario.episode_duration_s, num_outlook=_NUM_OUTLOOK
         )
+        names = ("desired_output", "desired_preview", "desired_outlook")
+        desired = {name: planner.GetOutputPort(name) for name in names}
+        safe_set = WalkingSafeSet(self.kinematics, parameters.safe_set)
+        guard_system = None
+        if guard and assessment is not None:
+            guard_system = builder.AddNamedSystem(
+                "command_guard",
+                CommandGuard(
+                    assessment,
+                    safe_set.with_commands,
+                    self.policy.parameters.command,
+                    threshold=parameters.guard.threshold,
+                    period_s=parameters.guard.period_s,
+                    offset_s=tick_offset_s,
+                    num_outlook=_NUM_OUTLOOK,
+                ),
+            )
+            builder.Connect(desired["desired_output"], guard_system.GetInputPort("command"))
+            desired = {name: guard_system.GetOutputPort(name) for name in names}
+            builder.ExportOutput(guard_system.GetOutputPort("is_changed"), "guard_active")
+        self._guard = guard_system
+        self._switches: list[PortSwitch] = []
+        command = desired["desired_output"]
+        trigger = None
+        if recovery:
+            trigger = self._add_trigger(builder, tick_offset_s)
+            command = self._recovering_command(builder, command, trigger)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
-            PolicyController(self.kinematics, self.policy, offset_s=tick_offset_s),
+            PolicyController(self.kinematics, self.policy, offset_s=2 * tick_offset_s),
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
-        builder.Connect(planner.GetOutputPort("desired_output"), controller.GetInputPort("command"))
-        physics.connect_servos(
-            builder, self.kinematics.joint_names, controller.GetOutputPort("desired_joint_state")
-        )
+        builder.Connect(command, controller.GetInputPort("command"))
+        joint_state = controller.GetOutputPort("desired_joint_state")
+        if trigger is not None:
+            joint_state = self._recovering_joints(
+                builder, joint_state, measured, desired["desired_output"], trigger
+            )
+        physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._watch(
             builder,
-            WalkingSafeSet(self.kinematics, parameters.safe_set),
+            safe_set,
+            outlook=desired["desired_outlook"],
             controller_features=(
                 controller.GetOutputPort("action_state"),
                 controller.action_names,
             ),
             has_stance=False,
         )
-        self._export_robot(
+        assessor = self._export_robot(
             builder,
             assessment_period_s=parameters.assessment_period_s,
+            desired_output=desired["desired_output"],
+            desired_preview=desired["desired_preview"],
             meshcat=meshcat,
         )
+        if guard_system is not None:
+            builder.Connect(
+                self._assessor_observer.GetOutputPort("state"), guard_system.GetInputPort("state")
+            )
+            builder.Connect(self._features, guard_system.GetInputPort("features"))
+        if trigger is not None and assessor is not None:
+            for name, port in (
+                ("safety_probability", "calibrated_safety_probability"),
+                ("belief", "belief"),
+            ):
+                builder.Connect(assessor.GetOutputPort(port), trigger.GetInputPort(name))
+        elif trigger is not None:
+            builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
         self._rehearsal: Walking | None = None
         self.finish(builder)
+
+    def _add_trigger(self, builder: DiagramBuilder, offset_s: float) -> RecoveryTrigger:
+        recovery = self.scenario.parameters.recovery
+        trigger = builder.AddNamedSystem(
+            "recovery_trigger",
+            RecoveryTrigger(
+                threshold=recovery.threshold,
+                persistence_s=recovery.persistence_s,
+                period_s=self.scenario.control_period_s,
+                offset_s=offset_s,
+            ),
+        )
+        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
+        return trigger
+
+    def _switched(
+        self,
+        builder: DiagramBuilder,
+        name: str,
+        nominal: OutputPort,
+        recovering: OutputPort,
+        trigger: RecoveryTrigger,
+    ) -> OutputPort:
+        switch = builder.AddNamedSystem(name, PortSwitch(nominal.size()))
+        builder.Connect(
+            trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
+        )
+        builder.Connect(nominal, switch.DeclareInputPort("nominal"))
+        builder.Connect(recovering, switch.DeclareInputPort("recovery"))
+        return switch.GetOutputPort("value")
+
+    def _recovering_command(
+        self, builder: DiagramBuilder, command: OutputPort, trigger: RecoveryTrigger
+    ) -> OutputPort:
+        """The command, or that of the branches "stop" and "slower" during recovery."""
+        recovery = self.scenario.parameters.recovery
+        if recovery.branch not in ("stop", "slower"):
+            return command
+        share = recovery.slower_share if recovery.branch == "slower" else 0.0
+        slower = builder.AddNamedSystem("slower_command", MatrixGain(share * np.eye(3)))
+        builder.Connect(command, slower.get_input_port())
+        return self._switched(builder, "command_switch", command, slower.get_output_port(), trigger)
+
+    def _recovering_joints(
+        self,
+        builder: DiagramBuilder,
+        joint_state: OutputPort,
+        measured: OutputPort,
+        command: OutputPort,
+        trigger: RecoveryTrigger,
+    ) -> OutputPort:
+        """The joints' set points, or those of "crouch" and "policy" during recovery."""
+        recovery, scenario = self.scenario.parameters.recovery, self.scenario
+        offset_s = 0.5 * scenario.time_step_s
+        if recovery.branch == "crouch":
+            stated = [
+                by_pattern(recovery.crouch, name, "crouch", self.robot.name)
+                for name in self.kinematics.joint_names
+            ]
+            standing = self.kinematics.standing_positions()[NUM_BASE_POSITIONS:]
+            posture = [
+                rest if value is None else value
+                for value, rest in zip(stated, standing.tolist(), strict=True)
+            ]
+            other = builder.AddNamedSystem(
+                "crouch_controller",
+                CrouchController(
+                    self.kinematics,
+                    np.array(posture),
+                    step_rad=recovery.crouch_step_rad,
+                    period_s=scenario.control_period_s,
+                    offset_s=offset_s,
+                ),
+            )
+        elif recovery.branch == "policy":
+            policy = load_policy(policy_file(scenario, recovery.policy), self.kinematics)
+            if policy.gains != self.policy.gains:
+                raise ValueError(
+                    f"recovery: policy '{recovery.policy}' has other joint gains than "
+                    f"'{scenario.parameters.policy}', and the servos have one set"
+                )
+            other = builder.AddNamedSystem(
+                "recovery_policy_controller",
+                PolicyController(self.kinematics, policy, offset_s=offset_s),
+            )
+            builder.Connect(command, other.GetInputPort("command"))
+        else:
+            return joint_state
+        builder.Connect(measured, other.GetInputPort("plant_state"))
+        return self._switched(
+            builder,
+            "joint_switch",
+            joint_state,
+            other.GetOutputPort("desired_joint_state"),
+            trigger,
+        )
 
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
@@ -196,53 +271,89 @@ class Walking(LeggedLoop):
         policy = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
         return [*super().model_files(scenario), path, network_file(policy, str(path.parent))]
 
-    def reset(self, context: Context, rng: np.random.Generator) -> int:
-        """Samples a phase of the gait, an offset of the state and a velocity profile."""
+    @property
+    def target_box(self) -> np.ndarray:
+        """Lowest and highest command of training, (2, 3) [m/s, rad/s]."""
+        limits = self.policy.parameters.command
+        reach = self.scenario.parameters.commands.reach
+        return reach * np.array([limits.lowest, limits.highest])
+
+    def goal_of(self, episode: Episode) -> np.ndarray:
+        """First command of an episode, (3,) [m/s, rad/s]."""
+        return episode.desired_output[0]
+
+    def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
+        """The plan of a constant command (3,) [m/s, rad/s].
+
+        Raises:
+            ValueError: The command is not three finite numbers.
+        """
+        command = np.asarray(command, dtype=float)
+        if command.shape != (3,) or not np.isfinite(command).all():
+            raise ValueError(
+                "walking: a command is three finite numbers, v_x v_y [m/s] and ω_z [rad/s]; got "
+                f"{command}"
+            )
+        duration_s = self.scenario.episode_duration_s
+        if self._command_s is None or self._command_s >= duration_s:
+            return profile([command], [], duration_s)
+        return profile([command, np.zeros(3)], [self._command_s], duration_s)
+
+    def reset(
+        self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
+    ) -> int:
+        """Samples a start, some with an offset, and a velocity profile; a goal is its command."""
         parameters = self.scenario.parameters
         sampling, limits = parameters.start, self.policy.parameters.command
-        duration_s = self.scenario.episode_duration_s
-        plan = parameters.commands.sample(limits, rng, duration_s)
-        before = np.clip(plan.value(0.0).ravel(), limits.lowest, limits.highest)
-        start, memory = self.rehearse(before, rng.uniform(*sampling.walked_s))
+        plan = parameters.commands.sample(limits, rng, self.scenario.episode_duration_s)
+        is_standing = rng.random() < sampling.standing_share
+        before = parameters.commands.sample_command(limits, rng)
+        walked_s = rng.uniform(*sampling.walked_s)
+        is_offset = rng.random() < sampling.push_share
+        offset_rng = rng.spawn(1)[0]
+        if goal is not None:
+            plan = self.command_plan(goal)
+        start = self.standing_start() if is_standing else self.rehearse(before, walked_s)
         q, v = start.q, start.v
-        if rng.random() < sampling.push_share:
-            q, v = self._pushed(q, v, rng)
-        self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
-        self._controller.set_state(self._controller.GetMyMutableContextFromRoot(context), memory)
+        if is_offset and self._is_disturbed:
+            v = sampling.offset_velocities(v, offset_rng)
+            q = self._above_ground(sampling.offset_positions(q, offset_rng))
+        self._enter(context, replace(start, q=q, v=v, plan=plan))
         self._observers.reseed(context, rng)
         return 0
 
-    def _pushed(
-        self, q: np.ndarray, v: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        sampling, kinematics = self.scenario.parameters.start, self.kinematics
-        q, v = q.copy(), v.copy()
-        half = 0.5 * rng.uniform(-1, 1, 2) * sampling.tilt_rad
-        w, x, y, z = q[:4]
-        # A small rotation about the base's x and y axes.
-        turned = np.array(
-            [
-                w - x * half[0] - y * half[1],
-                x + w * half[0] - z * half[1],
-                y + w * half[1] + z * half[0],
-                z + x * half[1] - y * half[0],
-            ]
-        )
-        q[:4] = turned / np.linalg.norm(turned)
+    def reset_standing(
+        self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
+    ) -> None:
+        """Starts at rest in the standing posture with a constant command."""
+        self._enter(context, replace(self.standing_start(), plan=self.command_plan(goal)))
+        self._observers.reseed(context, rng)
+        self._observers.silence(context)
+
+    def _above_ground(self, q: np.ndarray) -> np.ndarray:
+        """Joints within their stops, and the feet lifted out of the ground, (n_q,)."""
+        kinematics, q = self.kinematics, q.copy()
         lowest, highest = kinematics.position_limits.T
-        joints = q[7:] + rng.normal(size=kinematics.num_joints) * sampling.joint_rad
-        q[7:] = np.clip(joints, lowest, highest)
-        # Feet that were turned into the ground are lifted out of it.
+        q[NUM_BASE_POSITIONS:] = np.clip(q[NUM_BASE_POSITIONS:], lowest, highest)
         heights = kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii
         q[6] += max(0.0, -float(heights.min()))
-        speed, direction = rng.uniform(0, sampling.velocity_m_s), rng.uniform(-math.pi, math.pi)
-        v[:3] += rng.uniform(-1, 1, 3) * sampling.angular_velocity_rad_s
-        v[3:5] += speed * np.array([math.cos(direction), math.sin(direction)])
-        return q, v
+        return q
 
-    def rehearse(
-        self, command: np.ndarray, duration_s: float
-    ) -> tuple[EpisodeStart, list[np.ndarray]]:
+    def start_of(self, context: Context) -> EpisodeStart:
+        """State, plan and the controller's memory in a Context, as a start."""
+        own_context = self._controller.GetMyContextFromRoot(context)
+        return replace(
+            super().start_of(context), controller_state=self._controller.state_of(own_context)
+        )
+
+    def _set_state(self, context: Context, start: EpisodeStart) -> None:
+        super()._set_state(context, start)
+        if start.controller_state is not None:
+            self._controller.set_state(
+                self._controller.GetMyMutableContextFromRoot(context), start.controller_state
+            )
+
+    def rehearse(self, command: np.ndarray, duration_s: float) -> EpisodeStart:
         """Walks undisturbed from the standing posture, by the nominal robot.
 
         Args:
@@ -251,7 +362,7 @@ class Walking(LeggedLoop):
                 next update is due.
 
         Returns:
-            The state at the end, at the origin, and the controller's memory.
+            The state at the end, above the origin, with the controller's memory.
         """
         if self._rehearsal is None:
             self._rehearsal = type(self)(self.scenario)
@@ -259,16 +370,15 @@ class Walking(LeggedLoop):
         period_s = self.policy.parameters.period_s
         simulator = Simulator(other)
         context = simulator.get_mutable_context()
-        standing = other.standing_start()
-        other.reset_to(context, None, replace(standing, plan=PiecewisePolynomial(command[:, None])))
+        plan = PiecewisePolynomial(command[:, None])
+        other.reset_to(context, None, replace(self.standing_start(), plan=plan))
         simulator.Initialize()
         simulator.AdvanceTo(max(round(duration_s / period_s), 0) * period_s)
         start = other.start_of(context)
         q = start.q.copy()
         q[:4] /= np.linalg.norm(q[:4])
         q[4:6] = 0.0
-        memory = other._controller.state_of(other._controller.GetMyContextFromRoot(context))
-        return replace(start, q=q), memory
+        return replace(start, q=q)
 
     def standing_start(self) -> EpisodeStart:
         """A start at rest in the standing posture, with a command of zero."""
@@ -281,13 +391,15 @@ class Walking(LeggedLoop):
         return np.zeros(3)  # Commands are in the heading frame, wherever the feet are.
 
 
-def policy_file(scenario: LoopScenario) -> Path:
-    """The policy file of a scenario, relative to its robot's folder.
+def policy_file(scenario: LoopScenario, name: str | None = None) -> Path:
+    """A policy file, relative to the folder of a scenario's robot.
 
     Args:
         scenario: A scenario of the walking task.
+        name: The file; that of the scenario by default.
     """
-    return Path(load_robot(scenario.robot).source_dir) / scenario.parameters.policy
+    folder = Path(load_robot(scenario.robot).source_dir)
+    return folder / (scenario.parameters.policy if name is None else name)
 
 
 def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:

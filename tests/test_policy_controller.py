@@ -52,7 +52,7 @@ def test_a_set_point_is_that_of_the_action_until_the_next_period(monkeypatch):
     simulator.AdvanceTo(0.0199)
     np.testing.assert_allclose(output(system, context, "desired_joint_state"), expected)
     assert output(system, context, "status")[0] == ACTING
-    assert len(output(system, context, "action_state")) == len(system.action_names) == 7
+    assert len(output(system, context, "action_state")) == len(system.action_names) == 10
 
 
 def test_the_outputs_are_states_without_feedthrough(monkeypatch):

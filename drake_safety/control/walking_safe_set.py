@@ -11,6 +11,7 @@ from drake_safety.control.observation import heading_velocity
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 
 _GRAVITY = 9.81
+_AXES = ("forward", "left", "yaw")
 
 
 @dataclass(kw_only=True)
@@ -91,16 +92,15 @@ class WalkingSafeSet:
         self._clear = [(plant.GetBodyByName(n), h) for n, h in limits.clearance_m.items()]
         self._lowest_m = limits.height_share * kinematics.standing_height
         self._fallen_m = limits.fall_height_share * kinematics.standing_height
-        axes = ("forward", "left", "yaw")
         self.feature_names = [
             "tilt_margin",
             "height_margin",
             "clearance_margin",
             "joint_margin",
-            *(f"command_{axis}" for axis in axes),
-            *(f"last_command_{axis}" for axis in axes),
-            *(f"largest_command_{axis}" for axis in axes),
-            *(f"tracking_error_{axis}" for axis in axes),
+            *(f"command_{axis}" for axis in _AXES),
+            *(f"last_command_{axis}" for axis in _AXES),
+            *(f"largest_command_{axis}" for axis in _AXES),
+            *(f"tracking_error_{axis}" for axis in _AXES),
             "tilt_rate",
             "capture_point_support",
             "capture_point_x",
@@ -109,7 +109,7 @@ class WalkingSafeSet:
         ]
         self.rate_features = [
             "tilt_rate",
-            *(f"tracking_error_{axis}" for axis in axes),
+            *(f"tracking_error_{axis}" for axis in _AXES),
             *(name for name in self.feature_names if name.startswith("capture_point")),
         ]
 
@@ -187,6 +187,23 @@ class WalkingSafeSet:
                 heights,
             ]
         )
+
+    def with_commands(self, features: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Returns features as if constant commands had been asked for, (C, n_f).
+
+        Args:
+            features: Features of this safe set, possibly followed by others, (n_f,).
+            commands: (C, 3) [m/s, rad/s].
+        """
+        changed = np.tile(features, (len(commands), 1))
+        for axis, name in enumerate(_AXES):
+            column = self.feature_names.index
+            asked, error = column(f"command_{name}"), column(f"tracking_error_{name}")
+            velocity = features[asked] - features[error]
+            for prefix in ("", "last_", "largest_"):
+                changed[:, column(f"{prefix}command_{name}")] = commands[:, axis]
+            changed[:, error] = commands[:, axis] - velocity
+        return changed
 
 
 def _up(q: np.ndarray) -> tuple[float, float, float]:

@@ -25,12 +25,15 @@ class EpisodeStart:
         plan: Desired output over time since the start, in the stance frame, (n_z, 1) [m].
         foot_positions: Positions of the feet as the controller assumes them: centres of the contact
             spheres, (n_c, 3) [m]. By default those of ``q``, put on the ground.
+        controller_state: Memory of the controller, such as the phase of a gait, as the task defines
+            it; that of a controller which has done nothing by default.
     """
 
     q: np.ndarray
     v: np.ndarray
     plan: PiecewisePolynomial
     foot_positions: np.ndarray | None = None
+    controller_state: list[np.ndarray] | None = None
 
     def feet(self, kinematics: RobotKinematics) -> np.ndarray:
         """Foot positions, (n_c, 3) [m].

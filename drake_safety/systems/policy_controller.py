@@ -29,9 +29,10 @@ class PolicyController(FloatSystem, LeafSystem):
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs are
     discrete states, so that a cloned Context continues from its phase of the gait.
-    ``action_state`` is the last action (n_a,), its largest change in the last period (1,), and
-    sine and cosine of the phases (2 n_p,). An action that is not finite is replaced by the last
-    one, and ``status`` is ``HELD``.
+    ``action_state`` is the last action (n_a,), its largest change in the last period (1,), sine and
+    cosine of the phases (2 n_p,), and the command that the policy followed (3,), which differs from
+    the input while the policy's change of command is limited. An action that is not finite is
+    replaced by the last one, and ``status`` is ``HELD``.
 
     Args:
         kinematics: The robot.
@@ -51,7 +52,7 @@ class PolicyController(FloatSystem, LeafSystem):
         standing = np.concatenate([policy.default_positions, np.zeros(n_j)])
         self._set_point = self.DeclareDiscreteState(standing)
         phases = policy.initial_phases
-        memory = np.concatenate([np.zeros(n_a), [0.0], np.sin(phases), np.cos(phases)])
+        memory = np.concatenate([np.zeros(n_a), [0.0], np.sin(phases), np.cos(phases), np.zeros(3)])
         self._action = self.DeclareDiscreteState(memory)
         self._phases = self.DeclareDiscreteState(phases if n_p else np.zeros(1))
         self._applied = self.DeclareDiscreteState(3)
@@ -61,6 +62,7 @@ class PolicyController(FloatSystem, LeafSystem):
             *(f"action_{name}" for name in policy.joint_names),
             "action_change",
             *(f"{wave}_phase_{i}" for wave in ("sin", "cos") for i in range(n_p)),
+            *(f"applied_command_{axis}" for axis in ("forward", "left", "yaw")),
         ]
         self._num_actions, self._num_phases = n_a, n_p
         self.DeclarePeriodicDiscreteUpdateEvent(policy.parameters.period_s, offset_s, self._update)
@@ -102,7 +104,7 @@ class PolicyController(FloatSystem, LeafSystem):
         set_point = np.zeros(2 * len(policy.default_positions))
         set_point[: len(set_point) // 2] = policy.targets(new)
         change = float(np.abs(new - action).max())
-        memory = np.concatenate([new, [change], np.sin(phases), np.cos(phases)])
+        memory = np.concatenate([new, [change], np.sin(phases), np.cos(phases), applied])
         discrete_state.set_value(self._set_point, set_point)
         discrete_state.set_value(self._action, memory)
         if self._num_phases:

@@ -1,0 +1,212 @@
+"""Parameters of the walking task: commands, starts, guard and recovery."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety.control.policy import CommandLimits
+from drake_safety.control.walking_safe_set import WalkingLimits
+
+BRANCHES = ("stop", "slower", "crouch", "policy")
+"""What a robot does when it recovers."""
+_RAMP_S = 0.1  # From one command to the next.
+
+
+@dataclass(kw_only=True)
+class CommandSampling:
+    """Random velocity profiles."""
+
+    reach: float = 3.0
+    """How far commands go beyond the policy's ranges, as a factor on them."""
+    inside_share: float = 0.4
+    """Share of profiles inside the policy's ranges."""
+    num_segments: list[int] = field(default_factory=lambda: [1, 3])
+    """Least and largest number of constant commands in an episode."""
+    standing_share: float = 0.1
+    """Share of commands that are zero."""
+
+    def __post_init__(self) -> None:
+        if not self.reach > 0:
+            raise ValueError(f"commands: reach must be positive; got {self.reach}")
+        for name in ("inside_share", "standing_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"commands: {name} must be in [0, 1]; got {getattr(self, name)}")
+        low, high = self.num_segments
+        if not 1 <= low <= high:
+            raise ValueError(f"commands: num_segments must be [1 or more, ...]; got {[low, high]}")
+
+    def sample_command(
+        self, limits: CommandLimits, rng: np.random.Generator, reach: float = 1.0
+    ) -> np.ndarray:
+        """Samples a command, (3,) [m/s, rad/s].
+
+        Args:
+            limits: The policy's ranges.
+            rng: Random generator.
+            reach: Factor on the ranges.
+        """
+        low, high = reach * np.array(limits.lowest), reach * np.array(limits.highest)
+        drawn = rng.uniform(low, high)
+        return np.zeros(3) if rng.random() < self.standing_share else drawn
+
+    def sample(
+        self, limits: CommandLimits, rng: np.random.Generator, duration_s: float
+    ) -> PiecewisePolynomial:
+        """Samples a profile of constant commands with short ramps between them.
+
+        Args:
+            limits: The policy's ranges.
+            rng: Random generator.
+            duration_s: Of the profile [s].
+        """
+        reach = 1.0 if rng.random() < self.inside_share else self.reach
+        count = int(rng.integers(self.num_segments[0], self.num_segments[1] + 1))
+        commands = [self.sample_command(limits, rng, reach) for _ in range(count)]
+        changes = np.sort(rng.uniform(0.1 * duration_s, 0.9 * duration_s, count - 1))
+        return profile(commands, changes.tolist(), duration_s)
+
+
+def profile(
+    commands: list[np.ndarray], changes_s: list[float], duration_s: float
+) -> PiecewisePolynomial:
+    """A profile of constant commands.
+
+    Args:
+        commands: (v_x, v_y, ω_z) each, (3,) [m/s, rad/s].
+        changes_s: Ascending times at which the next command begins [s].
+        duration_s: Of the profile [s].
+    """
+    times, values = [0.0], [commands[0]]
+    for change_s, before, after in zip(changes_s, commands[:-1], commands[1:], strict=True):
+        begins = max(change_s, times[-1] + 1e-3)
+        times += [begins, begins + _RAMP_S]
+        values += [before, after]
+    times.append(max(duration_s, times[-1] + 1e-3))
+    values.append(values[-1])
+    return PiecewisePolynomial.FirstOrderHold(times, np.transpose(values))
+
+
+@dataclass(kw_only=True)
+class WalkingStart:
+    """Random initial states: standing or in mid-stride, some with an offset as after a push."""
+
+    standing_share: float = 0.25
+    """Share of episodes that begin at rest in the standing posture."""
+    walked_s: list[float] = field(default_factory=lambda: [0.2, 1.6])
+    """Shortest and longest time of the others since the robot stood [s]."""
+    push_share: float = 0.5
+    """Share of episodes with an offset."""
+    velocity_m_s: float = 2.0
+    """Largest horizontal velocity offset of the base."""
+    angular_velocity_rad_s: float = 1.5
+    """Half-width of the base's angular velocity offset, per axis."""
+    tilt_rad: float = 0.15
+    """Half-width of roll and pitch offsets."""
+    joint_rad: float = 0.05
+    """Standard deviation of the joints' offsets."""
+
+    def __post_init__(self) -> None:
+        for name in ("standing_share", "push_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"start: {name} must be in [0, 1]; got {getattr(self, name)}")
+        low, high = self.walked_s
+        if not 0 <= low <= high:
+            raise ValueError(f"start: walked_s must be [least, largest]; got {[low, high]}")
+
+    def offset_velocities(self, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Samples an offset of the base's velocities, and returns the sum.
+
+        Args:
+            v: Velocities, angular first, in the world, (n_v,) [rad/s, m/s].
+            rng: Random generator.
+        """
+        v = v.copy()
+        speed, direction = rng.uniform(0, self.velocity_m_s), rng.uniform(-math.pi, math.pi)
+        v[:3] += rng.uniform(-1, 1, 3) * self.angular_velocity_rad_s
+        v[3:5] += speed * np.array([math.cos(direction), math.sin(direction)])
+        return v
+
+    def offset_positions(self, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Samples an offset of tilt and joints, and returns the sum.
+
+        Args:
+            q: Positions: quaternion, base position, joints, (n_q,).
+            rng: Random generator.
+        """
+        q = q.copy()
+        half = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
+        w, x, y, z = q[:4]
+        # A small rotation about the base's x and y axes.
+        turned = np.array(
+            [
+                w - x * half[0] - y * half[1],
+                x + w * half[0] - z * half[1],
+                y + w * half[1] + z * half[0],
+                z + x * half[1] - y * half[0],
+            ]
+        )
+        q[:4] = turned / np.linalg.norm(turned)
+        q[7:] += rng.normal(size=len(q) - 7) * self.joint_rad
+        return q
+
+
+@dataclass(kw_only=True)
+class GuardParameters:
+    """The command guard."""
+
+    threshold: float = 0.5
+    """Lowest calibrated Γ of a command that is passed on."""
+    period_s: float = 0.1
+    """Time between two decisions [s]."""
+
+
+@dataclass(kw_only=True)
+class WalkingRecovery:
+    """What the robot does when Γ falls below a threshold."""
+
+    branch: str = "stop"
+    """"stop": a command of zero; "slower": a share of the command; "crouch": down to a posture,
+    with damping; "policy": another policy."""
+    threshold: float = 0.5
+    """Γ_thre, on the calibrated Γ."""
+    persistence_s: float = 0.0
+    """Time for which Γ must have been below it while nothing is known [s]."""
+    slower_share: float = 0.3
+    """Share of the command for "slower"."""
+    crouch: dict[str, float] = field(default_factory=dict)
+    """Joint positions of the crouched posture [rad], by regular expression; the others keep those
+    of the standing posture."""
+    crouch_step_rad: float = 0.3
+    """Largest distance of the crouch's set points from the measured joints [rad]."""
+    policy: str = ""
+    """Policy file of "policy", relative to the folder of the robot's YAML file."""
+
+    def __post_init__(self) -> None:
+        if self.branch not in BRANCHES:
+            raise ValueError(
+                f"recovery: branch must be one of {list(BRANCHES)}; got '{self.branch}'"
+            )
+        if (self.branch == "policy") != bool(self.policy):
+            raise ValueError(
+                "recovery: 'policy' names the file of branch 'policy', and of no other; got branch "
+                f"'{self.branch}' and policy '{self.policy}'"
+            )
+
+
+@dataclass(kw_only=True)
+class WalkingParameters:
+    """The task's part of the scenario file."""
+
+    policy: str = "policy.yaml"
+    """Policy file, relative to the folder of the robot's YAML file."""
+    safe_set: WalkingLimits = field(default_factory=WalkingLimits)
+    commands: CommandSampling = field(default_factory=CommandSampling)
+    start: WalkingStart = field(default_factory=WalkingStart)
+    named_commands: dict[str, list[float]] = field(default_factory=dict)
+    """Named commands (v_x, v_y, ω_z) [m/s, rad/s]."""
+    guard: GuardParameters = field(default_factory=GuardParameters)
+    recovery: WalkingRecovery = field(default_factory=WalkingRecovery)
+    assessment_period_s: float = 0.02
+    """Time between two evaluations of Γ [s]."""

@@ -1,0 +1,162 @@
+"""CommandGuard: passes on the accepted velocity command nearest to the asked one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.control.policy import CommandLimits
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.prediction import is_unknown
+from drake_safety.systems.float_system import FloatSystem
+
+_SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
+
+
+class CommandGuard(FloatSystem, LeafSystem):
+    """Stands between whoever commands a walking robot and its policy.
+
+    .. pydrake_system::
+
+        name: CommandGuard
+        input_ports:
+        - command
+        - state
+        - features
+        output_ports:
+        - desired_output
+        - desired_preview
+        - desired_outlook
+        - is_changed
+        - safety_probability
+
+    Every ``period_s`` Γ is evaluated for the asked command, held from now on. If it is accepted,
+    ``desired_output`` is the asked command. Otherwise it is the accepted one nearest to it,
+    measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
+    none is accepted, the one with the largest Γ. A command is accepted if its calibrated Γ reaches
+    the threshold and the inputs are not novel. ``safety_probability`` is that of the asked command.
+    All outputs are discrete states, and preview and outlook hold the command.
+
+    Args:
+        assessment: A fitted assessment.
+        with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
+            commands, such as `WalkingSafeSet.with_commands`.
+        limits: The policy's ranges.
+        threshold: Lowest calibrated Γ of an accepted command.
+        period_s: Time between two decisions [s].
+        offset_s: Time of the first [s].
+        num_outlook: M, samples of the outlook.
+
+    Raises:
+        ValueError: The threshold is outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        assessment: SafetyAssessment,
+        with_commands: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        limits: CommandLimits,
+        *,
+        threshold: float,
+        period_s: float,
+        offset_s: float = 0.0,
+        num_outlook: int,
+    ):
+        super().__init__()
+        if not 0 <= threshold <= 1:
+            raise ValueError(f"command guard: threshold must be in [0, 1]; got {threshold}")
+        info = assessment.info_
+        self._assessment, self._with_commands = assessment, with_commands
+        self._threshold, self._horizon = threshold, info.horizon
+        self._lowest, self._highest = np.array(limits.lowest), np.array(limits.highest)
+        self._command_port = self.DeclareVectorInputPort("command", 3)
+        self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
+        self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        command = self.DeclareDiscreteState(3)
+        self._decision = self.DeclareDiscreteState(2)
+        self._command = command
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        self.DeclareStateOutputPort("desired_output", command)
+        for name, count in (("desired_preview", info.horizon), ("desired_outlook", num_outlook)):
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(3 * count),
+                lambda context, output, count=count: output.SetFromVector(
+                    np.tile(context.get_discrete_state(self._command).get_value(), count)
+                ),
+                {self.discrete_state_ticket(command)},
+            )
+        for i, name in enumerate(("is_changed", "safety_probability")):
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(1),
+                lambda context, output, i=i: output.SetFromVector(
+                    context.get_discrete_state(self._decision).get_value()[i : i + 1]
+                ),
+                {self.discrete_state_ticket(self._decision)},
+            )
+
+    def probabilities(
+        self, state: np.ndarray, features: np.ndarray, commands: np.ndarray
+    ) -> np.ndarray:
+        """Calibrated Γ of constant commands from now on, (C,); 0 where nothing is known.
+
+        Args:
+            state: (n_s,), the assessor's.
+            features: (n_f,), of any command.
+            commands: (C, 3) [m/s, rad/s].
+        """
+        prediction = self._assessment.predict(
+            np.tile(state, (len(commands), 1)),
+            np.tile(commands, self._horizon),
+            self._with_commands(features, commands) if self._assessment.uses_features else None,
+        )
+        unknown = is_unknown(
+            prediction.belief, self._assessment.parameters.initial_uncertainty
+        ) | ~(prediction.novelty <= 1.0)
+        return np.where(unknown, 0.0, prediction.calibrated)
+
+    def candidates(self, asked: np.ndarray) -> np.ndarray:
+        """Commands that may replace an asked one, nearest first, (C, 3) [m/s, rad/s]."""
+        shares = np.stack(np.meshgrid(*[_SHARES] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        inside = np.clip(asked, self._lowest, self._highest)
+        commands = np.vstack([inside, shares * asked, shares * inside])
+        distance = np.linalg.norm((commands - asked) / (self._highest - self._lowest), axis=1)
+        return commands[np.argsort(distance, kind="stable")]
+
+    def decide(
+        self, asked: np.ndarray, state: np.ndarray, features: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Returns the command to pass on, (3,), and the Γ of the asked one.
+
+        Args:
+            asked: (3,) [m/s, rad/s].
+            state: (n_s,).
+            features: (n_f,).
+        """
+        asked_probability = float(self.probabilities(state, features, asked[None])[0])
+        if asked_probability >= self._threshold:
+            return asked, asked_probability
+        commands = self.candidates(asked)
+        probability = self.probabilities(state, features, commands)
+        is_accepted = probability >= self._threshold
+        chosen = int(np.argmax(is_accepted)) if is_accepted.any() else int(np.argmax(probability))
+        if not probability[chosen] > 0:  # Nothing is known: as asked, within the ranges.
+            return np.clip(asked, self._lowest, self._highest), asked_probability
+        return commands[chosen], asked_probability
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        asked = self._command_port.Eval(context)
+        state, features = self._state_port.Eval(context), self._features_port.Eval(context)
+        if not np.isfinite(asked).all():
+            command, probability = np.zeros(3), 0.0
+        elif np.isfinite(state).all() and np.isfinite(features).all():
+            command, probability = self.decide(asked, state, features)
+        else:
+            command, probability = np.clip(asked, self._lowest, self._highest), 0.0
+        discrete_state.set_value(self._command, command)
+        is_changed = bool(np.any(command != asked))
+        discrete_state.set_value(self._decision, [float(is_changed), probability])
