@@ -26,7 +26,6 @@ from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
@@ -127,11 +126,7 @@ class Reaching(LeggedLoop):
         self._controller = controller
         self._connect_controller(builder, controller, measured)
         physics.connect_torques(builder, controller.GetOutputPort("actuation"))
-        self._push_source = builder.AddNamedSystem(
-            "push_source",
-            PushSource(self.plant, physics.instance, period_s=scenario.control_period_s),
-        )
-        builder.Connect(self._push_source.get_output_port(), physics.applied_spatial_force)
+        self._add_push_source(builder)
 
         clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)
         self.safe_set = ReachingSafeSet(
@@ -248,20 +243,6 @@ class Reaching(LeggedLoop):
         end_s = push.time_s + push.duration_s + self.scenario.control_period_s
         return math.ceil(end_s / self.scenario.step_s)
 
-    def set_push(self, context: Context, push: Push) -> None:
-        """Sets a push on a body of the robot; call it after a reset.
-
-        Raises:
-            ValueError: The robot has no such body.
-        """
-        self._push_source.set_push(
-            self._push_source.GetMyMutableContextFromRoot(context),
-            push.body,
-            np.asarray(push.force_n, dtype=float),
-            start_s=push.time_s,
-            duration_s=push.duration_s,
-        )
-
     def sample_push(self, rng: np.random.Generator) -> Push:
         """Samples a push from the distribution of the episodes' initial pushes."""
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
@@ -325,7 +306,6 @@ class Reaching(LeggedLoop):
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         super()._set_state(context, start)
-        self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
         self._controller.set_reference(
             self._controller.GetMyMutableContextFromRoot(context),
             self._controller.model.reference(start.q),

@@ -21,6 +21,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
+from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed_file
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -61,7 +62,15 @@ class Walking(LeggedLoop):
     angular_constraints = WalkingSafeSet.angular_names
     # Commands are judged before the robot walks, and pushes are those of a run.
     judging_options: Mapping[str, Any] = MappingProxyType({"disturbed": False})
-    online_parameters = ("guard", "recovery", "named_commands", "assessment_period_s")
+    online_parameters = (
+        "guard",
+        "recovery",
+        "named_commands",
+        "pushes",
+        "random_pushes",
+        "assessment_period_s",
+        "view",
+    )
     hand = None
     goal_words = ("command", "m/s, m/s, rad/s")
 
@@ -82,7 +91,8 @@ class Walking(LeggedLoop):
             raise ValueError("walking: guard=True needs an assessment; got none")
         parameters = scenario.parameters
         self._is_disturbed, self._command_s = disturbed, command_s
-        self.named_targets = parameters.named_commands
+        self.named_targets, self.pushes = parameters.named_commands, parameters.pushes
+        self.view = parameters.view
         self.policy = load_policy(policy_file(scenario), self.kinematics)
         # The servos' gains are part of the policy, and its default posture is how it stands.
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
@@ -134,6 +144,7 @@ class Walking(LeggedLoop):
                 builder, joint_state, measured, desired["desired_output"], trigger
             )
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
+        self._add_push_source(builder)
         self._watch(
             builder,
             safe_set,
@@ -277,6 +288,10 @@ class Walking(LeggedLoop):
         limits = self.policy.parameters.command
         reach = self.scenario.parameters.commands.reach
         return reach * np.array([limits.lowest, limits.highest])
+
+    def sample_push(self, rng: np.random.Generator) -> Push:
+        """Samples a push, which no training episode has: they begin in the state after one."""
+        return self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """First command of an episode, (3,) [m/s, rad/s]."""

@@ -8,6 +8,8 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.policy import CommandLimits
 from drake_safety.control.walking_safe_set import WalkingLimits
+from drake_safety.plants.pushes import Push, RandomPushes
+from drake_safety.simulation.legged_loop import View
 
 BRANCHES = ("stop", "slower", "crouch", "policy")
 """What a robot does when it recovers."""
@@ -20,7 +22,7 @@ class CommandSampling:
 
     reach: float = 3.0
     """How far commands go beyond the policy's ranges, as a factor on them."""
-    inside_share: float = 0.4
+    inside_share: float = 0.3
     """Share of profiles inside the policy's ranges."""
     num_segments: list[int] = field(default_factory=lambda: [1, 3])
     """Least and largest number of constant commands in an episode."""
@@ -206,6 +208,12 @@ class WalkingParameters:
     start: WalkingStart = field(default_factory=WalkingStart)
     named_commands: dict[str, list[float]] = field(default_factory=dict)
     """Named commands (v_x, v_y, ω_z) [m/s, rad/s]."""
+    pushes: dict[str, Push] = field(default_factory=dict)
+    """Named pushes for single runs."""
+    random_pushes: RandomPushes = field(default_factory=RandomPushes)
+    """Pushes by which alarms and recovery are judged."""
+    view: View = field(default_factory=View)
+    """The camera's pose."""
     guard: GuardParameters = field(default_factory=GuardParameters)
     recovery: WalkingRecovery = field(default_factory=WalkingRecovery)
     assessment_period_s: float = 0.02

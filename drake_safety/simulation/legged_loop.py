@@ -16,6 +16,7 @@ from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.physics import Physics, Scene, add_physics
+from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import InputShift
 from drake_safety.simulation.closed_loop import LoopScenario
@@ -23,6 +24,7 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.systems.gravity_features import GravityFeatures
+from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
@@ -90,6 +92,7 @@ class LeggedLoop(PlannedLoop):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
+        self._push_source: PushSource | None = None
 
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
@@ -223,6 +226,34 @@ class LeggedLoop(PlannedLoop):
             builder.Connect(part.get_output_port(), difference.get_input_port(i))
         return difference.get_output_port(), [f"servo_load_{name}" for name in names]
 
+    def _add_push_source(self, builder: DiagramBuilder) -> None:
+        """Adds the source of a push on the robot, which :meth:`set_push` sets."""
+        self._push_source = builder.AddNamedSystem(
+            "push_source",
+            PushSource(self.plant, self._physics.instance, period_s=self.scenario.control_period_s),
+        )
+        builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
+
+    def set_push(self, context: Context, push: Push) -> None:
+        """Sets a push on a body of the robot; call it after a reset.
+
+        Args:
+            context: The root Context.
+            push: The push; it replaces an earlier one.
+
+        Raises:
+            ValueError: The robot has no such body, or the task adds no source of pushes.
+        """
+        if self._push_source is None:
+            raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
+        self._push_source.set_push(
+            self._push_source.GetMyMutableContextFromRoot(context),
+            push.body,
+            np.asarray(push.force_n, dtype=float),
+            start_s=push.time_s,
+            duration_s=push.duration_s,
+        )
+
     def _export_robot(
         self,
         builder: DiagramBuilder,
@@ -299,3 +330,5 @@ class LeggedLoop(PlannedLoop):
             )
             if self._physics.ball is not None:
                 self._physics.ball.park(plant_context)
+        if self._push_source is not None:
+            self._push_source.clear_push(self._push_source.GetMyMutableContextFromRoot(context))
