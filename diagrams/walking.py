@@ -23,6 +23,7 @@ from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed_file
+from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -72,7 +73,9 @@ class Walking(LeggedLoop):
         "view",
     )
     hand = None
-    goal_words = ("command", "m/s, m/s, rad/s")
+    goal_words = GoalWords(
+        goal="command", axes=("v_x", "v_y", "ω_z"), units=("m/s", "m/s", "rad/s")
+    )
 
     def __init__(
         self,

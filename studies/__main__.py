@@ -17,6 +17,7 @@ from studies.readings import readings
 from studies.scale import scale
 from studies.soak import soak
 from studies.truth import truth
+from studies.walking import walking
 
 app = typer.Typer(
     help="Run the studies behind the tables of README and docs, from a checkout.",
@@ -35,6 +36,7 @@ app.command()(kills)
 app.command()(scale)
 app.command()(soak)
 app.command()(truth)
+app.command()(walking)
 app.command()(bench)
 app.command()(store)
 app.command()(readme)

@@ -221,8 +221,8 @@ def test_a_named_target_is_the_point_of_that_name(loop):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--target", "green_ball"], r"'green_ball': give X Y Z, .*['blue_box', 'red_can']"),
-        (["--target", "0.7", "0.3"], "'0.7 0.3': give X Y Z"),
+        (["--target", "green_ball"], r"'green_ball': give x y z, .*['blue_box', 'red_can']"),
+        (["--target", "0.7", "0.3"], "'0.7 0.3': give x y z"),
         (["--target", "blue_box", "--hand", "third"], "no reaching frame 'third'; it has ['left'"),
         (["--target", "blue_box", "--mode", "paper"], "holds no 'paper' assessment"),
     ],
@@ -236,7 +236,7 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "needs a target: pass --target X Y Z, or one of the names ['blue_box', 'red_can']"),
+        ([], "needs a target: pass --target x y z, or one of the names ['blue_box', 'red_can']"),
         (["--push", "torso"], "needs a target"),
         (["--force"], "--force goes to a target that Γ refuses: pass --target too"),
         (["--target", "blue_box", "--push", "ball"], "no such push"),

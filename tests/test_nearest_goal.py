@@ -158,7 +158,7 @@ def test_without_a_gradient_a_suggestion_is_that_of_the_search():
 def test_what_cannot_be_suggested_for_is_none_or_an_error():
     task = GoalTask()
     assert suggest(task, PlaneAssessment(), np.array([0.5, np.nan, 1.0])) is None
-    with pytest.raises(ValueError, match=r"three numbers \[m\]; got \[0.5, 0.0\]"):
+    with pytest.raises(ValueError, match=r"three numbers; got \[0.5, 0.0\]"):
         suggest(task, PlaneAssessment(), GOAL[:2] * 0.0 + [0.5, 0.0])
     with pytest.raises(ValueError, match=r"reserve is -0\.1, expected a value in \[0, 1\]"):
         suggest(task, PlaneAssessment(), reserve=-0.1)

@@ -9,9 +9,10 @@ import typer
 
 from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
 from drake_safety.cli.targets import (
+    COMMAND,
     TARGET,
-    TARGET_HELP,
     HandOption,
+    TargetOption,
     nearest_accepted,
     parse_target,
     print_verdict,
@@ -21,13 +22,19 @@ from drake_safety.cli.training_folder import assessment_folder, goal_threshold, 
 
 def ask(
     scenario: ScenarioArgument,
-    target: Annotated[str, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)],
+    target: TargetOption = None,
     assessment: AssessmentOption = None,
     hand: HandOption = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            help="Of a command [s], after which the robot stops; an episode by default.", min=0.1
+        ),
+    ] = None,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Print the verdict on reaching a target from the standing posture; nothing moves.
+    """Print the verdict on a target, or on a command of a walking robot; nothing moves.
 
     Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
@@ -35,10 +42,13 @@ def ask(
     from drake_safety.planning.goal_verdict import assess_goal
     from drake_safety.simulation.scenario import load_scenario
 
+    if target is None:
+        raise ValueError(f"ask: pass {TARGET}, or for a walking robot {COMMAND}")
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment)
     gamma = load_assessment(folder.path, mode)
-    options: dict[str, Any] = {} if hand is None else {"hand": hand}
+    given = {"hand": hand, "command_s": duration}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     loop = loaded.make_loop(assessment=gamma, **options)
     goal = parse_target(loop, target)
     threshold, unsafe_below, remark = goal_threshold(folder.path, gamma)

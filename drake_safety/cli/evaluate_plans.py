@@ -14,6 +14,7 @@ from drake_safety.cli.findings import Findings, Judged
 if TYPE_CHECKING:
     from drake_safety.evaluation.plan_study import PlanRule, Plans, PlanStudy
     from drake_safety.learning.segments import Episodes
+    from drake_safety.simulation.capabilities import GoalWords
     from drake_safety.simulation.closed_loop import ClosedLoop
 
 _DEFAULT_OTHER_HAND = 400
@@ -45,7 +46,7 @@ def check_options(loop: ClosedLoop, options: PlanOptions) -> None:
         ValueError: The task does not support an option.
     """
     from drake_safety.evaluation.reachable_region import plane_of
-    from drake_safety.simulation.capabilities import HasGoals, require
+    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 
     if not isinstance(loop, HasGoals):
         if options != PlanOptions():
@@ -57,7 +58,7 @@ def check_options(loop: ClosedLoop, options: PlanOptions) -> None:
         return
     if options.other_hand and not _mirror_options(loop):
         raise ValueError(f"evaluate: {loop.scenario.task} has no other hand: pass --other-hand 0")
-    if options.plane_step:
+    if options.plane_step and goal_words(loop).is_point:
         plane_of(loop, options.plane_x, options.plane_step)
 
 
@@ -82,10 +83,16 @@ def evaluate_plans(
     from drake_safety.evaluation.plan_study import evaluate_plans, plans_of
     from drake_safety.evaluation.reachable_region import reachable_region
     from drake_safety.evaluation.region_figure import region_figure
-    from drake_safety.simulation.capabilities import judging_options
+    from drake_safety.simulation.capabilities import (
+        HasGoals,
+        goal_words,
+        judging_options,
+        require,
+    )
 
     scenario, sharpened = judged.scenario, judged.sharpened
     loop = scenario.make_loop()
+    words = goal_words(require(loop, HasGoals))
     mirror = _mirror_options(loop)
     test = plans_of(loop, judged.test_set)
     calibration = plans_of(loop, judged.calibration_set)
@@ -103,8 +110,8 @@ def evaluate_plans(
     twins = [key for key in sets if key != "plans"]
     study = evaluate_plans(rules, sharpened, calibration, sets, twins)
     estimates = dict(study.estimates)
-    pictures = _pictures(study, test, judged.folder)
-    if options.plane_step:
+    pictures = _pictures(study, test, words, judged.folder)
+    if options.plane_step and words.is_point:
         region = reachable_region(
             scenario,
             sharpened,
@@ -144,7 +151,7 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     return rules
 
 
-def _pictures(study: PlanStudy, test: Plans, folder: Path) -> list[Path]:
+def _pictures(study: PlanStudy, test: Plans, words: GoalWords, folder: Path) -> list[Path]:
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.plans_figure import plans_figure
     from drake_safety.evaluation.roc_figure import roc_figure
@@ -153,7 +160,7 @@ def _pictures(study: PlanStudy, test: Plans, folder: Path) -> list[Path]:
     score = np.where(np.isnan(scores["sharpened"]), np.inf, scores["sharpened"])
     is_refused = score > study.thresholds["sharpened"]
     return [
-        *save(plans_figure(test.goals, test.is_unsafe, is_refused), folder / "plans"),
+        *save(plans_figure(test.goals, test.is_unsafe, is_refused, words), folder / "plans"),
         *save(
             roc_figure(
                 {name: (score, test.is_unsafe) for name, score in scores.items()},

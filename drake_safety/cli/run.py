@@ -24,7 +24,7 @@ from drake_safety.cli.run_settings import (
     events_table,
 )
 from drake_safety.cli.target_run import run_to_target
-from drake_safety.cli.targets import TARGET, TARGET_HELP, HandOption
+from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 from drake_safety.learning.seeds import DEMONSTRATION
 
@@ -62,12 +62,13 @@ _THROW_FIELDS = {
 def run(
     scenario: ScenarioArgument,
     assessment: AssessmentOption = None,
-    target: Annotated[
-        str | None, typer.Option(TARGET, metavar="X Y Z | NAME", help=TARGET_HELP)
-    ] = None,
+    target: TargetOption = None,
     hand: HandOption = None,
     force: Annotated[
         bool, typer.Option("--force", help="Go to the target even if Γ refuses it.")
+    ] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="Pass on the nearest accepted command instead.")
     ] = False,
     push: Annotated[
         list[str] | None,
@@ -80,7 +81,7 @@ def run(
     variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
     recovery: Annotated[
         bool | None,
-        typer.Option("--recovery/--no-recovery", help="Recovery steps; on by default."),
+        typer.Option("--recovery/--no-recovery", help="Recovery; the task's default."),
     ] = None,
     duration: Annotated[
         float | None,
@@ -112,10 +113,10 @@ def run(
 
     If Γ refuses a target, nothing moves and the exit code is 1; --force goes there.
     """
-    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+    from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
     from drake_safety.simulation.scenario import load_scenario
 
-    given = {"hand": hand, "recovery": recovery}
+    given = {"hand": hand, "recovery": recovery, "guard": guard or None}
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     settings = RunSettings(
@@ -134,17 +135,18 @@ def run(
     print_shipped(learned)
     if target is not None:
         rule = goal_threshold(learned.path, settings.assessment)
-        if not run_to_target(settings, target, rule, is_forced=force):
+        if not run_to_target(settings, target, rule, is_forced=force or guard):
             raise typer.Exit(1)
         return
     if force:
-        raise ValueError(f"run: --force goes to a target that Γ refuses: pass {TARGET} too")
+        raise ValueError("run: --force goes to a target that Γ refuses: pass that too")
     # Check the capabilities of the task before a browser is opened.
     loop = settings.make_loop()
     if isinstance(loop, HasGoals):
+        words = goal_words(loop)
         raise ValueError(
-            f"run: task '{type(loop).__name__}' needs a target: pass {TARGET} X Y Z, or one of "
-            f"the names {list(loop.named_targets)}"
+            f"run: task '{type(loop).__name__}' needs a {words.goal}: pass --{words.goal} "
+            f"{' '.join(words.axes)}, or one of the names {list(loop.named_targets)}"
         )
     require(loop, HasBall, "run")
     _run_with_balls(settings)

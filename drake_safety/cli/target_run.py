@@ -1,7 +1,8 @@
-"""``drake-safety run --target``: a motion to a target that Γ accepts, or that is forced."""
+"""``drake-safety run --target``: a motion to a goal that Γ accepts, or that is forced."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +34,11 @@ _MOTION_PORTS = (
     "alarm",
     "alarm_cause",
 )
+_HAPPENING = {
+    "guard_active": "the guard passes on another command",
+    "recovery_active": "recovery triggered",
+}
+"""Ports that a loop may have, and what it means when they become positive."""
 _NUM_STILLS = 5
 _AFTER_PUSH_S = 0.15  # Time at which the effect of a push is visible.
 _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.
@@ -58,7 +64,9 @@ def run_to_target(
     from drake_safety.planning.goal_verdict import assess_goal
     from drake_safety.simulation.goal_motion import run_to_goal
 
-    loop = settings.make_loop()
+    # The verdict is on what is asked, whatever a guard would pass on.
+    options = {name: value for name, value in settings.options.items() if name != "guard"}
+    loop = replace(settings, options=options).make_loop()
     goal = parse_target(loop, target)
     push = named_push(loop, settings.pushes)
     threshold = rule.threshold
@@ -83,7 +91,7 @@ def run_to_target(
         duration_s=duration_s,
         seed=settings.seed,
         log_period_s=LOG_PERIOD_S,
-        ports=_MOTION_PORTS,
+        ports=(*_MOTION_PORTS, *filter(loop.HasOutputPort, _HAPPENING)),
         realtime_rate=settings.realtime_rate,
     )
     calibration = settings.assessment.calibrations_.get("motion")
@@ -185,8 +193,15 @@ def table_of_motion(
         motion: Log of the motion, with Γ and its predictions.
         threshold: Lowest Γ of an accepted goal.
     """
+    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
+
+    words = goal_words(require(loop, HasGoals))
     gamma = motion.extra["calibrated_safety_probability"][:, 0]
-    events = [(0.0, f"the {loop.hand} hand starts")]
+    events = [(0.0, f"{words.subject} starts")]
+    for port, happens in _HAPPENING.items():
+        if port in motion.extra and (motion.extra[port] > 0).any():
+            row = int(np.argmax(motion.extra[port][:, 0] > 0))
+            events.append((float(motion.time_s[row]), happens))
     if motion.push is not None:
         push = motion.push
         events.append(
@@ -215,6 +230,10 @@ def table_of_motion(
         events.append((motion.fall_time_s, "the robot fell"))
     else:
         place = "" if motion.has_left else ", inside the safe set throughout"
-        missed = f"standing{place}; {100 * motion.miss_m:.1f} cm from the target"
+        if words.is_point:
+            missed = f"standing{place}; {words.distance(motion.miss)} from the {words.goal}"
+        else:
+            reached = np.round(motion.output[len(motion.output) // 2 :].mean(axis=0), 2)
+            missed = f"on its feet{place}; mean of the second half {words.value(reached)}"
         events.append((float(motion.time_s[-1]), missed))
     return events_table(events, motion.time_s, gamma)

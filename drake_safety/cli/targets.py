@@ -14,10 +14,20 @@ from drake_safety.cli.console import console
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.planning.goal_verdict import GoalVerdict
+    from drake_safety.simulation.capabilities import GoalWords
     from drake_safety.simulation.closed_loop import ClosedLoop
 
-TARGET = "--target"
-TARGET_HELP = "Target: three numbers in the world frame [m], or a name in the scenario."
+TARGET, COMMAND = "--target", "--command"
+TargetOption = Annotated[
+    str | None,
+    typer.Option(
+        TARGET,
+        COMMAND,
+        metavar="X Y Z | NAME",
+        help="Target, three numbers in the world frame [m], or command, v_x v_y [m/s] and yaw rate "
+        "[rad/s]; or a name in the scenario.",
+    ),
+]
 HandOption = Annotated[
     str | None,
     typer.Option("--hand", help="Reaching hand; the trained one by default."),
@@ -27,7 +37,7 @@ _SEARCH_SEED = 0  # Fixed, so that results are reproducible.
 
 
 class TargetCommand(TyperCommand):
-    """A command whose ``--target`` takes three numbers, possibly negative, or one name."""
+    """A command whose targets are three numbers, possibly negative, or one name."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the arguments with the numbers of a target joined to one word."""
@@ -35,7 +45,7 @@ class TargetCommand(TyperCommand):
 
 
 def join_targets(args: Sequence[str]) -> list[str]:
-    """Joins the numbers that follow ``--target``: an option has a fixed number of words.
+    """Joins the numbers of a target or command: an option has a fixed number of words.
 
     Args:
         args: The words of a command line.
@@ -44,13 +54,13 @@ def join_targets(args: Sequence[str]) -> list[str]:
     words = list(args)
     while words:
         word = words.pop(0)
-        if word != TARGET or not words:
+        if word not in (TARGET, COMMAND) or not words:
             joined.append(word)
             continue
         numbers = [words.pop(0)]
         while words and len(numbers) < 3 and _is_number(numbers[-1]) and _is_number(words[0]):
             numbers.append(words.pop(0))
-        joined.append(f"{TARGET}={' '.join(numbers)}")
+        joined.append(f"{word}={' '.join(numbers)}")
     return joined
 
 
@@ -63,7 +73,7 @@ def _is_number(word: str) -> bool:
 
 
 def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
-    """The target of ``--target`` in the world, (3,) [m].
+    """The goal of ``--target`` or ``--command``, (3,).
 
     Args:
         loop: The closed loop, which names targets.
@@ -72,17 +82,19 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     Raises:
         ValueError: The plans of the task have no goal, or the text is neither.
     """
-    from drake_safety.simulation.capabilities import HasGoals, require
+    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 
-    named_targets = require(loop, HasGoals, TARGET).named_targets
+    with_goals = require(loop, HasGoals, TARGET)
+    named_targets, words = with_goals.named_targets, goal_words(with_goals)
     if text in named_targets:
         return np.array(named_targets[text], dtype=float)
-    words = text.split()
-    if len(words) == 3 and all(map(_is_number, words)):
-        return np.array([float(word) for word in words])
+    entries = text.split()
+    if len(entries) == 3 and all(map(_is_number, entries)):
+        return np.array([float(entry) for entry in entries])
     raise ValueError(
-        f"{TARGET} '{text}': give X Y Z, three numbers [m], or one of the names that scenario "
-        f"'{loop.scenario.name}' gives: {list(named_targets)}"
+        f"{words.goal} '{text}': give {' '.join(words.axes)}, three numbers "
+        f"[{', '.join(words.units)}], or one of the names that scenario '{loop.scenario.name}' "
+        f"gives: {list(named_targets)}"
     )
 
 
@@ -112,7 +124,11 @@ def print_verdict(
         nearest: The nearest accepted target, for a refusal.
         remark: Remark on the threshold, or "".
     """
-    lines = {"target": f"{_point(verdict.goal)} of the {loop.hand} hand"}
+    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
+
+    words = goal_words(require(loop, HasGoals))
+    of = f" of {words.subject}" if words.is_point else ""
+    lines = {words.goal: f"{words.value(verdict.goal)}{of}"}
     if verdict.reason:
         lines["verdict"] = f"{verdict.verdict}: {verdict.reason}"
     else:
@@ -125,14 +141,16 @@ def print_verdict(
         safe, unsafe, unknown = verdict.belief.tolist()
         lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if not verdict.is_accepted:
-        lines |= _refusal(loop, verdict, nearest)
+        lines |= _refusal(loop, words, verdict, nearest)
     if remark:
         lines["remark"] = remark
     for name, text in lines.items():
         console.print(f"{name:<16}  {text}", highlight=False, soft_wrap=True)
 
 
-def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None) -> dict[str, str]:
+def _refusal(
+    loop: ClosedLoop, words: GoalWords, verdict: GoalVerdict, nearest: GoalVerdict | None
+) -> dict[str, str]:
     from drake_safety.learning.causes import describe_margin
     from drake_safety.simulation.capabilities import angular_constraints
 
@@ -149,13 +167,8 @@ def _refusal(loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None
     if nearest is None:
         lines["nearest accepted"] = "none found that is accepted with reserve"
     else:
-        distance_m = float(np.linalg.norm(nearest.goal - verdict.goal))
         lines["nearest accepted"] = (
-            f"{_point(nearest.goal)}, {100 * distance_m:.1f} cm away, "
+            f"{words.value(nearest.goal)}, {words.distance(nearest.goal - verdict.goal)} away, "
             f"Γ {nearest.safety_probability:.3f}"
         )
     return lines
-
-
-def _point(point: np.ndarray) -> str:
-    return " ".join(f"{value:.12g}" for value in point.tolist()) + " m"

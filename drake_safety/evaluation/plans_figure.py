@@ -17,6 +17,8 @@ from drake_safety.evaluation.figure_style import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from drake_safety.simulation.capabilities import GoalWords
+
 MISS_COLOUR = "#111111"
 # Verdict and outcome: name, class, colour, marker and size; errors are drawn on top.
 _KINDS = (
@@ -32,13 +34,19 @@ _WIDTH, _HEIGHT = 6.6, 2.4  # Width of the figure, and height without panels [in
 _PANEL_WIDTH = 5.6
 
 
-def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarray) -> Figure:
-    """Plots targets in two views; the legend gives the number of each kind.
+def plans_figure(
+    goals: np.ndarray,
+    is_unsafe: np.ndarray,
+    is_refused: np.ndarray,
+    words: GoalWords | None = None,
+) -> Figure:
+    """Plots goals in two views; the legend gives the number of each kind.
 
     Args:
-        goals: Targets in the world, (N, 3) [m].
+        goals: Targets in the world, (N, 3) [m], or goals of another kind, (N, 3).
         is_unsafe: Outcome of each, (N,).
         is_refused: Verdict on each, (N,).
+        words: What the goals are called; targets by default.
 
     Raises:
         ValueError: The arguments have different lengths.
@@ -53,11 +61,17 @@ def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarra
         ~is_unsafe & is_refused,
         is_unsafe & ~is_refused,
     )
+    is_point = words is None or words.is_point
+    labels = list(_LABELS)
+    if words is not None and not is_point:
+        labels = [f"{axis} [{unit}]" for axis, unit in zip(words.axes, words.units, strict=True)]
     totals = {"safe": int((~is_unsafe).sum()), "unsafe": int(is_unsafe.sum())}
     with drawing_style():
         # Both views share the horizontal axis y and the scale.
         span = np.ptp(goals, axis=0) if len(goals) else np.ones(3)
         heights = [max(span[up], 0.1) / max(span[right], 0.1) for _, right, up in _VIEWS]
+        if not is_point:  # Axes of other units have no common scale.
+            heights = [0.6] * len(_VIEWS)
         fig = new_figure(_WIDTH, _HEIGHT + _PANEL_WIDTH * sum(heights))
         panels = fig.subplots(2, 1, sharex=True, height_ratios=heights)
         for axes, (title, right, up) in zip(panels, _VIEWS, strict=True):
@@ -77,13 +91,14 @@ def plans_figure(goals: np.ndarray, is_unsafe: np.ndarray, is_refused: np.ndarra
                     rasterized=True,
                     label=f"{name}: {rows.sum()} of {totals[which]}, {share:.1f} %",
                 )
-            axes.set_aspect("equal")
-            axes.set_title(title)
-            axes.set_ylabel(_LABELS[up])
+            if is_point:
+                axes.set_aspect("equal")
+                axes.set_title(title)
+            axes.set_ylabel(labels[up])
             axes.grid(color="#eceef0", linewidth=0.7)
             axes.set_axisbelow(True)
         panels[-1].invert_xaxis()
-        panels[-1].set_xlabel(_LABELS[1])
-        handles, labels = panels[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside lower center", ncols=2)
+        panels[-1].set_xlabel(labels[1])
+        handles, kinds = panels[0].get_legend_handles_labels()
+        fig.legend(handles, kinds, loc="outside lower center", ncols=2)
     return fig

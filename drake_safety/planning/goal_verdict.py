@@ -13,7 +13,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.simulation.capabilities import HasGoals, require
+from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -111,7 +111,8 @@ def assess_goal(
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
     """
     goal = checked_goal(goal)
-    box = require(loop, HasGoals).target_box
+    with_goals = require(loop, HasGoals)
+    box, words = with_goals.target_box, goal_words(with_goals)
     if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
         (verdict,) = assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
@@ -128,7 +129,7 @@ def assess_goal(
         constraint_names=names,
         cause_probability=np.zeros(len(names)),
         predicted_margins=np.full(len(names), np.nan),
-        reason=f"the target {position} the region sampled in training, {_region(box)}",
+        reason=f"the {words.goal} {position} the region sampled in training, {_region(box, words)}",
     )
 
 
@@ -155,6 +156,7 @@ def assess_goals(
     if len(goals) == 0:
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
+    noun = goal_words(require(loop, HasGoals)).goal
     seen = goal_inputs(loop, goals)
     prediction = assessment.predict(*seen)
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
@@ -167,7 +169,7 @@ def assess_goals(
             verdict = UNKNOWN
             reason = (
                 f"Γ {probability:.3f} lies between {unsafe_below:.3f} and {threshold:.3f}, where "
-                "safe and unsafe targets cannot be distinguished"
+                f"safe and unsafe {noun}s cannot be distinguished"
             )
         if prediction.novelty[i] > 1.0:
             verdict = UNKNOWN
@@ -178,7 +180,7 @@ def assess_goals(
             )
         elif has_no_data[i]:
             verdict = UNKNOWN
-            reason = "too little training data near this target's embedding"
+            reason = f"too little training data near this {noun}'s embedding"
         verdicts.append(
             GoalVerdict(
                 goal=np.array(goal, dtype=float),
@@ -224,14 +226,14 @@ def checked_goal(goal: np.ndarray) -> np.ndarray:
     """
     goal = np.asarray(goal, dtype=float)
     if goal.shape != (3,):
-        raise ValueError(f"a target is three numbers [m]; got {goal.tolist()}")
+        raise ValueError(f"a goal is three numbers; got {goal.tolist()}")
     return goal
 
 
-def _region(box: np.ndarray) -> str:
-    return (
-        ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in zip("xyz", *box, strict=True))
-        + " m"
+def _region(box: np.ndarray, words: GoalWords) -> str:
+    entries = zip(words.axes, *box.tolist(), strict=True)
+    return ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in entries) + (
+        " m" if words.is_point else ""
     )
 
 

@@ -7,6 +7,7 @@ generator, and ``episode`` an episode of the loop.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -27,10 +28,10 @@ _Capability = TypeVar("_Capability")
 
 @runtime_checkable
 class HasGoals(Protocol):
-    """Plans lead to a goal, a point in the world.
+    """Plans lead to a goal: three numbers, a point in the world [m] or what `goal_words` says.
 
     Attributes:
-        named_targets: Named goals in the world, (3,) [m] each.
+        named_targets: Named goals, (3,) each.
         hand: The reaching frame that moves to the goal; None for another part of the robot.
     """
 
@@ -56,6 +57,51 @@ class HasGoals(Protocol):
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """Goal of an episode's plan, in the world, (3,) [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalWords:
+    """What goals are called in messages and figures.
+
+    Attributes:
+        goal: A goal.
+        axes: Its three entries.
+        units: Their units; a single one holds for all.
+        subject: What moves.
+    """
+
+    goal: str = "target"
+    axes: tuple[str, str, str] = ("x", "y", "z")
+    units: tuple[str, ...] = ("m",)
+    subject: str = "the robot"
+
+    @property
+    def is_point(self) -> bool:
+        """Whether a goal is a point in the world."""
+        return self.units == ("m",)
+
+    def value(self, goal: np.ndarray) -> str:
+        """A goal with its units."""
+        numbers = [f"{value:.12g}" for value in goal.tolist()]
+        if len(self.units) == 1:
+            return f"{' '.join(numbers)} {self.units[0]}"
+        return " ".join(f"{n} {u}" for n, u in zip(numbers, self.units, strict=True))
+
+    def distance(self, difference: np.ndarray) -> str:
+        """The size of a difference of goals (3,)."""
+        length = float(np.linalg.norm(difference))
+        return f"{100 * length:.1f} cm" if self.is_point else f"{length:.2f}"
+
+
+@runtime_checkable
+class NamesGoals(Protocol):
+    """Goals are called otherwise than targets.
+
+    Attributes:
+        goal_words: What they are called.
+    """
+
+    goal_words: GoalWords
 
 
 @runtime_checkable
@@ -264,6 +310,13 @@ def rate_names(loop: ClosedLoop) -> list[str]:
     if isinstance(loop, PlannedLoop):
         return loop.rate_names
     return [*filter(is_rate, loop.state_names)]
+
+
+def goal_words(loop: HasGoals) -> GoalWords:
+    """What the goals of a loop are called."""
+    if isinstance(loop, NamesGoals):
+        return loop.goal_words
+    return GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
 
 
 def fair_box(loop: HasGoals) -> np.ndarray:

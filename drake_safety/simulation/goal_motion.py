@@ -65,9 +65,9 @@ class GoalMotion(Mishap):
     extra: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
-    def miss_m(self) -> float:
-        """Distance from the goal at the end [m]."""
-        return float(np.linalg.norm(self.output[-1] - self.goal))
+    def miss(self) -> np.ndarray:
+        """Output minus goal at the end, (3,)."""
+        return self.output[-1] - self.goal
 
 
 def run_to_goal(
@@ -81,6 +81,7 @@ def run_to_goal(
     ports: tuple[str, ...] = (),
     realtime_rate: float = 0.0,
     until_unsafe: bool = False,
+    after_fall_s: float = 0.0,
 ) -> GoalMotion:
     """Simulates the motion from the standing posture to a goal, safe or not.
 
@@ -94,6 +95,7 @@ def run_to_goal(
         ports: More output ports to log, into ``extra``.
         realtime_rate: Target real-time rate; 0 for as fast as possible.
         until_unsafe: Whether the motion ends when it leaves the safe set, not only at a fall.
+        after_fall_s: Time for which a motion continues after a fall [s].
 
     Raises:
         ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
@@ -121,7 +123,8 @@ def run_to_goal(
             if until_unsafe:
                 break
         if margins[fall_column] < 0:
-            fall_s = time
+            fall_s = min(fall_s, time)
+        if time >= fall_s + after_fall_s:
             break
     arrays = recorder.arrays()
     extra = {name: arrays.pop(name) for name in ports}

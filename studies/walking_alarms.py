@@ -1,0 +1,206 @@
+"""Figures of the study of walking: alarms, falls, guard, recovery and speeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from drake_safety.evaluation.alarms import Alarm, scorer_alarm, threshold_alarms
+from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.monitoring_study import (
+    first_alarm,
+    lowest_value,
+    persisting,
+    rate_per_hour,
+)
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.capabilities import CanFall, require
+from drake_safety.simulation.scenario import Scenario
+from studies.walking_motions import WalkedMotion
+
+EARLY_S = 0.2
+"""Time before a fall that an alarm should leave [s]."""
+NUM_ROWS = 2
+"""Successive rows below the threshold that give an alarm."""
+_RESERVE = 1.0  # Of a probability's logit, below the lowest value of the calibration.
+
+
+def walking_alarms(
+    scenario: Scenario, assessment: SafetyAssessment, classifiers: Sequence[Scorer]
+) -> list[Alarm]:
+    """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action."""
+    loop = scenario.make_loop()
+    watched = require(loop, CanFall).watched_features
+    alarms = [
+        scorer_alarm(assessment_scorer("sharpened", assessment, "calibrated")),
+        *(scorer_alarm(scorer) for scorer in classifiers),
+        *threshold_alarms(loop.state_names, loop.feature_names, watched),
+    ]
+    column = loop.feature_names.index("action_change")
+    alarms.append(Alarm(name="action_change", value=lambda one: -one.features[:, column]))
+    return alarms
+
+
+def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
+    return persisting(alarm.value(motion), NUM_ROWS)
+
+
+def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:
+    """The lowest value of each alarm on undisturbed tours.
+
+    Args:
+        alarms: The alarms.
+        calm: Tours; those with a fall are left out.
+
+    Raises:
+        ValueError: Every tour has a fall.
+    """
+    calm = [motion for motion in calm if not motion.has_left]
+    if not calm:
+        raise ValueError("walking: the robot leaves its safe set on every calibration tour")
+    return {
+        alarm.name: min(lowest_value(motion, _values(alarm, motion)) for motion in calm)
+        for alarm in alarms
+    }
+
+
+def alarm_estimates(
+    alarms: Sequence[Alarm], thresholds: Mapping[str, float], pushed: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Shares of falls announced, lead times, and alarms in motions without a fall.
+
+    Args:
+        alarms: The alarms.
+        thresholds: By alarm.
+        pushed: Motions with a push.
+    """
+    judged = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
+    fallen = [motion for motion in judged if motion.has_fallen]
+    safe = [motion for motion in judged if not motion.has_left]
+    until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
+    estimates = {
+        "pushes.fallen": proportion(len(fallen), len(judged)),
+        "pushes.left": proportion(sum(motion.has_left for motion in judged), len(judged)),
+        "pushes.push_to_fall_s": median(until),
+    }
+    for alarm in alarms:
+        threshold = thresholds[alarm.name]
+        lead = np.array([_lead(alarm, motion, threshold) for motion in fallen])
+        false = sum(
+            math.isfinite(first_alarm(motion, _values(alarm, motion), threshold)) for motion in safe
+        )
+        key = f"alarm.{alarm.name}"
+        estimates |= {
+            f"{key}.announced": proportion(int(np.sum(lead >= EARLY_S - 1e-9)), len(fallen)),
+            f"{key}.lead_s": median(lead),
+            f"{key}.alarms_without_leaving": proportion(false, len(safe)),
+        }
+    return estimates
+
+
+def _lead(alarm: Alarm, motion: WalkedMotion, threshold: float) -> float:
+    since = motion.push_time_s
+    alarm_s = first_alarm(motion, _values(alarm, motion), threshold, since_s=since)
+    return motion.fall_time_s - alarm_s if alarm_s <= motion.fall_time_s else -math.inf
+
+
+def tour_estimates(
+    alarms: Sequence[Alarm], thresholds: Mapping[str, float], tours: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Shares of tours with a fall, and false alarms an hour on the others.
+
+    Args:
+        alarms: The alarms.
+        thresholds: By alarm.
+        tours: Undisturbed tours.
+    """
+    calm = [motion for motion in tours if not motion.has_left]
+    duration_s = sum(float(motion.time_s[-1]) for motion in calm)
+    estimates = {
+        "tours.without_fall": proportion(sum(not m.has_fallen for m in tours), len(tours)),
+        "tours.hours": Estimate.exact(duration_s / 3600.0, len(calm)),
+    }
+    for alarm in alarms:
+        threshold = thresholds[alarm.name]
+        count = 0
+        for motion in calm:
+            is_below = ~(_values(alarm, motion) >= threshold)
+            count += int(np.sum(np.diff(is_below.astype(int), prepend=0) > 0))
+        estimates[f"tours.{alarm.name}.false_alarms_per_hour"] = rate_per_hour(
+            count, duration_s, len(calm)
+        )
+    return estimates
+
+
+def recovery_estimates(
+    branch: str, alone: Sequence[WalkedMotion], again: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Share of falls saved by a branch, and impact speeds of those that it does not save.
+
+    Args:
+        branch: Name of the branch.
+        alone: Motions that fell without recovery.
+        again: The same with recovery.
+    """
+    not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
+    return {
+        f"recovery.{branch}.saved": proportion(len(alone) - len(not_saved), len(alone)),
+        f"recovery.{branch}.impact_m_s": median(np.array([b.impact_m_s for _, b in not_saved])),
+        f"recovery.{branch}.impact_without_m_s": median(
+            np.array([a.impact_m_s for a, _ in not_saved])
+        ),
+    }
+
+
+def guard_estimates(
+    unguarded: Sequence[WalkedMotion],
+    guarded: Sequence[WalkedMotion],
+    inside: Sequence[WalkedMotion],
+) -> dict[str, Estimate]:
+    """Falls with and without the guard, and the share of time in which it changes a command.
+
+    Args:
+        unguarded: Commands past the ranges.
+        guarded: The same with the guard.
+        inside: Tours of commands inside the ranges, with the guard.
+    """
+    without = sum(motion.has_fallen for motion in unguarded)
+    with_guard = sum(motion.has_fallen for motion in guarded)
+    kept = np.array([float(np.mean(motion.is_changed == 0)) for motion in inside])
+    estimates = {
+        "guard.falls_without": proportion(without, len(unguarded)),
+        "guard.falls_with": proportion(with_guard, len(guarded)),
+        "guard.left_without": proportion(sum(m.has_left for m in unguarded), len(unguarded)),
+        "guard.left_with": proportion(sum(m.has_left for m in guarded), len(guarded)),
+        "guard.fewer_falls": Estimate.exact(1.0 - with_guard / max(without, 1), len(guarded)),
+    }
+    if len(inside):
+        low, high = np.quantile(kept, [0.025, 0.975])
+        estimates["guard.unchanged_inside"] = Estimate(
+            float(kept.mean()), float(low), float(high), len(inside)
+        )
+        estimates["guard.falls_inside"] = proportion(
+            sum(motion.has_fallen for motion in inside), len(inside)
+        )
+    return estimates
+
+
+def speed_estimates(
+    ours: Sequence[WalkedMotion], theirs: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Difference of mean forward speeds between two engines, over the same commands.
+
+    Args:
+        ours: Tours in Drake.
+        theirs: The same in MuJoCo.
+    """
+    pairs = [
+        (a.output.mean(axis=0), b.output.mean(axis=0))
+        for a, b in zip(ours, theirs, strict=True)
+        if not (a.has_fallen or b.has_fallen)
+    ]
+    difference = np.array([np.linalg.norm((a - b)[:2]) for a, b in pairs])
+    return {"speed.difference_to_mujoco_m_s": median(difference)}

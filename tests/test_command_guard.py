@@ -1,0 +1,124 @@
+"""CommandGuard: passes on accepted commands, and the nearest accepted one in place of others."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_safety.control.policy import CommandLimits
+from drake_safety.learning.assessment import Assessments
+from drake_safety.systems.command_guard import CommandGuard
+
+LIMITS = CommandLimits(lowest=[-1.0, -0.5, -1.0], highest=[1.0, 0.5, 1.0])
+HORIZON, OUTLOOK = 4, 3
+
+
+class SlowIsSafe:
+    """Γ is 1 up to a forward speed, and 0 beyond; its features are the command."""
+
+    parameters = SimpleNamespace(initial_uncertainty=0.3)
+    uses_features = True
+    info_ = SimpleNamespace(horizon=HORIZON, state_names=["s"], feature_names=["x", "y", "yaw"])
+
+    def __init__(self, fastest=1.5, novelty=0.0):
+        self.fastest, self.novelty = fastest, novelty
+        self.seen = []
+
+    def predict(self, state, desired_preview, features):
+        np.testing.assert_array_equal(desired_preview, np.tile(features, HORIZON))
+        self.seen.append(len(state))
+        gamma = (features[:, 0] <= self.fastest + 1e-9).astype(float)
+        n = len(gamma)
+        return Assessments(
+            safety_probability=0.7 * gamma,
+            normalized=gamma,
+            belief=np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(n, 0.3)]),
+            embedding=np.zeros((n, 2)),
+            cause_probability=np.zeros((n, 1)),
+            calibrated=gamma,
+            predicted_margins=np.zeros((n, 1)),
+            novelty=np.full(n, self.novelty),
+            unsafe_logit=np.zeros(n),
+        )
+
+
+def guard(assessment, **options):
+    return CommandGuard(
+        assessment,
+        lambda features, commands: commands,
+        LIMITS,
+        **{"threshold": 0.5, "period_s": 0.1, "num_outlook": OUTLOOK, **options},
+    )
+
+
+def passed_on(system, command, state=0.0, features=(0.0, 0.0, 0.0)):
+    builder = DiagramBuilder()
+    builder.AddSystem(system)
+    for name, value in (("command", command), ("state", [state]), ("features", features)):
+        source = builder.AddSystem(ConstantVectorSource(np.array(value, dtype=float)))
+        builder.Connect(source.get_output_port(), system.GetInputPort(name))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.Initialize()
+    context = system.GetMyContextFromRoot(simulator.get_context())
+    return {
+        system.get_output_port(i).get_name(): system.get_output_port(i).Eval(context)
+        for i in range(system.num_output_ports())
+    }
+
+
+def test_an_accepted_command_passes_unchanged():
+    seen = SlowIsSafe()
+    out = passed_on(guard(seen), [1.2, 0.3, 0.0])
+    np.testing.assert_array_equal(out["desired_output"], [1.2, 0.3, 0.0])
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (0.0, 1.0)
+    assert seen.seen == [1]  # No other command is evaluated.
+    np.testing.assert_array_equal(out["desired_preview"], np.tile([1.2, 0.3, 0.0], HORIZON))
+    np.testing.assert_array_equal(out["desired_outlook"], np.tile([1.2, 0.3, 0.0], OUTLOOK))
+
+
+def test_a_refused_command_is_replaced_by_the_nearest_accepted_one():
+    out = passed_on(guard(SlowIsSafe(fastest=1.5)), [2.5, 0.4, 0.0])
+    # Shares of 2.5 are .5 apart, and the other entries stay.
+    np.testing.assert_allclose(out["desired_output"], [1.5, 0.4, 0.0])
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("assessment", [SlowIsSafe(novelty=2.0), SlowIsSafe(fastest=-9.0)])
+def test_where_nothing_is_accepted_the_command_stays_within_the_ranges(assessment):
+    out = passed_on(guard(assessment), [2.5, 0.4, -3.0])
+    np.testing.assert_array_equal(out["desired_output"], [1.0, 0.4, -1.0])
+    assert out["safety_probability"][0] == 0.0
+
+
+def test_a_command_that_is_not_finite_stops_the_robot():
+    out = passed_on(guard(SlowIsSafe()), [np.nan, 0.0, 0.0])
+    np.testing.assert_array_equal(out["desired_output"], np.zeros(3))
+    assert out["is_changed"][0] == 1.0
+
+
+def test_a_state_that_is_not_finite_keeps_the_command_within_the_ranges():
+    out = passed_on(guard(SlowIsSafe()), [0.4, 2.0, 0.0], state=np.nan)
+    np.testing.assert_array_equal(out["desired_output"], [0.4, 0.5, 0.0])
+
+
+def test_candidates_are_sorted_by_distance_and_contain_standing():
+    asked = np.array([2.0, -1.0, 3.0])
+    candidates = guard(SlowIsSafe()).candidates(asked)
+    scale = np.subtract(LIMITS.highest, LIMITS.lowest)
+    distance = np.linalg.norm((candidates - asked) / scale, axis=1)
+    assert np.all(np.diff(distance) >= -1e-12)
+    np.testing.assert_allclose(candidates[0], asked)
+    assert np.any(np.all(candidates == 0.0, axis=1))
+
+
+def test_a_threshold_outside_zero_and_one_is_refused():
+    with pytest.raises(ValueError, match=r"threshold must be in \[0, 1\]; got 1.5"):
+        guard(SlowIsSafe(), threshold=1.5)
+
+
+def test_the_outputs_are_states_without_feedthrough():
+    assert not guard(SlowIsSafe()).HasAnyDirectFeedthrough()
