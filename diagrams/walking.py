@@ -348,6 +348,29 @@ class Walking(LeggedLoop):
         self._observers.reseed(context, rng)
         self._observers.silence(context)
 
+    def set_command(self, context: Context, command: np.ndarray) -> None:
+        """Sets a constant command from now on.
+
+        Args:
+            context: The root Context.
+            command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
+        """
+        self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
+
+    def set_guarded(self, context: Context, is_guarded: bool) -> None:
+        """Sets whether the guard acts.
+
+        Args:
+            context: The root Context.
+            is_guarded: Whether it does.
+
+        Raises:
+            ValueError: The diagram was built without a guard.
+        """
+        if self._guard is None:
+            raise ValueError("walking: the diagram was built without a guard: pass guard=True")
+        self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)
+
     def _above_ground(self, q: np.ndarray) -> np.ndarray:
         """Joints within their stops, and the feet lifted out of the ground, (n_q,)."""
         kinematics, q = self.kinematics, q.copy()

@@ -1,4 +1,4 @@
-"""``drake-safety play``: throw balls or move targets interactively, with Γ beside the robot."""
+"""``drake-safety play``: throw balls, move targets or walk, with Γ beside the robot."""
 
 from __future__ import annotations
 
@@ -41,10 +41,12 @@ def play(
 ) -> None:
     """Run the robot in the browser, in real time, until Stop or Ctrl-C.
 
-    Sliders and buttons throw a ball or move the target; Γ, belief and verdict are shown.
+    Sliders and buttons throw a ball or move the target; keys walk a robot that follows commands,
+    push it, and switch its guard. Γ, belief and verdict are shown.
     """
+    from drake_safety.live.commanded_session import LiveCommands
     from drake_safety.live.session import LiveGoals, LiveThrows
-    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+    from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -54,15 +56,20 @@ def play(
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     # Check the capabilities of the task before a browser is opened.
     asked = loaded.make_loop(variation, assessment=gamma, **options)
-    has_goals = isinstance(asked, HasGoals)
-    if not has_goals:
+    has_goals, is_commanded = isinstance(asked, HasGoals), isinstance(asked, FollowsCommands)
+    if is_commanded:
+        options["guard"] = True
+    elif not has_goals:
         require(asked, HasBall, "play")
         options["ball"] = True
     print_shipped(folder)
     meshcat = open_viewer(host, port)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session: LiveSession
-    if has_goals:
+    if is_commanded:
+        threshold = loaded.parameters.guard.threshold
+        session = LiveCommands(loop, meshcat, threshold=threshold, seed=seed)
+    elif has_goals:
         rule = goal_threshold(folder.path, gamma)
         if rule.remark:
             console.print(rule.remark, highlight=False, soft_wrap=True)

@@ -175,6 +175,21 @@ class CanBePushed(Protocol):
 
 
 @runtime_checkable
+class FollowsCommands(Protocol):
+    """Goals are commands that can change while the robot moves."""
+
+    def set_command(self, context: Context, command: np.ndarray) -> None:
+        """Sets a constant command (3,) from now on."""
+
+    def set_guarded(self, context: Context, is_guarded: bool) -> None:
+        """Sets whether a guard replaces commands that are not accepted.
+
+        Raises:
+            ValueError: The loop was built without a guard.
+        """
+
+
+@runtime_checkable
 class OffersPlans(Protocol):
     """There are several plans to choose from in a state.
 
@@ -243,6 +258,7 @@ _DESCRIPTIONS: dict[type, str] = {
     HasBall: "a ball to throw",
     CanFall: "a fall",
     CanBePushed: "pushes on its robot",
+    FollowsCommands: "commands that change while it moves",
     OffersPlans: "plans to choose from",
     CanStartAnywhere: "episodes from a given start",
     HasStatePlanes: "state planes",

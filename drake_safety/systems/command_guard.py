@@ -37,7 +37,8 @@ class CommandGuard(FloatSystem, LeafSystem):
     measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
     none is accepted, the one with the largest Γ. A command is accepted if its calibrated Γ reaches
     the threshold and the inputs are not novel. ``safety_probability`` is that of the asked command.
-    All outputs are discrete states, and preview and outlook hold the command.
+    All outputs are discrete states, and preview and outlook hold the command. Whether the guard
+    acts is a parameter of the Context; one that does not passes on everything.
 
     Args:
         assessment: A fitted assessment.
@@ -74,6 +75,7 @@ class CommandGuard(FloatSystem, LeafSystem):
         self._command_port = self.DeclareVectorInputPort("command", 3)
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._is_acting = self.DeclareNumericParameter(BasicVector([1.0]))
         command = self.DeclareDiscreteState(3)
         self._decision = self.DeclareDiscreteState(2)
         self._command = command
@@ -98,6 +100,15 @@ class CommandGuard(FloatSystem, LeafSystem):
                 ),
                 {self.discrete_state_ticket(self._decision)},
             )
+
+    def set_acting(self, context: Context, is_acting: bool) -> None:
+        """Sets whether the guard acts, from its next decision on.
+
+        Args:
+            context: This system's Context.
+            is_acting: Whether it replaces commands that are not accepted.
+        """
+        context.get_mutable_numeric_parameter(self._is_acting).SetAtIndex(0, float(is_acting))
 
     def probabilities(
         self, state: np.ndarray, features: np.ndarray, commands: np.ndarray
@@ -128,7 +139,12 @@ class CommandGuard(FloatSystem, LeafSystem):
         return commands[np.argsort(distance, kind="stable")]
 
     def decide(
-        self, asked: np.ndarray, state: np.ndarray, features: np.ndarray
+        self,
+        asked: np.ndarray,
+        state: np.ndarray,
+        features: np.ndarray,
+        *,
+        is_acting: bool = True,
     ) -> tuple[np.ndarray, float]:
         """Returns the command to pass on, (3,), and the Γ of the asked one.
 
@@ -136,9 +152,10 @@ class CommandGuard(FloatSystem, LeafSystem):
             asked: (3,) [m/s, rad/s].
             state: (n_s,).
             features: (n_f,).
+            is_acting: Whether to replace a command that is not accepted.
         """
         asked_probability = float(self.probabilities(state, features, asked[None])[0])
-        if asked_probability >= self._threshold:
+        if asked_probability >= self._threshold or not is_acting:
             return asked, asked_probability
         commands = self.candidates(asked)
         probability = self.probabilities(state, features, commands)
@@ -154,7 +171,8 @@ class CommandGuard(FloatSystem, LeafSystem):
         if not np.isfinite(asked).all():
             command, probability = np.zeros(3), 0.0
         elif np.isfinite(state).all() and np.isfinite(features).all():
-            command, probability = self.decide(asked, state, features)
+            is_acting = bool(context.get_numeric_parameter(self._is_acting).GetAtIndex(0) > 0)
+            command, probability = self.decide(asked, state, features, is_acting=is_acting)
         else:
             command, probability = np.clip(asked, self._lowest, self._highest), 0.0
         discrete_state.set_value(self._command, command)
