@@ -72,9 +72,15 @@ def log_motion(loop: ClosedLoop, index: int, port: InputPort) -> Motion:
     """Simulates an episode again and logs each change of an input port of its plant."""
     duration_s = float(run_episode(loop, index, seed=SEED).time_s[-1])
     simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, episode_rng(SEED, index))
-    plant = loop.plant
+    loop.reset(simulator.get_mutable_context(), episode_rng(SEED, index))
+    return log_commands(loop, simulator, port, duration_s, index)
+
+
+def log_commands(
+    loop: ClosedLoop, simulator: Simulator, port: InputPort, duration_s: float, index: int = 0
+) -> Motion:
+    """Simulates from the present state and logs each change of an input port of the plant."""
+    plant, context = loop.plant, simulator.get_mutable_context()
     plant_context = plant.GetMyContextFromRoot(context)
     start = context.Clone()
     breaks: list[float] = []

@@ -19,13 +19,14 @@ from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.watched_motion import WatchedMotion
 from studies.walking_motions import WalkedMotion
 
 EARLY_S = 0.2
 """Time before a fall that an alarm should leave [s]."""
 NUM_ROWS = 2
 """Successive rows below the threshold that give an alarm."""
-_RESERVE = 1.0  # Of a probability's logit, below the lowest value of the calibration.
+_LEAST = 1e-6  # Of a probability and its complement, in logits.
 
 
 def walking_alarms(
@@ -34,9 +35,9 @@ def walking_alarms(
     """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action."""
     loop = scenario.make_loop()
     watched = require(loop, CanFall).watched_features
+    scorers = [assessment_scorer("sharpened", assessment, "calibrated"), *classifiers]
     alarms = [
-        scorer_alarm(assessment_scorer("sharpened", assessment, "calibrated")),
-        *(scorer_alarm(scorer) for scorer in classifiers),
+        *(_in_logits(scorer_alarm(scorer)) for scorer in scorers),
         *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]
     column = loop.feature_names.index("action_change")
@@ -44,27 +45,41 @@ def walking_alarms(
     return alarms
 
 
+def _in_logits(alarm: Alarm) -> Alarm:
+    """An alarm on the logit of a probability, whose lowest values are spread."""
+
+    def value(motion: WatchedMotion) -> np.ndarray:
+        p = np.clip(alarm.value(motion), _LEAST, 1.0 - _LEAST)
+        return np.log(p / (1.0 - p))
+
+    return Alarm(name=alarm.name, value=value)
+
+
 def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
     return persisting(alarm.value(motion), NUM_ROWS)
 
 
 def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:
-    """The lowest value of each alarm on undisturbed tours.
+    """Thresholds that give no alarm on undisturbed tours, with a reserve.
+
+    The reserve below the lowest value is half of its distance to the median of the tours' lowest
+    values, as many more hours have lower ones.
 
     Args:
         alarms: The alarms.
-        calm: Tours; those with a fall are left out.
+        calm: Tours; those that leave the safe set are left out.
 
     Raises:
-        ValueError: Every tour has a fall.
+        ValueError: Every tour does.
     """
     calm = [motion for motion in calm if not motion.has_left]
     if not calm:
         raise ValueError("walking: the robot leaves its safe set on every calibration tour")
-    return {
-        alarm.name: min(lowest_value(motion, _values(alarm, motion)) for motion in calm)
-        for alarm in alarms
-    }
+    thresholds = {}
+    for alarm in alarms:
+        lowest = [lowest_value(motion, _values(alarm, motion)) for motion in calm]
+        thresholds[alarm.name] = float(min(lowest) - 0.5 * (np.median(lowest) - min(lowest)))
+    return thresholds
 
 
 def alarm_estimates(

@@ -11,8 +11,9 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import heading_velocity, walking_state
-from drake_safety.diagrams.walking_parameters import CommandSampling, profile
+from drake_safety.diagrams.walking_parameters import CommandSampling, WalkingRecovery, profile
 from drake_safety.simulation.contract import check_contract
+from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.rollouts import episode_rng
 
 NAMES = ["g1_walking", "go2_walking"]
@@ -110,3 +111,115 @@ def test_a_body_that_does_not_exist_is_named(name):
     scenario.parameters.safe_set.clearance_m["wing"] = 0.1
     with pytest.raises(ValueError, match=r"no bodies \['wing'\] for clearance_m; it has"):
         scenario.make_loop()
+
+
+def test_a_start_carries_the_controller_so_that_the_motion_goes_on_as_it_was(loop):
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_standing(context, np.array([0.4, 0.0, 0.3]))
+    simulator.Initialize()
+    simulator.AdvanceTo(0.6)
+    start = loop.start_of(context)
+    simulator.AdvanceTo(1.0)
+    expected = loop.GetOutputPort("plant_state").Eval(context).copy()
+    again = Simulator(loop)
+    loop.reset_to(again.get_mutable_context(), None, start)
+    again.Initialize()
+    again.AdvanceTo(0.4)
+    found = loop.GetOutputPort("plant_state").Eval(again.get_context())
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    without = replace(start, controller_state=None)
+    loop.reset_to(again.get_mutable_context(), None, without)
+    again.Initialize()
+    again.AdvanceTo(0.4)
+    forgotten = loop.GetOutputPort("plant_state").Eval(again.get_context())
+    assert np.abs(forgotten - expected).max() > 0.01
+
+
+def test_a_goal_is_a_command_which_may_end_before_the_episode():
+    loop = load_scenario("go2_walking").make_loop(command_s=1.0)
+    context = loop.CreateDefaultContext()
+    loop.reset_standing(context, np.array([0.5, 0.1, -0.2]))
+    preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
+    np.testing.assert_allclose(preview[5], [0.5, 0.1, -0.2])
+    outlook = loop.GetOutputPort("features").Eval(context)[
+        [loop.feature_names.index(f"last_command_{axis}") for axis in ("forward", "left", "yaw")]
+    ]
+    np.testing.assert_allclose(outlook, np.zeros(3), atol=1e-12)
+    assert np.all(loop.target_box[1] > loop.policy.parameters.command.highest)
+    with pytest.raises(ValueError, match="a command is three finite numbers"):
+        loop.reset_standing(context, np.array([0.5, np.nan, 0.0]))
+
+
+def test_evaluation_starts_without_an_offset():
+    scenario = load_scenario("go2_walking")
+    calm, pushed = scenario.make_loop(disturbed=False), scenario.make_loop()
+    speeds = {True: [], False: []}
+    for loop, is_disturbed in ((calm, False), (pushed, True)):
+        context = loop.CreateDefaultContext()
+        for index in range(12):
+            loop.reset(context, episode_rng(5, index))
+            n_q = loop.kinematics.num_positions
+            state = loop.GetOutputPort("plant_state").Eval(context)
+            speeds[is_disturbed].append(np.linalg.norm(state[n_q + 3 : n_q + 5]))
+    assert max(speeds[False]) < 1.6 < max(speeds[True])
+
+
+def test_a_push_accelerates_the_robot():
+    loop = load_scenario("go2_walking").make_loop()
+    push = replace(loop.pushes["side"], time_s=0.2, duration_s=0.1, force_n=[0.0, 300.0, 0.0])
+    motion = run_to_goal(loop, np.zeros(3), push=push, duration_s=0.34)
+    assert motion.output[-1, 1] > 1.0
+    sampled = [loop.sample_push(episode_rng(0, i)) for i in range(20)]
+    low, high = loop.scenario.parameters.random_pushes.force_n
+    assert all(low <= one.strength_n <= high for one in sampled)
+
+
+@pytest.mark.parametrize(
+    ("branch", "options"),
+    [
+        ("stop", {}),
+        ("slower", {"slower_share": 0.5}),
+        ("crouch", {"crouch": {".*_thigh_joint": 1.3, ".*_calf_joint": -2.5}}),
+        ("policy", {"policy": "policy.yaml"}),
+    ],
+)
+def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, options):
+    scenario = load_scenario("go2_walking")
+    scenario.parameters.recovery = WalkingRecovery(branch=branch, **options)
+    loop = scenario.make_loop(recovery=True)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    probability = loop.GetInputPort("safety_probability")
+    probability.FixValue(context, [1.0])
+    loop.reset_standing(context, np.array([0.8, 0.0, 0.0]))
+    simulator.Initialize()
+    simulator.AdvanceTo(2.0)
+    assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 0.0
+    speed = loop.GetOutputPort("output").Eval(context)[0]
+    assert speed > 0.4
+    probability.FixValue(context, [0.0])
+    simulator.AdvanceTo(3.5)
+    assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 1.0
+    slower = loop.GetOutputPort("output").Eval(context)[0]
+    height = loop.GetOutputPort("plant_state").Eval(context)[6]
+    standing = loop.kinematics.standing_height
+    assert loop.GetOutputPort("margins").Eval(context)[loop.constraint_names.index("tilt")] > 0.4
+    if branch in ("stop", "crouch"):
+        assert abs(slower) < 0.15
+    if branch == "slower":
+        assert 0.1 < slower < 0.8 * speed
+    assert (height < 0.75 * standing) == (branch == "crouch")
+
+
+def test_what_a_diagram_lacks_is_named():
+    scenario = load_scenario("go2_walking")
+    with pytest.raises(ValueError, match="guard=True needs an assessment"):
+        scenario.make_loop(guard=True)
+    loop = scenario.make_loop()
+    with pytest.raises(ValueError, match="built without a guard"):
+        loop.set_guarded(loop.CreateDefaultContext(), True)
+    with pytest.raises(ValueError, match=r"branch must be one of \['stop', .*got 'jump'"):
+        WalkingRecovery(branch="jump")
+    with pytest.raises(ValueError, match="'policy' names the file of branch 'policy'"):
+        WalkingRecovery(branch="stop", policy="other.yaml")
