@@ -21,10 +21,11 @@ from studies.readings import READINGS_FILE
 from studies.readme import rewrite_readme
 from studies.shipping import ship as ship_assessments
 from studies.stored_results import store_results
+from studies.walking import WALKING_FILE
 
 _DOCUMENTS = [
     Path("README.md"),
-    *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts")),
+    *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts", "walking")),
 ]
 
 
@@ -98,7 +99,7 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
             estimates=results.estimates | drawn.estimates,
             entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
         )
-    for name in (READINGS_FILE, CONVERGED_FILE, SHIFTS_FILE):
+    for name in (READINGS_FILE, CONVERGED_FILE, SHIFTS_FILE, WALKING_FILE):
         if (folder / name).is_file():
             studied = read_evaluation(folder / name)
             key = Path(name).stem

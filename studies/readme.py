@@ -26,15 +26,16 @@ from drake_safety.evaluation.report.verdicts import (
 )
 from studies.shift_table import shifts_text
 from studies.stored_results import read_results
+from studies.walking_table import walking_text
 
 RESULTS_FOLDER = Path("docs/results")
 _BLOCK = re.compile(
-    r"(?P<start><!-- (?P<kind>results|summary|readings|converged|shifts): "
+    r"(?P<start><!-- (?P<kind>results|summary|readings|converged|shifts|walking): "
     r"(?P<name>[\w-]+) -->\n).*?"
     r"(?P<end><!-- end -->)",
     re.DOTALL,
 )
-_OPEN = re.compile(r"<!-- (?:results|summary|readings|converged|shifts): ([\w-]+) -->")
+_OPEN = re.compile(r"<!-- (?:results|summary|readings|converged|shifts|walking): ([\w-]+) -->")
 _PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
 _SHARE = Column(key="", title="", meaning="")
 _PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
@@ -200,6 +201,7 @@ def converged_text(results: Results) -> str:
         "literal": "Γ < 0.6, before adaptation",
         "converged": "Γ < 0.6, after adaptation",
         "shifts": shifts_text,
+        "walking": walking_text,
         "normalized": "b_safe / (1 − μ), balanced threshold",
         "conformal": "b_safe / (1 − μ), promised miss rate 1 %",
     }
@@ -254,6 +256,7 @@ _MAKE = {
     "readings": readings_text,
     "converged": converged_text,
     "shifts": shifts_text,
+    "walking": walking_text,
 }
 """Text of each kind of block."""
 

@@ -40,6 +40,7 @@ from studies.walking_alarms import (
 )
 from studies.walking_motions import WalkedMotion, run_motions
 
+WALKING_FILE = "walking.json"
 TOUR_S, _PUSHED_S, _COMMANDED_S, _SPEED_S = 60.0, 5.0, 4.0, 12.0
 _SEEDS = {"calibration": 6_000_000, "tour": 6_000_001, "push": 6_000_002, "command": 6_000_003}
 
@@ -160,7 +161,7 @@ def walking(
         "thresholds": thresholds,
         **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
-    file = assessment / "walking.json"
+    file = assessment / WALKING_FILE
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     table = new_table("figure", "value", "n")
