@@ -7,6 +7,7 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.report.results import Results
 
 _NAMES = {
+    "sharpened": "Γ, `sharpened`",
     "tilt": "tilt",
     "capture_point_margin": "capture point",
     "tracking_error": "tracking error",

@@ -1,0 +1,129 @@
+"""Figures of the study of walking, from motions made by hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_safety import load_scenario
+from drake_safety.evaluation.alarms import Alarm
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.report.results import Results
+from studies.walking_alarms import (
+    alarm_estimates,
+    alarm_thresholds,
+    guard_estimates,
+    recovery_estimates,
+    speed_estimates,
+    tour_estimates,
+)
+from studies.walking_motions import WalkedMotion, random_command, run_motions
+from studies.walking_table import walking_text
+
+ALARM = Alarm(name="value", value=lambda motion: motion.features[:, 0])
+
+
+def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
+    n = len(values)
+    return WalkedMotion(
+        index=0,
+        push_time_s=push_s,
+        leave_time_s=leave_s,
+        fall_time_s=fall_s,
+        time_s=0.1 * np.arange(n),
+        state=np.zeros((n, 1)),
+        desired_preview=np.zeros((n, 3)),
+        features=np.array(values, dtype=float)[:, None],
+        margins=np.ones((n, 1)),
+        output=np.tile([0.5, 0.0, 0.1], (n, 1)),
+        desired_output=np.zeros((n, 3)),
+        is_changed=np.full(n, changed),
+        impact_m_s=impact,
+    )
+
+
+def test_thresholds_lie_below_the_lowest_values_of_calm_tours_by_half_their_spread():
+    calm = [motion([1.0, value, value, 1.0]) for value in (0.6, 0.8, 0.9)]
+    fallen = motion([0.0, 0.0], leave_s=0.1)
+    assert alarm_thresholds([ALARM], [*calm, fallen])["value"] == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="every calibration tour"):
+        alarm_thresholds([ALARM], [fallen])
+
+
+def test_a_fall_is_announced_by_two_rows_below_the_threshold_between_push_and_fall():
+    in_time = motion([1, 1, 1, 0, 0, 0, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
+    late = motion([1, 1, 1, 1, 1, 0, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
+    never = motion([0, 1, 1, 1, 1, 1, 0, 1], push_s=0.2, leave_s=0.6, fall_s=0.7)
+    false = motion([1, 0, 0, 1, 1, 1], push_s=0.1)
+    before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
+    found = alarm_estimates(
+        [ALARM], {"value": 0.5}, [in_time, late, never, false, motion([1] * 6), before_push]
+    )
+    assert found["pushes.fallen"].value == pytest.approx(3 / 5)
+    assert found["pushes.push_to_fall_s"].value == pytest.approx(0.5)
+    assert found["alarm.value.announced"].value == pytest.approx(1 / 3)
+    assert found["alarm.value.lead_s"].value == pytest.approx(0.1)
+    assert found["alarm.value.alarms_without_leaving"].value == pytest.approx(1 / 2)
+
+
+def test_false_alarms_are_counted_once_each_on_tours_that_stay_safe():
+    twice = motion([1, 0, 0, 0, 1, 0, 0])
+    fallen = motion([0, 0, 0], leave_s=0.2, fall_s=0.2)
+    found = tour_estimates([ALARM], {"value": 0.5}, [twice, fallen])
+    assert found["tours.without_fall"].value == 0.5
+    assert found["tours.hours"].value == pytest.approx(0.6 / 3600)
+    assert found["tours.value.false_alarms_per_hour"].value == pytest.approx(2 * 3600 / 0.6)
+
+
+def test_guard_recovery_and_speeds_compare_the_same_motions():
+    falls, stays = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=3.0), motion([1, 1])
+    softer = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=2.0)
+    guard = guard_estimates([falls, falls, stays], [stays, falls, stays], [motion([1], changed=1)])
+    assert guard["guard.fewer_falls"].value == 0.5
+    assert guard["guard.unchanged_inside"].value == 0.0
+    saved = recovery_estimates("crouch", [falls, falls], [stays, softer])
+    assert saved["recovery.crouch.saved"].value == 0.5
+    assert saved["recovery.crouch.impact_m_s"].value == 2.0
+    assert saved["recovery.crouch.impact_without_m_s"].value == 3.0
+    assert speed_estimates([stays], [stays])["speed.difference_to_mujoco_m_s"].value == 0.0
+
+
+def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: Path):
+    scenario = load_scenario("go2_walking")
+    loop = scenario.make_loop()
+    limits, rng = loop.policy.parameters.command, np.random.default_rng(0)
+    for _ in range(30):
+        inside = random_command(loop, rng, is_inside=True)
+        assert np.all(inside >= limits.lowest) and np.all(inside <= limits.highest)
+        past = random_command(loop, rng, is_inside=False)
+        assert np.any(past < limits.lowest) or np.any(past > limits.highest)
+    options = {"seed": 3, "duration_s": 0.4, "folder": tmp_path}
+    (first,) = run_motions(scenario, "tour", [0], **options)
+    assert first.time_s[-1] == pytest.approx(0.4)
+    written = (tmp_path / "00000.npz").stat().st_mtime_ns
+    again = run_motions(scenario, "tour", [0, 1], **options)
+    assert (tmp_path / "00000.npz").stat().st_mtime_ns == written
+    np.testing.assert_array_equal(again[0].state, first.state)
+    (tmp_path / "00001.npz").write_bytes(b"no motion")
+    with pytest.raises(ValueError, match=r"00001\.npz holds no motion"):
+        run_motions(scenario, "tour", [1], **options)
+
+
+def test_the_table_has_a_row_for_every_alarm_and_branch():
+    estimate = Estimate(0.5, 0.4, 0.6, 10)
+    keys = ["tours.without_fall", "tours.hours", "pushes.fallen", "pushes.push_to_fall_s"]
+    for alarm in ("sharpened", "tilt"):
+        keys += [f"alarm.{alarm}.{x}" for x in ("announced", "lead_s", "alarms_without_leaving")]
+        keys.append(f"tours.{alarm}.false_alarms_per_hour")
+    for branch in ("stop", "crouch"):
+        keys += [f"recovery.{branch}.{x}" for x in ("saved", "impact_m_s", "impact_without_m_s")]
+    results = Results(
+        estimates=dict.fromkeys(keys, estimate),
+        entries={"walking": {"command": "run me", "thresholds": {"sharpened": 1, "tilt": 2}}},
+    )
+    text = walking_text(results)
+    assert text.startswith("```sh\nrun me\n```")
+    assert text.count("50.0 % (40.0–60.0)") == 8
+    for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| crouch |"):
+        assert row in text
