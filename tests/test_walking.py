@@ -16,7 +16,7 @@ from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.rollouts import episode_rng
 
-NAMES = ["g1_walking", "go2_walking"]
+NAMES = ["g1_walking", "go2_walking", "t1_walking"]
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -39,7 +39,7 @@ def walk(loop, command, duration_s):
 
 
 def test_the_robot_walks_where_it_is_told_without_leaving_its_safe_set(loop):
-    velocities, margins = walk(loop, [0.5, 0.0, 0.0], 5.0)
+    velocities, margins = walk(loop, [0.5, 0.0, 0.0], 10.0)
     assert margins.min() > 0
     mean = velocities[15:].mean(axis=0)
     assert mean[0] == pytest.approx(0.5, abs=0.15)

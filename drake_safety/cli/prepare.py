@@ -21,8 +21,8 @@ def scenarios() -> None:
         try:
             scenario = load_scenario(name)
             scenario.task_class().model_files(scenario)
-        except MissingExtraError:
-            table.add_row(name, *4 * ["–"], "drake_safety[robots]")
+        except MissingExtraError as error:
+            table.add_row(name, *4 * ["–"], error.needs)
             continue
         horizon_s = scenario.assessment.horizon * scenario.preview_step_s
         table.add_row(

@@ -15,7 +15,7 @@ from drake_safety.control.kinematics import (
 )
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
-from drake_safety.robots.model_files import MissingExtraError, is_installed, model_file
+from drake_safety.robots.model_files import required_file
 from drake_safety.robots.robot_model import JointGains, by_pattern, load_typed_file
 
 _DOWN = np.array([0.0, 0.0, -1.0])
@@ -393,12 +393,7 @@ def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
     """
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
-    if parameters.requires and not is_installed(parameters.network):
-        raise MissingExtraError(
-            f"'{parameters.network}': the package of this policy is not installed: "
-            f"pip install --no-deps {parameters.requires}"
-        )
-    return model_file(parameters.network, folder)
+    return required_file(parameters.network, folder, parameters.requires)
 
 
 def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:

@@ -17,7 +17,16 @@ _EXTRAS = {"example-robot-data": "robots"}
 
 
 class MissingExtraError(ValueError):
-    """A model needs a package that an extra installs."""
+    """A file needs a package that is not installed.
+
+    Args:
+        message: The message.
+        needs: What pip is to install.
+    """
+
+    def __init__(self, message: str, needs: str = "drake_safety[robots]"):
+        super().__init__(message)
+        self.needs = needs
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
@@ -86,7 +95,8 @@ def model_file(url: str, folder: str = "") -> Path:
     if parts.netloc in _EXTRAS:
         raise MissingExtraError(
             f"'{url}': the package '{parts.netloc}' is not installed: "
-            f"pip install 'drake_safety[{_EXTRAS[parts.netloc]}]'"
+            f"pip install 'drake_safety[{_EXTRAS[parts.netloc]}]'",
+            f"drake_safety[{_EXTRAS[parts.netloc]}]",
         )
     raise ValueError(f"'{url}': no package '{parts.netloc}'; use a path instead")
 
@@ -101,3 +111,23 @@ def is_installed(url: str) -> bool:
     package_map = PackageMap()
     add_to_package_map(package_map, url)
     return parts.scheme != "package" or package_map.Contains(parts.netloc)
+
+
+def required_file(url: str, folder: str, requires: str) -> Path:
+    """Returns the file of :func:`model_file`, or says which package to install.
+
+    Args:
+        url: The ``package://…`` URL, or a path relative to ``folder``.
+        folder: The folder.
+        requires: Requirement by which pip installs the package without its dependencies; empty for
+            packages of an extra.
+
+    Raises:
+        MissingExtraError: The package is not installed.
+        ValueError: The package is unknown.
+    """
+    if requires and not is_installed(url):
+        raise MissingExtraError(
+            f"'{url}': its package is not installed: pip install --no-deps {requires}", requires
+        )
+    return model_file(url, folder)

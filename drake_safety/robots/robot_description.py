@@ -27,6 +27,7 @@ from drake_safety.robots.model_files import (
     is_installed,
     model_file,
     package_parser,
+    required_file,
 )
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
@@ -50,7 +51,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             be converted.
     """
     parser = package_parser(plant, robot.urdf)
-    path = model_file(robot.urdf, robot.source_dir)
+    path = required_file(robot.urdf, robot.source_dir, robot.requires)
     urdf = None
     if path.suffix == ".urdf":
         urdf = read_urdf(path)

@@ -158,6 +158,9 @@ class RobotModel:
     urdf: str = ""
     """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file; any
     format that Drake's Parser reads."""
+    requires: str = ""
+    """Requirement by which pip installs the package of ``urdf`` without its dependencies, if no
+    extra does."""
     visuals: str = ""
     """``package://…`` of a URDF whose visuals replace those of links with the same names, if its
     package is installed. Its frames must equal those of ``urdf``, itself a URDF. Simulations do not
