@@ -14,7 +14,8 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import Policy, PolicyParameters, load_policy, network_file
+from drake_safety.control.policy import Policy
+from drake_safety.control.policy_files import load_policy, read_policy_file
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -22,7 +23,7 @@ from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed_file
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -281,9 +282,8 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
         """The robot's files and those of the policy."""
-        path = policy_file(scenario)
-        policy = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
-        return [*super().model_files(scenario), path, network_file(policy, str(path.parent))]
+        policy = read_policy_file(policy_file(scenario))
+        return [*super().model_files(scenario), *policy.files, policy.network]
 
     @property
     def target_box(self) -> np.ndarray:

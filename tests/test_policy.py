@@ -1,12 +1,10 @@
 """Policies as data: observation, action, gait clock, and networks that do not fit."""
 
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.policy import (
@@ -15,34 +13,21 @@ from drake_safety.control.policy import (
     ObservationTerm,
     Policy,
     PolicyParameters,
+    WholeHistory,
     network_file,
     observation_term,
 )
 from drake_safety.control.policy_network import _read_metadata, load_network
 from drake_safety.robots.model_files import MissingExtraError
 from drake_safety.robots.robot_model import JointGains
+from policy_networks import save_network
 
 JOINTS = ["hip", "knee", "tail"]  # The robot's; the policy moves two, in another order.
 TERMS = ["base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
 
 
-class Linear(torch.nn.Module):
-    def __init__(self, num_inputs, num_outputs):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.arange(num_inputs * num_outputs) * 0.01)
-        self.num_outputs: int = num_outputs
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x @ self.weight.reshape(-1, self.num_outputs)
-
-
 def saved(tmp_path, num_inputs=13, num_outputs=2):
-    path = tmp_path / f"net_{num_inputs}_{num_outputs}.pt"
-    with warnings.catch_warnings():
-        # Torch deprecates the format, in which policies are nevertheless published.
-        warnings.simplefilter("ignore")
-        torch.jit.script(Linear(num_inputs, num_outputs)).save(str(path))
-    return path
+    return save_network(tmp_path / f"net_{num_inputs}_{num_outputs}.pt", num_inputs, num_outputs)
 
 
 def parameters(tmp_path, **changed):
@@ -108,6 +93,47 @@ def test_history_is_oldest_first_and_begins_with_what_is_seen_first(tmp_path):
     np.testing.assert_allclose(history, [3, 4, 3, 4, 3, 4])
     seen.action = np.array([5.0, 6.0])
     np.testing.assert_allclose(made.observe(seen, history), [3, 4, 3, 4, 5, 6])
+
+
+@pytest.mark.parametrize(
+    ("history", "first", "second"),
+    [
+        ({"ages": [2, 1, 0]}, [3, 0, 0, -1] * 3, [3, 0, 0, -1] * 2 + [5, 0, 0, -1]),
+        ({"ages": [0, 1, 2]}, [3, 0, 0, -1] * 3, [5, 0, 0, -1] + [3, 0, 0, -1] * 2),
+        (
+            {"ages": [0, 1, 2], "by": "term"},
+            [3] * 3 + [0, 0, -1] * 3,
+            [5, 3, 3] + [0, 0, -1] * 3,
+        ),
+    ],
+)
+def test_a_history_of_the_whole_observation_is_laid_out_as_stated(tmp_path, history, first, second):
+    terms = [ObservationTerm(name=name) for name in ("last_action", "projected_gravity")]
+    made = policy(
+        tmp_path,
+        joints=["knee"],
+        network=str(saved(tmp_path, 12, 1)),
+        observation=terms,
+        history=WholeHistory(**history),
+    )
+    seen = see(made)
+    seen.action = np.array([3.0])
+    last = made.observe(seen, np.full(12, np.nan))
+    np.testing.assert_allclose(last, first)
+    seen.action = np.array([5.0])
+    np.testing.assert_allclose(made.observe(seen, last), second)
+
+
+def test_histories_that_cannot_be_kept_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"newest 2 samples once, from 0; got \[0, 2\]"):
+        WholeHistory(ages=[0, 2])
+    with pytest.raises(ValueError, match="must be 'time' or 'term'; got 'joint'"):
+        WholeHistory(by="joint")
+    with pytest.raises(ValueError, match=r"got both, \['last_action'\]"):
+        PolicyParameters(
+            history=WholeHistory(ages=[0, 1]),
+            observation=[ObservationTerm(name="last_action", history=2)],
+        )
 
 
 def test_the_gait_clock_runs_once_a_period_and_rests_while_standing(tmp_path):

@@ -1,24 +1,37 @@
 """Locomotion policies as data: observation terms, actions, gait clock and command limits."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    NUM_BASE_VELOCITIES,
-    RobotKinematics,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
+from drake_safety.control.policy_terms import (
+    TERMS,
+    PolicyInput,
+    Term,
+    observation_term,
+    registered_terms,
+)
 from drake_safety.robots.model_files import required_file
-from drake_safety.robots.robot_model import JointGains, by_pattern, load_typed_file
+from drake_safety.robots.robot_model import JointGains, by_pattern
 
-_DOWN = np.array([0.0, 0.0, -1.0])
+__all__ = [
+    "CommandLimits",
+    "GaitClock",
+    "ObservationTerm",
+    "Policy",
+    "PolicyInput",
+    "PolicyParameters",
+    "WholeHistory",
+    "network_file",
+    "observation_term",
+    "registered_terms",
+]
 
 
 @dataclass(kw_only=True)
@@ -76,9 +89,35 @@ class CommandLimits:
 
 
 @dataclass(kw_only=True)
+class WholeHistory:
+    """Samples of the whole observation in the network's input."""
+
+    ages: list[int] = field(default_factory=list)
+    """Age of each sample in periods, 0 for the newest, in the network's order; empty for policies
+    whose terms have histories of their own, or none."""
+    by: str = "time"
+    """``time``: one sample of all terms after the other; ``term``: all samples of a term together.
+    """
+
+    def __post_init__(self) -> None:
+        if sorted(self.ages) != list(range(len(self.ages))):
+            raise ValueError(
+                f"history: ages must name each of the newest {len(self.ages)} samples once, from "
+                f"0; got {self.ages}"
+            )
+        if self.by not in ("time", "term"):
+            raise ValueError(f"history: by must be 'time' or 'term'; got '{self.by}'")
+
+
+@dataclass(kw_only=True)
 class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
+    read: str = ""
+    """``deploy.yaml`` of unitree_rl_lab or ``config.yaml`` of rl_sar that has what is not stated:
+    ``package://…`` or a path relative to the YAML file."""
+    motors: list[str] = field(default_factory=list)
+    """Joints in the order of the robot's motors, for files that number them."""
     network: str = ""
     """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
     requires: str = ""
@@ -101,6 +140,7 @@ class PolicyParameters:
     """Time between two actions [s]."""
     observation: list[ObservationTerm] = field(default_factory=list)
     """Terms in the network's order."""
+    history: WholeHistory = field(default_factory=WholeHistory)
     gait: GaitClock = field(default_factory=GaitClock)
     command: CommandLimits = field(default_factory=CommandLimits)
 
@@ -109,67 +149,9 @@ class PolicyParameters:
             raise ValueError(f"policy: period_s must be finite and positive; got {self.period_s}")
         if not self.action_clip > 0:
             raise ValueError(f"policy: action_clip must be positive; got {self.action_clip}")
-
-
-@dataclass(kw_only=True, eq=False)
-class PolicyInput:
-    """What observation terms are functions of.
-
-    Attributes:
-        R_WB: Orientation of the base, (3, 3).
-        w_WB: Angular velocity of the base in the world, (3,) [rad/s].
-        v_WB: Velocity of the base in the world, (3,) [m/s].
-        positions: Joint positions less those of zero action, in the policy's order, (n_a,) [rad].
-        rates: Joint rates, (n_a,) [rad/s].
-        command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
-        action: The last action, (n_a,).
-        phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
-    """
-
-    R_WB: np.ndarray
-    w_WB: np.ndarray
-    v_WB: np.ndarray
-    positions: np.ndarray
-    rates: np.ndarray
-    command: np.ndarray
-    action: np.ndarray
-    phases: np.ndarray
-
-
-Term = Callable[[PolicyInput], np.ndarray]
-_TERMS: dict[str, Term] = {}
-
-
-def observation_term(name: str) -> Callable[[Term], Term]:
-    """Registers a function of a :class:`PolicyInput` as an observation term.
-
-    Args:
-        name: The term's name in ``policy.yaml``.
-
-    Raises:
-        ValueError: Another function has this name.
-    """
-
-    def register(term: Term) -> Term:
-        if _TERMS.setdefault(name, term) is not term:
-            raise ValueError(f"observation term '{name}' is already registered")
-        return term
-
-    return register
-
-
-# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
-observation_term("base_lin_vel")(lambda seen: seen.R_WB.T @ seen.v_WB)
-observation_term("base_ang_vel")(lambda seen: seen.R_WB.T @ seen.w_WB)
-observation_term("projected_gravity")(lambda seen: seen.R_WB.T @ _DOWN)
-observation_term("velocity_commands")(lambda seen: seen.command)
-observation_term("command_lin_vel")(lambda seen: seen.command[:2])
-observation_term("command_ang_vel")(lambda seen: seen.command[2:])
-observation_term("joint_pos_rel")(lambda seen: seen.positions)
-observation_term("joint_vel_rel")(lambda seen: seen.rates)
-observation_term("last_action")(lambda seen: seen.action)
-observation_term("sin_phase")(lambda seen: np.sin(seen.phases))
-observation_term("cos_phase")(lambda seen: np.cos(seen.phases))
+        own = [term.name for term in self.observation if term.history > 1]
+        if self.history.ages and own:
+            raise ValueError(f"policy: either history or terms with their own; got both, {own}")
 
 
 class Policy:
@@ -239,9 +221,12 @@ class Policy:
                 raise ValueError(
                     f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
                 )
-        self.sizes = [
-            width * spec.history for width, (_, spec) in zip(widths, self._terms, strict=True)
-        ]
+        ages = parameters.history.ages
+        samples = [list(range(spec.history))[::-1] for _, spec in self._terms]
+        if ages:
+            samples = [ages] * len(widths)
+        self.sizes = [w * len(one) for w, one in zip(widths, samples, strict=True)]
+        self._lay_out(widths, samples, by_time=bool(ages) and parameters.history.by == "time")
         self.network.check(who, sum(self.sizes), len(names), self._described(widths))
 
     def _value(
@@ -276,19 +261,37 @@ class Policy:
         return found
 
     def _registered(self, who: str) -> list[tuple[Term, ObservationTerm]]:
-        unknown = [one.name for one in self.parameters.observation if one.name not in _TERMS]
+        unknown = [one.name for one in self.parameters.observation if one.name not in TERMS]
         if unknown or not self.parameters.observation:
             raise ValueError(
                 f"{who}: observation must list terms; got unknown ones {unknown}; registered are "
-                f"{sorted(_TERMS)}"
+                f"{registered_terms()}"
             )
-        return [(_TERMS[one.name], one) for one in self.parameters.observation]
+        return [(TERMS[one.name], one) for one in self.parameters.observation]
 
     def _described(self, widths: list[int]) -> str:
         return ", ".join(
-            f"{spec.name} {width}" + (f" x {spec.history}" if spec.history > 1 else "")
-            for width, (_, spec) in zip(widths, self._terms, strict=True)
+            f"{spec.name} {width}" + (f" x {size // width}" if size > width else "")
+            for width, size, (_, spec) in zip(widths, self.sizes, self._terms, strict=True)
         )
+
+    def _lay_out(self, widths: list[int], samples: list[list[int]], *, by_time: bool) -> None:
+        """Sets, for each entry of the network's input, where it comes from.
+
+        ``_entries`` is the entry of the present observation, ``_earlier`` that of the last input
+        which is one period younger; -1 for the newest samples.
+        """
+        firsts = np.concatenate([[0], np.cumsum(widths[:-1])]).astype(int)
+        terms = range(len(widths))
+        blocks = [(term, age) for term in terms for age in samples[term]]
+        if by_time:
+            blocks = [(term, age) for age in samples[0] for term in terms]
+        places: dict[tuple[int, int], int] = {}
+        for term, age in blocks:
+            for i in range(firsts[term], firsts[term] + widths[term]):
+                places[i, age] = len(places)
+        self._entries = np.array([entry for entry, _ in places], dtype=int)
+        self._earlier = np.array([places.get((i, age - 1), -1) for i, age in places], dtype=int)
 
     def _still(self) -> PolicyInput:
         n = len(self.joint_names)
@@ -334,23 +337,23 @@ class Policy:
         )
 
     def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
-        """Returns the network's input, in which every term's newest sample is the last.
+        """Returns the network's input.
 
         Args:
             seen: The present input.
             history: The last input of the network, (n_o,); NaN before the first.
         """
-        parts, first = [], 0
-        for (term, spec), size in zip(self._terms, self.sizes, strict=True):
-            value = np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)
-            if spec.history > 1:
-                earlier = history[first + len(value) : first + size]
-                if not np.isfinite(earlier).all():
-                    earlier = np.tile(value, spec.history - 1)
-                value = np.concatenate([earlier, value])
-            parts.append(value)
-            first += size
-        return np.concatenate(parts)
+        present = np.concatenate(
+            [
+                np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)
+                for term, spec in self._terms
+            ]
+        )
+        observation = present[self._entries]
+        if np.isfinite(history).all():
+            aged = self._earlier >= 0
+            observation[aged] = history[self._earlier[aged]]
+        return observation
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns the action (n_a,) for a network's input (n_o,)."""
@@ -394,25 +397,6 @@ def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
     return required_file(parameters.network, folder, parameters.requires)
-
-
-def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
-    """Loads a ``policy.yaml`` for a robot.
-
-    Args:
-        path: The file.
-        kinematics: The robot.
-
-    Raises:
-        ValueError: The file does not fit the schema, the robot or the network.
-    """
-    parameters = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
-    return Policy(
-        parameters,
-        kinematics.joint_names,
-        robot=kinematics.robot.name,
-        folder=str(Path(path).parent),
-    )
 
 
 def _wrapped(phases: np.ndarray) -> np.ndarray:

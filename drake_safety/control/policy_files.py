@@ -1,0 +1,168 @@
+"""Reads ``policy.yaml``, and the files of other projects that it names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drake_safety.control.isaac_lab_policy import from_isaac_lab, is_isaac_lab
+from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.policy import Policy, PolicyParameters, network_file
+from drake_safety.control.policy_network import load_network
+from drake_safety.control.rl_sar_policy import from_rl_sar, is_rl_sar
+from drake_safety.robots.model_files import required_file
+from drake_safety.robots.reading import parse_yaml, reading
+from drake_safety.robots.robot_model import load_typed
+
+_MERGED = ("gait", "command")
+"""Keys of which single entries may be stated."""
+
+
+@dataclass(kw_only=True)
+class PolicyFile:
+    """A policy file with what it reads.
+
+    Attributes:
+        parameters: Contents of ``policy.yaml``, with values of the files that it reads.
+        files: The files that determine the policy, without the network.
+        folder: Folder of the policy file.
+    """
+
+    parameters: PolicyParameters
+    files: list[Path]
+    folder: str
+
+    @property
+    def network(self) -> Path:
+        """The network's file; see :func:`network_file` for errors."""
+        return network_file(self.parameters, self.folder)
+
+
+def read_policy_file(path: Path, joint_names: list[str] | None = None) -> PolicyFile:
+    """Reads a ``policy.yaml``, a ``deploy.yaml`` of unitree_rl_lab or a ``config.yaml`` of rl_sar.
+
+    A ``policy.yaml`` may name one of the others by ``read``; what it states itself wins.
+
+    Args:
+        path: The file.
+        joint_names: Joints of the robot, for messages.
+
+    Raises:
+        MissingExtraError: A package that has a file is not installed.
+        ValueError: A file does not exist, is not YAML, does not fit the schema or its form, or does
+            not say which joints the network moves.
+    """
+    path = Path(path)
+    raw = _parsed(path, f"policy file '{path}'")
+    files, folder, who = [path], str(path.parent), f"policy file '{path}'"
+    source = path if is_isaac_lab(raw) or is_rl_sar(raw) else None
+    stated: Any = {} if source else raw
+    if isinstance(stated, dict) and stated.get("read"):
+        source = required_file(str(stated["read"]), folder, str(stated.get("requires", "")))
+        files.append(source)
+    if source is not None:
+        # Unknown keys and values of wrong types are told before anything is read.
+        own = load_typed(PolicyParameters, stated, who)
+        with reading(source):
+            found, more = _found(source, set(stated) - set(_MERGED), own.motors)
+            files += more
+            stated = _merged(stated, found, source, folder, joint_names)
+    return PolicyFile(
+        parameters=load_typed(PolicyParameters, stated, who), files=files, folder=folder
+    )
+
+
+def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
+    """Loads a policy for a robot.
+
+    Args:
+        path: A file for :func:`read_policy_file`.
+        kinematics: The robot.
+
+    Raises:
+        ValueError: The file does not fit the schema, the robot or the network.
+    """
+    found = read_policy_file(path, kinematics.joint_names)
+    return Policy(
+        found.parameters,
+        kinematics.joint_names,
+        robot=kinematics.robot.name,
+        folder=found.folder,
+    )
+
+
+def _parsed(path: Path, who: str) -> Any:
+    if not path.is_file():
+        raise ValueError(f"{who} does not exist")
+    with reading(path):
+        return parse_yaml(path.read_text(encoding="utf-8"), who)
+
+
+def _found(path: Path, stated: set[str], motors: list[str]) -> tuple[dict[str, Any], list[Path]]:
+    """What the file of another project says, and the further files that were read."""
+    raw = _parsed(path, f"'{path}', which the policy reads,")
+    if is_isaac_lab(raw):
+        return from_isaac_lab(raw, path, stated, motors), []
+    if is_rl_sar(raw):
+        base = path.parent.parent / "base.yaml"
+        if not base.is_file():
+            return from_rl_sar(raw, path, stated), []
+        return from_rl_sar(raw, path, stated, _parsed(base, f"'{base}'")), [base]
+    keys = list(raw) if isinstance(raw, dict) else raw
+    raise ValueError(
+        f"'{path}' is neither a deploy.yaml of unitree_rl_lab (joint_ids_map, observations, ...) "
+        f"nor a config.yaml of rl_sar (rl_kp, num_observations, ...); its keys are {keys}"
+    )
+
+
+def _merged(
+    stated: dict[str, Any],
+    found: dict[str, Any],
+    source: Path,
+    folder: str,
+    joint_names: list[str] | None,
+) -> dict[str, Any]:
+    """The keys of ``policy.yaml``: as stated, else as found."""
+    found = dict(found)
+    count = found.pop("num_joints")
+    network = stated.get("network") or found.get("network", "")
+    names = stated.get("joints") or found.pop("joints", [])
+    if not names:
+        of_network = PolicyParameters(network=network, requires=stated.get("requires", ""))
+        names = load_network(network_file(of_network, folder)).metadata.joints
+    if not names:
+        exists = f"; the robot has {joint_names}" if joint_names else ""
+        raise ValueError(
+            f"'{source}' does not name its joints, nor does the network. State in policy.yaml "
+            "'motors', the joints in the order of the robot's motors, or 'joints', those in the "
+            f"network's order{exists}"
+        )
+    if len(names) != count:
+        raise ValueError(f"'{source}' has {count} joints; got {len(names)} names: {names}")
+    keys = [re.escape(name) for name in names]
+    values: dict[str, Any] = {"joints": list(names)}
+    for key, value in found.items():
+        if key in ("default_positions", "action_scale"):
+            value = dict(zip(keys, value, strict=True))
+        elif key in _MERGED:
+            value = {**value, **(stated.get(key) or {})}
+        if key not in ("stiffness", "damping"):
+            values[key] = value
+    if "stiffness" in found:
+        values["gains"] = {
+            key: {"stiffness": stiffness, "damping": damping}
+            for key, stiffness, damping in zip(
+                keys, found["stiffness"], found["damping"], strict=True
+            )
+        }
+    merged = {**values, **{key: value for key, value in stated.items() if key not in _MERGED}}
+    merged |= {key: stated[key] for key in _MERGED if key in stated and key not in values}
+    uses_clock = any(term.get("name") == "gait_phase" for term in merged.get("observation", ()))
+    if uses_clock and not (merged.get("gait") or {}).get("period_s"):
+        raise ValueError(
+            f"'{source}' has a gait clock without a period; state it in policy.yaml: "
+            "gait: {period_s: ...} [s]"
+        )
+    return merged
