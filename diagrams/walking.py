@@ -1,6 +1,6 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,7 +15,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.policy import Policy
-from drake_safety.control.policy_files import load_policy, read_policy_file
+from drake_safety.control.policy_files import load_policy, missing_entries, read_policy_file
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -26,6 +26,7 @@ from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
+from drake_safety.simulation.contract import Finding, failed, passed
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
@@ -284,6 +285,23 @@ class Walking(LeggedLoop):
         """The robot's files and those of the policy."""
         policy = read_policy_file(policy_file(scenario))
         return [*super().model_files(scenario), *policy.files, policy.network]
+
+    @classmethod
+    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
+        """Findings about the policy: what its files lack, and how to mend it."""
+        path = policy_file(scenario)
+        try:
+            missing = list(missing_entries(path, kinematics.joint_names))
+            for what, remedy in missing:
+                yield failed("policy", what, remedy)
+            if not missing:
+                policy = load_policy(path, kinematics)
+                yield passed(
+                    "policy",
+                    f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
+                )
+        except ValueError as error:
+            yield failed("policy", str(error), f"correct it in {path.name}")
 
     @property
     def target_box(self) -> np.ndarray:

@@ -252,7 +252,9 @@ def test_new_refuses_what_it_cannot_write(tmp_path):
     urdf = tmp_path / "hexapod.urdf"
     with pytest.raises(ValueError, match="a robot's name is letters"):
         write_robot("my robot", urdf, "balancing", tmp_path / "a")
-    with pytest.raises(ValueError, match=r"task must be one of \['balancing', 'reaching'\]"):
+    with pytest.raises(
+        ValueError, match=r"task must be one of \['balancing', 'reaching', 'walking'\]"
+    ):
         write_robot("spider", urdf, "dancing", tmp_path / "a")
     with pytest.raises(ValueError, match="exists already"):
         write_robot("spider", urdf, "balancing", tmp_path)

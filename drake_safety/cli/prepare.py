@@ -39,7 +39,15 @@ def scenarios() -> None:
 def new(
     name: Annotated[str, typer.Argument(help="Name of the robot, and of its folder.")],
     urdf: Annotated[Path, typer.Option(help="Its URDF.", dir_okay=False)],
-    task: Annotated[str, typer.Option(help="'balancing' or 'reaching'.")] = "balancing",
+    task: Annotated[str, typer.Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            help="For 'walking': its network (.onnx, .pt), a deploy.yaml of unitree_rl_lab or a "
+            "config.yaml of rl_sar.",
+            dir_okay=False,
+        ),
+    ] = None,
     feet: Annotated[
         str | None,
         typer.Option(help="Links that touch the ground, with commas; the lowest by default."),
@@ -50,15 +58,31 @@ def new(
 
     Values that a URDF does not have are marked ASK in the files, with their units.
     """
+    from drake_safety.control.policy_template import survey_policy
     from drake_safety.robots.robot_template import write_robot
 
+    if (task == "walking") != (policy is not None):
+        raise ValueError(
+            f"new: --policy is that of --task walking, and of no other; got task '{task}' and "
+            f"policy {policy}"
+        )
+    # Before anything is written.
+    template = None if policy is None else survey_policy(policy)
+    moved: list[str] | None = []
+    if template is not None:
+        moved = template.joints or None
     written = write_robot(
         name,
         urdf,
         task,
         Path(name) if out is None else out,
         feet=None if feet is None else [link.strip() for link in feet.split(",")],
+        moved=moved,
     )
+    files, asked = written.files, written.asked
+    if template is not None:
+        more, unknown = template.write(written.folder, written.joints, written.posture)
+        files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
     sizes = written.sizes
     console.print(
         f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m "
@@ -66,11 +90,11 @@ def new(
         highlight=False,
         soft_wrap=True,
     )
-    for path in written.files:
+    for path in files:
         print_path("wrote", path)
     for what in written.left_out:
         console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
-    for what in written.asked:
+    for what in asked:
         console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     print_path("next: drake-safety check", written.files[-1])
 

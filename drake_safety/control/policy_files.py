@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from drake_safety.control.isaac_lab_policy import from_isaac_lab, is_isaac_lab
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.policy import Policy, PolicyParameters, network_file
+from drake_safety.control.policy import (
+    Policy,
+    PolicyParameters,
+    network_file,
+    registered_terms,
+)
 from drake_safety.control.policy_network import load_network
 from drake_safety.control.rl_sar_policy import from_rl_sar, is_rl_sar
 from drake_safety.robots.model_files import required_file
 from drake_safety.robots.reading import parse_yaml, reading
-from drake_safety.robots.robot_model import load_typed
+from drake_safety.robots.robot_model import by_pattern, load_typed
 
 _MERGED = ("gait", "command")
 """Keys of which single entries may be stated."""
@@ -66,7 +72,7 @@ def read_policy_file(path: Path, joint_names: list[str] | None = None) -> Policy
         # Unknown keys and values of wrong types are told before anything is read.
         own = load_typed(PolicyParameters, stated, who)
         with reading(source):
-            found, more = _found(source, set(stated) - set(_MERGED), own.motors)
+            found, more = read_foreign(source, set(stated) - set(_MERGED), own.motors)
             files += more
             stated = _merged(stated, found, source, folder, joint_names)
     return PolicyFile(
@@ -93,6 +99,57 @@ def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
     )
 
 
+def missing_entries(path: Path, joint_names: list[str]) -> Iterator[tuple[str, str]]:
+    """What a policy file lacks for a robot, each with its remedy.
+
+    Args:
+        path: A file for :func:`read_policy_file`.
+        joint_names: Joints of the robot.
+
+    Raises:
+        ValueError: A file that it needs is missing or wrong.
+    """
+    found = read_policy_file(path, joint_names)
+    parameters, network = found.parameters, load_network(found.network)
+    metadata = network.metadata
+    names = parameters.joints or metadata.joints
+    if not names:
+        yield (
+            "the network does not name its joints",
+            f"state 'joints' in its order in {path.name}; the robot has {joint_names}",
+        )
+    for key, of_network, what in (
+        ("action_scale", metadata.action_scale, "joint positions per unit of action [rad]"),
+        ("gains", metadata.stiffness, "stiffness and damping [N·m/rad, N·m·s/rad]"),
+    ):
+        patterns = getattr(parameters, key)
+        without = [
+            name
+            for name in names or joint_names
+            if by_pattern(patterns, name, key, "") is None
+            and not (of_network and name in metadata.joints)
+        ]
+        if without:
+            yield (
+                f"no {key} for joints {without}",
+                f"state '{key}' in {path.name} by regular expression: {what}",
+            )
+    if not parameters.default_positions and not metadata.default_positions:
+        yield (
+            "no default_positions",
+            f"state the joint positions at zero action [rad] in {path.name}; {{.*: 0.0}} if they "
+            "are zero",
+        )
+    if not parameters.observation:
+        width, _ = network.widths
+        expected = "" if width is None else f", {width} entries in all"
+        yield (
+            "no observation",
+            f"list the terms of the network's input under 'observation' in {path.name}, in its "
+            f"order{expected}; registered are {registered_terms()}",
+        )
+
+
 def _parsed(path: Path, who: str) -> Any:
     if not path.is_file():
         raise ValueError(f"{who} does not exist")
@@ -100,14 +157,31 @@ def _parsed(path: Path, who: str) -> Any:
         return parse_yaml(path.read_text(encoding="utf-8"), who)
 
 
-def _found(path: Path, stated: set[str], motors: list[str]) -> tuple[dict[str, Any], list[Path]]:
-    """What the file of another project says, and the further files that were read."""
+def read_foreign(
+    path: Path, stated: Collection[str] = (), motors: list[str] | None = None
+) -> tuple[dict[str, Any], list[Path]]:
+    """Reads a policy's file of another project.
+
+    Args:
+        path: A ``deploy.yaml`` of unitree_rl_lab or a ``config.yaml`` of rl_sar.
+        stated: Keys of ``policy.yaml`` whose values are not read here.
+        motors: Names of the robot's motors in their order.
+
+    Returns:
+        Values for the keys of ``policy.yaml``, as those of :func:`from_isaac_lab`, and the further
+        files that were read.
+
+    Raises:
+        ValueError: The file does not exist, is neither of both, or has entries of another form or
+            width, or ones that cannot be supported.
+    """
     raw = _parsed(path, f"'{path}', which the policy reads,")
     if is_isaac_lab(raw):
-        return from_isaac_lab(raw, path, stated, motors), []
+        return from_isaac_lab(raw, path, stated, motors or []), []
     if is_rl_sar(raw):
-        base = path.parent.parent / "base.yaml"
-        if not base.is_file():
+        bases = [folder / "base.yaml" for folder in (path.parent, path.parent.parent)]
+        base = next((one for one in bases if one.is_file()), None)
+        if base is None:
             return from_rl_sar(raw, path, stated), []
         return from_rl_sar(raw, path, stated, _parsed(base, f"'{base}'")), [base]
     keys = list(raw) if isinstance(raw, dict) else raw

@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 import tempfile
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,6 +35,8 @@ class NewRobot:
         asked: Values that the URDF lacks and the user must supply.
         left_out: Visuals of the URDF that the copy lacks, with the reasons.
         sizes: Sizes of the standing robot.
+        joints: Its joints, in the order of its positions.
+        posture: Its standing joint positions [rad].
     """
 
     folder: Path
@@ -41,6 +44,8 @@ class NewRobot:
     asked: list[str]
     left_out: list[str]
     sizes: Sizes
+    joints: list[str]
+    posture: dict[str, float]
 
 
 @dataclass(kw_only=True)
@@ -57,16 +62,24 @@ class _Findings:
 
 
 def write_robot(
-    name: str, urdf: Path, task: str, folder: Path, *, feet: list[str] | None = None
+    name: str,
+    urdf: Path,
+    task: str,
+    folder: Path,
+    *,
+    feet: list[str] | None = None,
+    moved: Collection[str] | None = (),
 ) -> NewRobot:
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
     Args:
         name: Name of the robot.
         urdf: Its URDF.
-        task: ``balancing`` or ``reaching``.
+        task: ``balancing``, ``reaching`` or ``walking``.
         folder: The folder, which must not exist yet.
         feet: Links that touch the ground; found by their height by default.
+        moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
+            nor a hand; None for all.
 
     Raises:
         ValueError: Invalid name, unknown task, existing folder, or a URDF without a legged robot.
@@ -78,7 +91,7 @@ def write_robot(
     if folder.exists():
         raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
     with tempfile.TemporaryDirectory() as scratch:
-        found = _survey(name, urdf, task, Path(scratch) / f"{name}.urdf", feet)
+        found = _survey(name, urdf, task, Path(scratch) / f"{name}.urdf", feet, moved)
         # Copied to the target only when complete.
         staged = Path(scratch) / "robot"
         staged.mkdir()
@@ -97,10 +110,19 @@ def write_robot(
         asked=found.asked,
         left_out=found.copy.left_out,
         sizes=found.sizes,
+        joints=[joint.name() for joint in found.survey.joints],
+        posture=found.posture,
     )
 
 
-def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | None) -> _Findings:
+def _survey(
+    name: str,
+    urdf: Path,
+    task: str,
+    scratch: Path,
+    feet: list[str] | None,
+    moved: Collection[str] | None,
+) -> _Findings:
     copy = simulatable_copy(urdf)
     copy.write(scratch)
     survey = Survey(scratch, copy.lost_shapes)
@@ -112,6 +134,7 @@ def _survey(name: str, urdf: Path, task: str, scratch: Path, feet: list[str] | N
             "with; use --task balancing"
         )
     used = {joint for limb in (*legs, *arms) for joint in survey.chain(limb.body)}
+    used |= {joint.name() for joint in survey.joints} if moved is None else set(moved)
     idle = [joint.name() for joint in survey.joints if joint.name() not in used]
     for limb in legs:
         if not limb.is_own_shape:

@@ -139,5 +139,26 @@ parameters:
 """
 
 
-TASKS: dict[str, Callable[[Sizes], str]] = {"balancing": _balancing, "reaching": _reaching}
+def _walking(sizes: Sizes) -> str:
+    h = sizes.height_m
+    return f"""# Walking: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high.
+task: drake_safety.diagrams.walking:Walking
+robot: robot.yaml
+episode_duration_s: 4.0
+step_s: 0.1
+control_period_s: 0.02
+{_variations(sizes, 1.0, 0.004, 0.016)}assessment: {{preview_stride: 1}}
+parameters:
+  policy: policy.yaml
+  safe_set:  # ASK the least heights of bodies that must not touch the ground [m]
+    clearance_m: {{{sizes.base}: {0.35 * h:.2g}}}
+  commands: {{reach: 3.0}}  # beyond the ranges of training, so that some episodes are unsafe
+"""
+
+
+TASKS: dict[str, Callable[[Sizes], str]] = {
+    "balancing": _balancing,
+    "reaching": _reaching,
+    "walking": _walking,
+}
 """Writers of scenarios by task."""

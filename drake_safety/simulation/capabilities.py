@@ -6,7 +6,7 @@ generator, and ``episode`` an episode of the loop.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
@@ -17,13 +17,25 @@ from drake_safety.learning.inputs import is_rate
 from drake_safety.simulation.planned_loop import PlannedLoop
 
 if TYPE_CHECKING:
+    from drake_safety.control.kinematics import RobotKinematics
     from drake_safety.learning.segments import Episode
     from drake_safety.plants.balls import Throw
     from drake_safety.plants.pushes import Push
     from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.contract import Finding
     from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
+    from drake_safety.simulation.scenario import Scenario
 
 _Capability = TypeVar("_Capability")
+
+
+@runtime_checkable
+class HasOwnFiles(Protocol):
+    """A task, the class itself, with files of its own that ``check`` checks before the diagram."""
+
+    @classmethod
+    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
+        """Findings about the task's own files, for a scenario and its robot."""
 
 
 @runtime_checkable

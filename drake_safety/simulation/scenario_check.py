@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Sphere
@@ -16,7 +17,7 @@ from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polyg
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
-from drake_safety.simulation.capabilities import HasBall
+from drake_safety.simulation.capabilities import HasBall, HasOwnFiles
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -74,6 +75,10 @@ def check_scenario(
         yield from _guarded("standing posture", lambda: _posture(kinematics))
         yield from _guarded("motors", lambda: _motors(kinematics))
     if not is_imported:
+        return
+    own = list(_guarded("files of the task", lambda: _own(state, scenario)))
+    yield from own
+    if not all(finding.is_ok for finding in own):
         return
     yield from _guarded("diagram", lambda: _diagram(state, scenario))
     if (loop := state.loop) is None:
@@ -192,6 +197,13 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
                 f"{-100 * distance:.1f} cm outside their polygon",
                 "change 'posture' so that the feet surround it, or 'contact_points'",
             )
+
+
+def _own(state: _State, scenario: Scenario) -> Iterator[Finding]:
+    task: Any = scenario.task_class()
+    kinematics = state.kinematics
+    if isinstance(task, HasOwnFiles) and kinematics is not None:
+        yield from task.check_files(scenario, kinematics)
 
 
 def _diagram(state: _State, scenario: Scenario) -> Iterator[Finding]:

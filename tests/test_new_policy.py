@@ -1,0 +1,142 @@
+"""`new --task walking`: from a URDF and a policy's files to a robot that can be checked."""
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drake_safety.cli import app
+from drake_safety.control.policy_network import PolicyMetadata, PolicyNetwork
+from drake_safety.control.policy_template import PolicyTemplate, survey_policy
+from drake_safety.simulation.scenario_check import check_scenario
+from legged_robots import write_hexapod
+from policy_networks import save_network
+
+SWINGS = [f"swing_{i}" for i in range(6)]
+LEGS = [name for i in range(6) for name in (f"swing_{i}", f"lift_{i}", f"knee_{i}")]
+POSTURE = [value for _ in range(6) for value in (0.0, -0.4, 1.6)]
+TERMS = ["projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
+
+
+def new(folder, policy, *more):
+    write_hexapod(folder)
+    urdf, out = folder / "hexapod.urdf", folder / "walker"
+    words = ["new", "walker", "--urdf", str(urdf), "--out", str(out), "--task", "walking"]
+    result = CliRunner().invoke(app, [*words, "--policy", str(policy), *more])
+    return out, result
+
+
+def problems(scenario):
+    return [f for f in check_scenario(scenario, num_episodes=0) if not f.is_ok]
+
+
+def uncommented(path, *starts):
+    """Removes the sign of comments before lines, and what follows the next one."""
+    lines = path.read_text().splitlines()
+    for i, line in enumerate(lines):
+        if line.startswith(tuple(f"# {start}" for start in starts)):
+            lines[i] = line[2:].partition("#")[0].rstrip()
+    path.write_text("\n".join(lines))
+
+
+def test_a_network_alone_leaves_what_it_cannot_tell_to_be_asked_for(tmp_path):
+    network = save_network(tmp_path / "walk.pt", 42, 18, scale=0.0)
+    out, result = new(tmp_path, network)
+    assert result.exit_code == 0, result.output
+    text = (out / "policy.yaml").read_text()
+    for key in ("joints", "default_positions", "action_scale", "gains", "observation"):
+        (line,) = [one for one in text.splitlines() if one.startswith(f"# {key}:")]
+        assert "# ASK" in line
+    assert (out / "walk.pt").read_bytes() == network.read_bytes()
+    scenario = out / "walking.yaml"
+    found = problems(scenario)
+    assert {finding.item for finding in found} == {"policy"}
+    messages = [finding.message for finding in found]
+    assert "the network does not name its joints" in messages
+    assert any("no action_scale for joints" in message for message in messages)
+    assert {"no observation", "no default_positions"} <= set(messages)
+    assert all("policy.yaml" in finding.remedy for finding in found)
+    # Done as it says, the check passes, to standing for a second and the contract.
+    uncommented(out / "policy.yaml", "joints:", "default_positions:", "action_scale:")
+    stated = yaml.safe_load((out / "policy.yaml").read_text())
+    stated["gains"] = {".*": {"stiffness": 200.0, "damping": 4.0}}
+    stated["observation"] = [{"name": name} for name in TERMS]
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    assert problems(scenario) == []
+    stated["observation"] = stated["observation"][:-1]
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    (finding,) = problems(scenario)
+    assert "takes no observation of 24 entries" in finding.message
+
+
+def deploy(folder):
+    """A deploy.yaml for the hexapod, whose network moves its joints in another order."""
+    order = [*range(0, 18, 3), *range(1, 18, 3), *range(2, 18, 3)]
+    default = [POSTURE[i] for i in order]
+    content = {
+        "joint_ids_map": order,
+        "step_dt": 0.02,
+        "stiffness": [200.0] * 18,
+        "damping": [4.0] * 18,
+        "default_joint_pos": default,
+        "actions": {"JointPositionAction": {"scale": [0.25] * 18, "offset": default}},
+        "observations": {name: {} for name in TERMS},
+    }
+    (folder / "deploy.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    save_network(folder / "policy.pt", 42, 18, scale=0.0)
+    return folder / "deploy.yaml"
+
+
+def test_a_deploy_yaml_leaves_the_names_of_the_motors_alone(tmp_path):
+    out, result = new(tmp_path, deploy(tmp_path))
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in out.iterdir()} >= {"deploy.yaml", "policy.pt", "policy.yaml"}
+    text = (out / "policy.yaml").read_text()
+    assert text.startswith("# Written from") and "read: deploy.yaml" in text
+    assert "# motors: [" in text and "observation" not in text and "gains" not in text
+    (finding,) = problems(out / "walking.yaml")
+    assert "State in policy.yaml 'motors'" in finding.message
+    stated = yaml.safe_load(text) | {"motors": LEGS}
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    assert problems(out / "walking.yaml") == []
+
+
+def test_joints_that_a_policy_moves_are_not_fixed(tmp_path):
+    # Three legs have feet; the policy moves the others too.
+    network = save_network(tmp_path / "walk.pt", 42, 18)
+    out, result = new(tmp_path, network, "--feet", "tibia_0,tibia_2,tibia_4")
+    assert result.exit_code == 0, result.output
+    text = (out / "policy.yaml").read_text()
+    assert all(name in text for name in SWINGS)
+    assert "are fixed at zero" not in (out / "README.md").read_text()
+
+
+def test_metadata_of_a_network_are_not_asked_for(tmp_path):
+    metadata = PolicyMetadata(
+        joints=["a", "b"],
+        stiffness=[1.0, 2.0],
+        damping=[0.1, 0.2],
+        action_scale=[0.25, 0.25],
+        default_positions=[0.0, 0.1],
+        command={"lin_vel_x": [-0.5, 1], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-1, 1]},
+    )
+    network = PolicyNetwork(tmp_path / "p.onnx", lambda batch: batch, (45, 2), metadata)
+    text, asked = PolicyTemplate(network=network, joints=["a", "b"]).yaml(["a", "b", "c"], {})
+    assert [what.partition(":")[2].split()[1] for what in asked] == ["time", "terms"]
+    assert "45 entries" in text
+    stated = yaml.safe_load(text)
+    assert stated["command"] == {"lowest": [-0.5, -0.3, -1.0], "highest": [1.0, 0.3, 1.0]}
+    text, asked = PolicyTemplate(network=network, joints=["a", "b"]).yaml(["c", "d"], {})
+    assert "its own ['a', 'b'] are none of them" in asked[0]
+
+
+def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
+    (tmp_path / "odd.yaml").write_text("a: 1")
+    for policy in ("gone.pt", "odd.yaml", "gone.yaml"):
+        out, result = new(tmp_path, tmp_path / policy)
+        assert result.exit_code != 0 and not out.exists()
+    write_hexapod(tmp_path)
+    words = ["new", "walker", "--urdf", str(tmp_path / "hexapod.urdf")]
+    result = CliRunner().invoke(app, [*words, "--task", "walking"])
+    assert result.exit_code != 0
+    with pytest.raises(ValueError, match=r"is neither a deploy\.yaml"):
+        survey_policy(tmp_path / "odd.yaml")
