@@ -14,8 +14,7 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import Policy
-from drake_safety.control.policy_files import load_policy, missing_entries, read_policy_file
+from drake_safety.control.policy_files import load_policy, read_policy_file, with_policy
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -23,12 +22,13 @@ from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
-from drake_safety.simulation.contract import Finding, failed, passed
+from drake_safety.simulation.contract import Finding
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.policy_check import policy_findings
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.crouch_controller import CrouchController
@@ -289,19 +289,7 @@ class Walking(LeggedLoop):
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
         """Findings about the policy: what its files lack, and how to mend it."""
-        path = policy_file(scenario)
-        try:
-            missing = list(missing_entries(path, kinematics.joint_names))
-            for what, remedy in missing:
-                yield failed("policy", what, remedy)
-            if not missing:
-                policy = load_policy(path, kinematics)
-                yield passed(
-                    "policy",
-                    f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
-                )
-        except ValueError as error:
-            yield failed("policy", str(error), f"correct it in {path.name}")
+        return policy_findings(policy_file(scenario), kinematics)
 
     @property
     def target_box(self) -> np.ndarray:
@@ -459,21 +447,3 @@ def policy_file(scenario: LoopScenario, name: str | None = None) -> Path:
     """
     folder = Path(load_robot(scenario.robot).source_dir)
     return folder / (scenario.parameters.policy if name is None else name)
-
-
-def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:
-    """A robot with the gains, rotor inertias and posture of a policy.
-
-    Args:
-        robot: The robot.
-        policy: The policy.
-        joint_names: The robot's joints, in the order of the policy's default positions.
-    """
-    posture = dict(zip(joint_names, policy.default_positions.tolist(), strict=True))
-    inertia = policy.parameters.rotor_inertia
-    return replace(
-        robot,
-        posture=posture,
-        joint_gains={**policy.gains},
-        rotor_inertia=inertia or robot.rotor_inertia,
-    )

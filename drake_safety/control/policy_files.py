@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from drake_safety.control.policy_network import load_network
 from drake_safety.control.rl_sar_policy import from_rl_sar, is_rl_sar
 from drake_safety.robots.model_files import required_file
 from drake_safety.robots.reading import parse_yaml, reading
-from drake_safety.robots.robot_model import by_pattern, load_typed
+from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed
 
 _MERGED = ("gait", "command")
 """Keys of which single entries may be stated."""
@@ -96,6 +96,24 @@ def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
         kinematics.joint_names,
         robot=kinematics.robot.name,
         folder=found.folder,
+    )
+
+
+def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:
+    """A robot with the gains, rotor inertias and posture of a policy.
+
+    Args:
+        robot: The robot.
+        policy: The policy.
+        joint_names: The robot's joints, in the order of the policy's default positions.
+    """
+    posture = dict(zip(joint_names, policy.default_positions.tolist(), strict=True))
+    inertia = policy.parameters.rotor_inertia
+    return replace(
+        robot,
+        posture=posture,
+        joint_gains={**policy.gains},
+        rotor_inertia=inertia or robot.rotor_inertia,
     )
 
 
