@@ -97,13 +97,13 @@ def deploy(folder, change=None, **stated):
     return dump(folder / "policy.yaml", stated)
 
 
-def rl_sar(folder, change=None):
-    """A config.yaml beside its network, with the base.yaml of its robot."""
+def rl_sar(folder, change=None, lab="lab"):
+    """A config.yaml beside its network, with the base.yaml of its robot in a folder above."""
     content = copy.deepcopy(CONFIG)
     if change is not None:
         change(content["beast/lab"])
     dump(folder / "beast" / "base.yaml", BASE)
-    config = dump(folder / "beast" / "lab" / "config.yaml", content)
+    config = dump(folder / "beast" / lab / "config.yaml", content)
     save_network(config.parent / "walk.pt", 16, 2)
     return config
 
@@ -229,6 +229,23 @@ def test_joints_without_names_are_asked_for_with_those_of_the_robot(tmp_path):
         loaded(tmp_path / "params" / "deploy.yaml")
 
 
+def test_slices_that_an_exporter_writes_are_read(tmp_path):
+    path = deploy(tmp_path)
+    file = tmp_path / "params" / "deploy.yaml"
+    text = file.read_text()
+    for ends, is_all in (("[null, null, null]", True), ("[0, 1, null]", False)):
+        tag = "joint_ids: !!python/object/apply:builtins.slice"
+        file.write_text(text.replace("joint_ids: null", f"{tag} {ends}"))
+        if is_all:
+            assert loaded(path).joint_names == ["hip", "knee"]
+        else:
+            with pytest.raises(ValueError, match="joint_ids must be all 2 joints"):
+                loaded(path)
+    file.write_text(text.replace("joint_ids: null", "joint_ids: !!python/name:os.system ''"))
+    with pytest.raises(ValueError, match="is not YAML"):
+        loaded(path)
+
+
 def test_a_network_is_looked_for_beside_the_file(tmp_path):
     path = deploy(tmp_path)
     (tmp_path / "exported" / "policy.pt").unlink()
@@ -252,6 +269,10 @@ def test_a_config_of_rl_sar_needs_no_policy_yaml(tmp_path):
     assert policy.parameters.history.ages == [0, 1]
     files = read_policy_file(config).files
     assert [path.name for path in files] == ["config.yaml", "base.yaml"]
+
+
+def test_the_robots_file_may_be_two_folders_up(tmp_path):
+    assert loaded(rl_sar(tmp_path, lab="lab/walk")).joint_names == ["hip", "knee"]
 
 
 def test_history_by_term_is_read_too(tmp_path):

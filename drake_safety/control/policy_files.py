@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from drake_safety.control.isaac_lab_policy import from_isaac_lab, is_isaac_lab
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.policy import (
@@ -21,6 +23,19 @@ from drake_safety.control.rl_sar_policy import from_rl_sar, is_rl_sar
 from drake_safety.robots.model_files import required_file
 from drake_safety.robots.reading import parse_yaml, reading
 from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads Python's slices and tuples, which exporters write, as lists; a slice of all as null."""
+
+
+def _slice(loader: _Loader, node: yaml.SequenceNode) -> list[Any] | None:
+    ends = loader.construct_sequence(node)
+    return None if set(ends) == {None} else ends
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/object/apply:builtins.slice", _slice)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_sequence)
 
 _MERGED = ("gait", "command")
 """Keys of which single entries may be stated."""
@@ -172,7 +187,7 @@ def _parsed(path: Path, who: str) -> Any:
     if not path.is_file():
         raise ValueError(f"{who} does not exist")
     with reading(path):
-        return parse_yaml(path.read_text(encoding="utf-8"), who)
+        return parse_yaml(path.read_text(encoding="utf-8"), who, _Loader)
 
 
 def read_foreign(
@@ -197,7 +212,8 @@ def read_foreign(
     if is_isaac_lab(raw):
         return from_isaac_lab(raw, path, stated, motors or []), []
     if is_rl_sar(raw):
-        bases = [folder / "base.yaml" for folder in (path.parent, path.parent.parent)]
+        folders = [path.parent, *path.resolve().parents[1:3]]
+        bases = (folder / "base.yaml" for folder in folders)
         base = next((one for one in bases if one.is_file()), None)
         if base is None:
             return from_rl_sar(raw, path, stated), []

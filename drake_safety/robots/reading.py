@@ -61,19 +61,20 @@ def shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE - 4]} ..."
 
 
-def parse_yaml(text: str, who: str) -> Any:
+def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """Parses a YAML document of plain values.
 
     Args:
         text: The document.
         who: Beginning of error messages.
+        loader: A loader for further tags.
 
     Raises:
         ValueError: It is not YAML, is nested too deeply, contains itself, or a few aliases stand
             for more values than a description of a robot or task can have.
     """
     try:
-        value = yaml.safe_load(text)
+        value = yaml.load(text, Loader=loader)
         _num_values(value, {})
     except yaml.YAMLError as error:
         raise ValueError(f"{who} is not YAML: {shortened(str(error))}") from error
