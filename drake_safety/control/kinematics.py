@@ -166,6 +166,10 @@ class RobotKinematics:
     def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns :meth:`contact_positions` and :meth:`contact_jacobian` together."""
         self.set_positions(q)
+        return self.present_contacts()
+
+    def present_contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`contact_positions_and_jacobian`, at the scratch Context's positions."""
         return self._contacts(), self._jacobian()
 
     def _contacts(self) -> np.ndarray:
