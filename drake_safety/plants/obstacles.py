@@ -146,6 +146,23 @@ def filter_collisions(
     scene_graph.collision_filter_manager().Apply(declaration)
 
 
+def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Context) -> None:
+    """Removes all geometries but those of collision from a Context.
+
+    Every query moves all geometries, and a robot's meshes are many times its collision shapes.
+
+    Args:
+        plant: The finalised plant, the only source of geometries.
+        scene_graph: Its scene graph.
+        context: The root Context.
+    """
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    own_context = scene_graph.GetMyMutableContextFromRoot(context)
+    for geometry in inspector.GetAllGeometryIds():
+        if inspector.GetProximityProperties(geometry) is None:
+            scene_graph.RemoveGeometry(own_context, source, geometry)
+
+
 @dataclass(eq=False)
 class _Contexts:
     """A scratch Context, and those of its parts: looking them up costs as much as a distance."""
@@ -192,6 +209,7 @@ class Clearance:
         self.range_m = range_m
 
     def _contexts_of(self, root: Context) -> _Contexts:
+        remove_visuals(self._plant, self._scene_graph, root)
         return _Contexts(
             root=root,
             plant=self._plant.GetMyMutableContextFromRoot(root),
