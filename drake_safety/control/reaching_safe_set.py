@@ -218,7 +218,7 @@ class ReachingSafeSet:
         on_path = self.clearance.of_points(path, self._hand.radius_m)
 
         ahead = self._preview.follow(q, path[_previewed(len(path))])
-        corners = convex_hull(p_WC[:, :2])
+        corners = convex_hull(p_WC[:, :2].tolist())
         previewed = np.column_stack(
             [
                 [signed_distance_to_polygon(at[4:6], corners) for at in ahead],
