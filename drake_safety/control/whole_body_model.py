@@ -117,6 +117,8 @@ class WholeBodyModel:
             self.hand = Hand(hand, plant.GetBodyByName(frame.body), frame)
         self.body_names = list(parameters.orientation)
         self.bodies = [plant.GetBodyByName(name) for name in self.body_names]
+        # After the three of the centre of mass.
+        self.orientation_rows = [slice(3 * i, 3 * i + 3) for i in range(1, len(self.bodies) + 1)]
         self.feet = [
             StandingFoot(plant.GetBodyByName(foot.body), points)
             for foot, points in zip(robot.feet.values(), kinematics.foot_points, strict=True)

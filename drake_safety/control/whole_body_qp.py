@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import daqp
 import numpy as np
 from pydrake.math import RotationMatrix
-from pydrake.multibody.tree import JacobianWrtVariable, RigidBody
+from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
@@ -220,7 +219,8 @@ def task_errors(
     J[_FIRST] = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, kv, world, world)
     p_com = plant.CalcCenterOfMassPositionInWorld(context)
     error[_FIRST] = reference.center_of_mass.position - p_com
-    for rows, body, R_WBd in _oriented(model, reference):
+    oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
+    for rows, body, R_WBd in oriented:
         if body is kinematics.base:
             J[rows] = model.base_turns
         else:
@@ -234,14 +234,6 @@ def task_errors(
     return J, error
 
 
-def _oriented(
-    model: WholeBodyModel, reference: WholeBodyReference
-) -> Iterator[tuple[slice, RigidBody, RotationMatrix]]:
-    """Rows, body and wanted orientation R_WB of every orientation task."""
-    for i, (body, R_WBd) in enumerate(zip(model.bodies, reference.orientations, strict=True), 1):
-        yield slice(3 * i, 3 * i + 3), body, R_WBd
-
-
 def _turn_to(R_WBd: RotationMatrix, R_WB: RotationMatrix) -> np.ndarray:
     """Rotation vector from an orientation to the wanted one, in the world (3,) [rad]."""
     # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
@@ -253,7 +245,8 @@ def _set_orientations(
 ) -> None:
     plant, context = model.kinematics.plant, model.kinematics.context
     world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
-    for rows, body, R_WBd in _oriented(model, reference):
+    oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
+    for rows, body, R_WBd in oriented:
         if body is model.kinematics.base:
             tasks.J[rows], tasks.Jdot_v[rows] = model.base_turns, 0.0
         else:
