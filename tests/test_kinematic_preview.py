@@ -35,7 +35,7 @@ def gradient(preview, reference, q):
     """Of half the cost in the motions that leave the feet still, and the hand's share of it."""
     model, kinematics = preview.model, preview.model.kinematics
     _, J_feet = kinematics.contact_positions_and_jacobian(q)
-    J, error = task_errors(model, q, reference)
+    J, error = task_errors(model, reference)
     slope = (model.task_weights * J).T @ error
     slope[6:] += model.parameters.posture.weight * (reference.posture - q[7:])
     still = null_space(J_feet, rcond=1e-9)

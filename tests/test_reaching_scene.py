@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pydrake.geometry import Role
+from pydrake.geometry import Meshcat, Role
 
 from drake_safety.models import load_robot
 from drake_safety.simulation.scenario import load_scenario
@@ -79,6 +79,21 @@ def test_the_first_instant_from_the_standing_posture_is_without_noise(loop):
     for one, other in zip(*seen, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(seen[0][0], loop.GetOutputPort("true_state").Eval(context))
+
+
+@pytest.mark.parametrize("is_watched", [False, True])
+def test_visual_shapes_are_simulated_only_where_somebody_watches(loop, is_watched):
+    if is_watched:
+        loop = load_scenario(SCENARIO).make_loop(meshcat=Meshcat())
+    context = loop.CreateDefaultContext()
+    loop.simplify(context)
+    scene_graph = loop.scene_graph
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    model, simulated = scene_graph.model_inspector(), query.inspector()
+    assert simulated.GetCollisionCandidates() == model.GetCollisionCandidates()
+    num_visual = model.NumGeometriesWithRole(Role.kIllustration)
+    assert num_visual > 100
+    assert simulated.NumGeometriesWithRole(Role.kIllustration) == is_watched * num_visual
 
 
 def test_what_is_seen_or_asked_for_does_not_decide_what_episodes_are():

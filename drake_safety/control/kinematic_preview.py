@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from drake_safety.control.kinematics import (
@@ -66,12 +68,17 @@ class KinematicPreview:
             reference.reaching = PointReference(position=point)
             least, most = _LAST_ITERATIONS if sample == len(path) - 1 else (1, _MAX_ITERATIONS)
             for iteration in range(most):
-                if iteration >= least and self._is_near(q, point):
+                kinematics.set_positions(q)
+                if iteration >= least and self._is_near(point):
                     break
-                reached, J_feet = kinematics.contact_positions_and_jacobian(q)
-                J, error = task_errors(model, q, reference)
+                reached, J_feet = kinematics.present_contacts()
+                J, error = task_errors(model, reference)
                 weighted = model.task_weights * J
-                H = model.H + J.T @ weighted + _FOOT_WEIGHT * (J_feet.T @ J_feet)
+                H = J.T @ weighted
+                H += model.H
+                feet = J_feet.T @ J_feet
+                feet *= _FOOT_WEIGHT
+                H += feet
                 g = error @ weighted + _FOOT_WEIGHT * ((contacts - reached).ravel() @ J_feet)
                 g[NUM_BASE_VELOCITIES:] += posture.weight * (
                     reference.posture - q[NUM_BASE_POSITIONS:]
@@ -79,12 +86,12 @@ class KinematicPreview:
                 _, step, _ = dposv(H, g)
                 # The Context still has the positions q.
                 q += kinematics.plant.MapVelocityToQDot(kinematics.context, step)
-                q[:4] /= np.linalg.norm(q[:4])
+                q[:4] /= math.sqrt(q[:4].dot(q[:4]))
             positions[sample] = q
         return positions
 
-    def _is_near(self, q: np.ndarray, point: np.ndarray) -> bool:
-        miss = self.model.reaching_position(q) - point
+    def _is_near(self, point: np.ndarray) -> bool:
+        miss = self.hand.present_position(self.model.kinematics) - point
         return float(miss.dot(miss)) < _NEAR_M**2
 
 

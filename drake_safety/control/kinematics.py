@@ -166,6 +166,10 @@ class RobotKinematics:
     def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns :meth:`contact_positions` and :meth:`contact_jacobian` together."""
         self.set_positions(q)
+        return self.present_contacts()
+
+    def present_contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`contact_positions_and_jacobian`, at the scratch Context's positions."""
         return self._contacts(), self._jacobian()
 
     def _contacts(self) -> np.ndarray:
@@ -261,9 +265,10 @@ def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
     # Floats are several times faster than arrays for a few points.
     points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()
     n = len(points)
-    x = sum(px for px, _ in points) / n
-    y = sum(py for _, py in points) / n
-    sine = cosine = 0.0
+    x = y = sine = cosine = 0.0
+    for px, py in points:
+        x, y = x + px, y + py
+    x, y = x / n, y / n
     for (px, py), (nx, ny) in zip(points, nominal, strict=True):
         dx, dy = px - x, py - y
         sine += nx * dy - ny * dx

@@ -59,7 +59,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     x, y, yaw = kinematics.stance_pose(q)
     R_SW = RotationMatrix.MakeZRotation(-yaw)
     R = R_SW.matrix()
-    R_SB = R_SW @ RotationMatrix(quaternion_of(q))
+    # R_SW R_WB; Drake's product of rotations is wrapped in Python.
+    R_SB = R_SW.inverse().InvertAndCompose(RotationMatrix(quaternion_of(q)))
     return np.concatenate(
         [
             R @ (q[4:7] - (x, y, 0.0)),
@@ -137,14 +138,16 @@ def gravity_in_foot_plane(
     if not q.dot(q) + gravity @ gravity < math.inf:
         return np.full(2, np.nan)
     p_WC = kinematics.contact_positions(q) - kinematics.foot_radii[:, None] * (0.0, 0.0, 1.0)
-    p = p_WC - p_WC.mean(axis=0)
-    regularization = len(p) * _LEAST_FOOT_SPREAD_M**2 * np.eye(2)
-    slope = np.linalg.solve(p[:, :2].T @ p[:, :2] + regularization, p[:, :2].T @ p[:, 2])
+    p = p_WC - p_WC.sum(axis=0) / len(p_WC)
+    spread = p[:, :2].T @ p[:, :2]
+    spread.flat[::3] += len(p) * _LEAST_FOOT_SPREAD_M**2
+    slope = np.linalg.solve(spread, p[:, :2].T @ p[:, 2])
     yaw = kinematics.stance_pose(q)[2]
-    axes = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    tangents = np.column_stack([axes, axes @ slope])
+    c, s = math.cos(yaw), math.sin(yaw)
+    tangents = np.array([[c, s, 0.0], [-s, c, 0.0]])
+    tangents[:, 2] = tangents[:, :2] @ slope
     along = tangents @ gravity / math.sqrt(gravity @ gravity)
-    return along / np.linalg.norm(tangents, axis=1)
+    return along / np.sqrt((tangents * tangents).sum(axis=1))
 
 
 def add_noise(

@@ -1,5 +1,6 @@
 """The safe set of a reaching robot: standing, clear of obstacles, off its joint stops."""
 
+import functools
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -149,9 +150,9 @@ class ReachingSafeSet:
         ]
 
     def _joint_margins(self, q: np.ndarray) -> np.ndarray:
-        """Distance of every joint to its nearer stop, less the margin, (n_j,) [rad]."""
+        """Distance of every joint to its nearer stop, less the margin, (..., n_j) [rad]."""
         lowest, highest = self.kinematics.position_limits.T
-        joints = q[NUM_BASE_POSITIONS:]
+        joints = q[..., NUM_BASE_POSITIONS:]
         # Finite for joints without stops.
         distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
         return distance - self.limits.joint_margin_rad
@@ -216,17 +217,13 @@ class ReachingSafeSet:
         capture_in_stance = com_in_stance[:2] + rate * v_SC[:2]
         on_path = self.clearance.of_points(path, self._hand.radius_m)
 
-        chosen = np.unique(np.linspace(0, len(path) - 1, _NUM_PREVIEWED + 1).round().astype(int))
-        ahead = self._preview.follow(q, path[chosen[1:] if len(chosen) > 1 else chosen])
-        corners = convex_hull(p_WC[:, :2])
-        previewed = np.array(
+        ahead = self._preview.follow(q, path[_previewed(len(path))])
+        corners = convex_hull(p_WC[:, :2].tolist())
+        previewed = np.column_stack(
             [
-                (
-                    signed_distance_to_polygon(at[4:6], corners),
-                    self.clearance.of_arms(at),
-                    self._joint_margins(at).min(),
-                )
-                for at in ahead
+                [signed_distance_to_polygon(at[4:6], corners) for at in ahead],
+                [self.clearance.of_arms(at) for at in ahead],
+                self._joint_margins(ahead).min(axis=1),
             ]
         )
         com_support = min(
@@ -259,3 +256,11 @@ class ReachingSafeSet:
                 ],
             ]
         )
+
+
+@functools.cache
+def _previewed(num_samples: int) -> np.ndarray:
+    """The samples of a plan that are previewed: evenly spaced, without the first of several."""
+    spaced = np.linspace(0, num_samples - 1, _NUM_PREVIEWED + 1).round().astype(int)
+    chosen = np.unique(spaced)
+    return chosen[1:] if len(chosen) > 1 else chosen

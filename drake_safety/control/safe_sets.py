@@ -1,7 +1,7 @@
 """Safe sets as signed margins: positive inside, zero on the boundary, negative outside."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -17,16 +17,16 @@ DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 DIRECTION_NAMES = [f"{round(math.degrees(angle))}deg" for angle in _ANGLES]
 
 
-def convex_hull(points: np.ndarray) -> list[tuple[float, float]]:
+def convex_hull(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
     """Computes the convex hull, counter-clockwise (Andrew's monotone chain).
 
     Args:
-        points: (n, 2) [m].
+        points: n points (2,) [m]; lists of floats are faster than an array.
 
     Returns:
         The corners; one or two if the points coincide or are collinear.
     """
-    ordered = sorted(map(tuple, points.tolist()))
+    ordered = sorted((x, y) for x, y in points)
 
     def chain(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
         hull: list[tuple[float, float]] = []
@@ -85,9 +85,10 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
         clearance_m: Height below which a contact point is on the ground [m].
     """
     p_WC = kinematics.contact_positions(q)
-    is_support = p_WC[:, 2] - kinematics.foot_radii < clearance_m
-    if is_support.any():
-        return signed_distance_to_polygon(q[4:6], convex_hull(p_WC[is_support, :2]))
+    points = zip(p_WC.tolist(), kinematics.foot_radii.tolist(), strict=True)
+    support = [(x, y) for (x, y, z), radius in points if z - radius < clearance_m]
+    if support:
+        return signed_distance_to_polygon(q[4:6], convex_hull(support))
     x, y = (q[4:6] - p_WC[:, :2].mean(axis=0)).tolist()
     return -math.hypot(x, y) - 1e-3
 
@@ -230,7 +231,7 @@ class BalanceSafeSet:
         capture_point = base + velocity * math.sqrt(max(height, 0.05) / _GRAVITY)
         goal = preview[-1, :2]
         reach = (contacts[is_support] @ DIRECTIONS).max(axis=0)
-        corners = convex_hull(contacts[is_support])
+        corners = convex_hull(contacts[is_support].tolist())
         points = np.stack([base, capture_point, goal])
         qw, qx, qy, qz = q[:4]
         base_yaw = math.atan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)

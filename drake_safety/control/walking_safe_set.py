@@ -182,7 +182,10 @@ class WalkingSafeSet:
                 preview[-1],
                 largest,
                 preview[0] - heading_velocity(q, v),
-                [_tilt_rate(q, v), signed_distance_to_polygon(capture, convex_hull(p_WC[:, :2]))],
+                [
+                    _tilt_rate(q, v),
+                    signed_distance_to_polygon(capture, convex_hull(p_WC[:, :2].tolist())),
+                ],
                 to_heading @ (capture - p_WC[:, :2].mean(axis=0)),
                 heights,
             ]

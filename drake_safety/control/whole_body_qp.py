@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
+from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
@@ -202,73 +203,72 @@ def _add_contacts(
 
 
 def task_errors(
-    model: WholeBodyModel, q: np.ndarray, reference: WholeBodyReference
+    model: WholeBodyModel, reference: WholeBodyReference
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest.
 
     Args:
-        model: The model; its scratch Context has the positions ``q`` afterwards.
-        q: Positions (n_q,).
+        model: The model, at the positions of its scratch Context.
         reference: References of the tasks.
     """
     kinematics = model.kinematics
-    kinematics.set_positions(q)
     plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
-    tasks = _TaskRows(model.num_task_rows, model.num_velocities)
-    tasks.J[_FIRST] = plant.CalcJacobianCenterOfMassTranslationalVelocity(
-        context, JacobianWrtVariable.kV, world, world
-    )
+    kv = JacobianWrtVariable.kV
+    J = np.empty((model.num_task_rows, model.num_velocities))
+    error = np.zeros(model.num_task_rows)
+    J[_FIRST] = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, kv, world, world)
     p_com = plant.CalcCenterOfMassPositionInWorld(context)
-    tasks.follow(_FIRST, reference.center_of_mass, p_com)
-    _set_orientations(model, reference, tasks, at_rest=True)
-    _set_hand(model, reference, tasks, at_rest=True)
-    return tasks.J, tasks.error
+    error[_FIRST] = reference.center_of_mass.position - p_com
+    oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
+    for rows, body, R_WBd in oriented:
+        if body is kinematics.base:
+            J[rows] = model.base_turns
+        else:
+            frame = body.body_frame()
+            J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
+        error[rows] = _turn_to(R_WBd, body.EvalPoseInWorld(context).rotation())
+    if model.hand is not None and reference.reaching is not None:
+        frame, p = model.hand.frame, model.hand.point
+        J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
+        error[_LAST] = reference.reaching.position - model.hand.present_position(kinematics)
+    return J, error
+
+
+def _turn_to(R_WBd: RotationMatrix, R_WB: RotationMatrix) -> np.ndarray:
+    """Rotation vector from an orientation to the wanted one, in the world (3,) [rad]."""
+    # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
+    return rotation_vector(R_WBd.inverse().InvertAndCompose(R_WB.inverse()))
 
 
 def _set_orientations(
-    model: WholeBodyModel,
-    reference: WholeBodyReference,
-    tasks: _TaskRows,
-    *,
-    at_rest: bool = False,
+    model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows
 ) -> None:
     plant, context = model.kinematics.plant, model.kinematics.context
     world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
-    row = 3
-    for body, R_WBd in zip(model.bodies, reference.orientations, strict=True):
-        rows = slice(row, row + 3)
-        row += 3
+    oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
+    for rows, body, R_WBd in oriented:
         if body is model.kinematics.base:
             tasks.J[rows], tasks.Jdot_v[rows] = model.base_turns, 0.0
         else:
             frame = body.body_frame()
             tasks.J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
-            if not at_rest:
-                tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
-                    context, kv, frame, _ORIGIN, world, world
-                ).rotational()
-        R_WB = body.EvalPoseInWorld(context).rotation()
-        tasks.error[rows] = rotation_vector(R_WBd.multiply(R_WB.inverse()))
+            tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
+                context, kv, frame, _ORIGIN, world, world
+            ).rotational()
+        tasks.error[rows] = _turn_to(R_WBd, body.EvalPoseInWorld(context).rotation())
 
 
-def _set_hand(
-    model: WholeBodyModel,
-    reference: WholeBodyReference,
-    tasks: _TaskRows,
-    *,
-    at_rest: bool = False,
-) -> None:
+def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows) -> None:
     if model.hand is None or reference.reaching is None:
         return
     plant, context = model.kinematics.plant, model.kinematics.context
     world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
-    body, frame, p = model.hand.body, model.hand.frame, model.hand.point
-    tasks.J[-3:] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
-    if not at_rest:
-        tasks.Jdot_v[-3:] = plant.CalcBiasTranslationalAcceleration(
-            context, kv, frame, p, world, world
-        )[:, 0]
-    tasks.follow(_LAST, reference.reaching, body.EvalPoseInWorld(context).multiply(p))
+    frame, p = model.hand.frame, model.hand.point
+    tasks.J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
+    tasks.Jdot_v[_LAST] = plant.CalcBiasTranslationalAcceleration(
+        context, kv, frame, p, world, world
+    )[:, 0]
+    tasks.follow(_LAST, reference.reaching, model.hand.present_position(model.kinematics))
 
 
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:

@@ -15,7 +15,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot import Scratch, add_robot
@@ -146,6 +146,32 @@ def filter_collisions(
     scene_graph.collision_filter_manager().Apply(declaration)
 
 
+def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Context) -> None:
+    """Removes all geometries but those of collision from a Context.
+
+    Every query moves all geometries, and a robot's meshes are many times its collision shapes.
+
+    Args:
+        plant: The finalised plant, the only source of geometries.
+        scene_graph: Its scene graph.
+        context: The root Context.
+    """
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    own_context = scene_graph.GetMyMutableContextFromRoot(context)
+    for geometry in inspector.GetAllGeometryIds():
+        if inspector.GetProximityProperties(geometry) is None:
+            scene_graph.RemoveGeometry(own_context, source, geometry)
+
+
+@dataclass(eq=False)
+class _Contexts:
+    """A scratch Context, and those of its parts: looking them up costs as much as a distance."""
+
+    root: Context
+    plant: Context
+    scene_graph: Context
+
+
 class Clearance:
     """Signed distances of a robot's arms, and of points, to obstacles.
 
@@ -171,7 +197,8 @@ class Clearance:
         self._plant.Finalize()
         filter_collisions(self._plant, self._scene_graph, robot, instances)
         diagram = builder.Build()
-        self._scratch = Scratch(diagram.CreateDefaultContext)
+        self._query_port = self._scene_graph.get_query_output_port()
+        self._scratch = Scratch(lambda: self._contexts_of(diagram.CreateDefaultContext()))
         self._obstacles = set(collision_geometries(self._plant, instances))
         if self._obstacles and not arm_geometries(self._plant, robot):
             raise ValueError(
@@ -181,9 +208,16 @@ class Clearance:
             )
         self.range_m = range_m
 
+    def _contexts_of(self, root: Context) -> _Contexts:
+        remove_visuals(self._plant, self._scene_graph, root)
+        return _Contexts(
+            root=root,
+            plant=self._plant.GetMyMutableContextFromRoot(root),
+            scene_graph=self._scene_graph.GetMyContextFromRoot(root),
+        )
+
     def _query(self) -> QueryObject:
-        context = self._scene_graph.GetMyContextFromRoot(self._scratch.value)
-        return self._scene_graph.get_query_output_port().Eval(context)
+        return self._query_port.Eval(self._scratch.value.scene_graph)
 
     def of_arms(self, q: np.ndarray) -> float:
         """Returns the distance of the arms to the nearest obstacle, negative in contact [m].
@@ -199,8 +233,7 @@ class Clearance:
             raise ValueError(f"clearance: positions must be finite; got {q}")
         if not self._obstacles:
             return self.range_m
-        context = self._plant.GetMyMutableContextFromRoot(self._scratch.value)
-        self._plant.SetPositions(context, q)
+        self._plant.SetPositions(self._scratch.value.plant, q)
         pairs = self._query().ComputeSignedDistancePairwiseClosestPoints(self.range_m)
         return min((pair.distance for pair in pairs), default=self.range_m)
 

@@ -103,6 +103,7 @@ def run_to_goal(
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
+    loop.simplify(context)
     with_goals = require(loop, HasGoals)
     with_goals.reset_standing(context, goal, episode_rng(seed, 0))
     if push is not None:

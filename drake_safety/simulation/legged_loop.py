@@ -15,6 +15,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
+from drake_safety.plants.obstacles import remove_visuals
 from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
@@ -277,9 +278,15 @@ class LeggedLoop(PlannedLoop):
         )
         if self._physics.ball_state is not None:
             builder.ExportOutput(self._physics.ball_state, "ball_state")
+        self._is_shown = meshcat is not None
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, self.scene_graph, meshcat)
         return assessor
+
+    def simplify(self, context: Context) -> None:
+        """Removes the visual shapes, unless the diagram has a visualiser; see `ClosedLoop`."""
+        if not self._is_shown:
+            remove_visuals(self.plant, self.scene_graph, context)
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart

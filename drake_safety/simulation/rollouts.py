@@ -117,6 +117,7 @@ def run_episode(
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
+    loop.simplify(context)
     rng = episode_rng(seed, index)
     first_step = 0
     if start is not None:

@@ -183,7 +183,7 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
             "feet level",
             f"within {1000 * np.ptp(heights):.1f} mm, base {kinematics.standing_height:.3f} m high",
         )
-    corners = convex_hull(p_WC[:, :2])
+    corners = convex_hull(p_WC[:, :2].tolist())
     for item, point in (
         ("centre of mass over the feet", kinematics.center_of_mass(q)),
         ("base over the feet", q[4:7]),

@@ -196,7 +196,7 @@ class RecoveryStepPlanner(FloatSystem, LeafSystem):
 
     def _margin(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> float:
         """Signed distance of the capture point inside the polygon of the planted feet [m]."""
-        corners = convex_hull(self._contacts(discrete_state)[:, :2])
+        corners = convex_hull(self._contacts(discrete_state)[:, :2].tolist())
         return signed_distance_to_polygon(capture_point(q[4:7], v[3:6]), corners)
 
     def _heading_error(self, discrete_state: DiscreteValues, yaw: float) -> float:

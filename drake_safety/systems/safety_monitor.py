@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -68,7 +69,7 @@ class SafetyMonitor(FloatSystem, LeafSystem):
 
     def _calc_margins(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)
-        if np.isfinite(state).all():
+        if state.dot(state) < math.inf:
             margins = self._safe_set.margins(state[: self._n_q], state[self._n_q :])
         else:
             margins = np.full(len(self.constraint_names), -np.inf)

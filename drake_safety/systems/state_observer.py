@@ -81,8 +81,8 @@ class StateObserver(FloatSystem, LeafSystem):
 
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)
-        is_finite = np.isfinite(state).all()
-        if is_finite and not self._is_exact and self._noise_port.HasValue(context):
+        is_noisy = not self._is_exact and self._noise_port.HasValue(context)
+        if is_noisy and np.isfinite(state).all():
             q, v = add_noise(
                 state[: self._n_q], state[self._n_q :], self._noise_port.Eval(context), self._noise
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 from pydrake.common.value import Value
@@ -116,12 +117,8 @@ class WholeBodyController(FloatSystem, LeafSystem):
         point = PointReference(position=self._desired_port.Eval(context))
         if self._rate_port.HasValue(context):
             point.rate = self._rate_port.Eval(context)
-        reference = copy.copy(reference)
-        if self.model.hand is None:
-            reference.center_of_mass = point
-        else:
-            reference.reaching = point
-        return reference
+        name = "center_of_mass" if self.model.hand is None else "reaching"
+        return replace(reference, **{name: point})
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
