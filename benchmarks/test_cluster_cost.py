@@ -16,7 +16,7 @@ from bare_plant import SEED
 from drake_safety import Scenario, run_episodes
 from drake_safety.simulation.cluster import connected
 
-NUM_EPISODES, WARM_UP, ROUNDS, PATIENCE_S = 128, 16, 3, 60.0
+NUM_EPISODES, WARM_UP, ROUNDS, PATIENCE_S = 256, 16, 3, 60.0
 # Sockets of dask's client are closed by its own threads, after the test.
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 

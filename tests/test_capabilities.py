@@ -9,6 +9,7 @@ from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
     CanStartAnywhere,
+    FollowsCommands,
     HasBall,
     HasGoals,
     HasMirrorImage,
@@ -29,6 +30,7 @@ ASKED = (
     HasBall,
     CanFall,
     CanBePushed,
+    FollowsCommands,
     OffersPlans,
     CanStartAnywhere,
     HasStatePlanes,
@@ -44,6 +46,7 @@ HAS = {
         CanStartAnywhere,
         HasMirrorImage,
     },
+    "go2_walking": {HasGoals, CanFall, CanBePushed, FollowsCommands, CanStartAnywhere},
     "pendulum": {CanStartAnywhere, HasStatePlanes},
 }
 
