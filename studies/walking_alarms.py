@@ -12,7 +12,6 @@ from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.monitoring_study import (
     first_alarm,
     lowest_value,
-    persisting,
     rate_per_hour,
 )
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
@@ -24,8 +23,6 @@ from studies.walking_motions import WalkedMotion
 
 EARLY_S = 0.2
 """Time before a fall that an alarm should leave [s]."""
-NUM_ROWS = 2
-"""Successive rows below the threshold that give an alarm."""
 _LEAST = 1e-6  # Of a probability and its complement, in logits.
 
 
@@ -56,7 +53,8 @@ def _in_logits(alarm: Alarm) -> Alarm:
 
 
 def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
-    return persisting(alarm.value(motion), NUM_ROWS)
+    """The alarm's value of each row; NaN, "don't know", is below every threshold."""
+    return np.nan_to_num(alarm.value(motion), nan=-math.inf)
 
 
 def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:

@@ -51,9 +51,9 @@ def test_thresholds_lie_below_the_lowest_values_of_calm_tours_by_half_their_spre
         alarm_thresholds([ALARM], [fallen])
 
 
-def test_a_fall_is_announced_by_two_rows_below_the_threshold_between_push_and_fall():
+def test_a_fall_is_announced_by_a_row_below_the_threshold_between_push_and_fall():
     in_time = motion([1, 1, 1, 0, 0, 0, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
-    late = motion([1, 1, 1, 1, 1, 0, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
+    late = motion([1, 1, 1, 1, 1, 1, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
     never = motion([0, 1, 1, 1, 1, 1, 0, 1], push_s=0.2, leave_s=0.6, fall_s=0.7)
     false = motion([1, 0, 0, 1, 1, 1], push_s=0.1)
     before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
