@@ -173,8 +173,9 @@ class WalkingRecovery:
     with damping; "policy": another policy."""
     threshold: float = 0.5
     """Γ_thre, on the calibrated Γ."""
-    persistence_s: float = 0.0
-    """Time for which Γ must have been below it while nothing is known [s]."""
+    persistence_s: float = 0.04
+    """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
+    move, a single row can be unlike those of training."""
     slower_share: float = 0.3
     """Share of the command for "slower"."""
     crouch: dict[str, float] = field(default_factory=dict)
