@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import MatrixGain, PortSwitch
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.policy_files import load_policy, read_policy_file, with_policy
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
+from drake_safety.diagrams.walking_recovery import RecoveryBranches
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.contract import Finding
@@ -31,11 +30,10 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.policy_check import policy_findings
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard
-from drake_safety.systems.crouch_controller import CrouchController
 from drake_safety.systems.policy_controller import PolicyController
-from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 _NUM_OUTLOOK = 9  # Samples of the commands from now to the end, for the features.
+_SETTLING_S = 1.0
 
 
 class Walking(LeggedLoop):
@@ -131,12 +129,17 @@ class Walking(LeggedLoop):
             desired = {name: guard_system.GetOutputPort(name) for name in names}
             builder.ExportOutput(guard_system.GetOutputPort("is_changed"), "guard_active")
         self._guard = guard_system
-        self._switches: list[PortSwitch] = []
         command = desired["desired_output"]
-        trigger = None
+        trigger = branches = None
         if recovery:
-            trigger = self._add_trigger(builder, tick_offset_s)
-            command = self._recovering_command(builder, command, trigger)
+            branches = RecoveryBranches(
+                builder,
+                parameters.recovery,
+                period_s=scenario.control_period_s,
+                offset_s=tick_offset_s,
+            )
+            trigger = branches.trigger
+            command = branches.command(command)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
             PolicyController(self.kinematics, self.policy, offset_s=2 * tick_offset_s),
@@ -144,9 +147,14 @@ class Walking(LeggedLoop):
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
         joint_state = controller.GetOutputPort("desired_joint_state")
-        if trigger is not None:
-            joint_state = self._recovering_joints(
-                builder, joint_state, measured, desired["desired_output"], trigger
+        if branches is not None:
+            joint_state = branches.joints(
+                self.kinematics,
+                self.policy,
+                policy_file(scenario, parameters.recovery.policy),
+                nominal=joint_state,
+                measured=measured,
+                command=desired["desired_output"],
             )
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
@@ -182,103 +190,8 @@ class Walking(LeggedLoop):
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
         self._rehearsal: Walking | None = None
+        self._settled: EpisodeStart | None = None
         self.finish(builder)
-
-    def _add_trigger(self, builder: DiagramBuilder, offset_s: float) -> RecoveryTrigger:
-        recovery = self.scenario.parameters.recovery
-        trigger = builder.AddNamedSystem(
-            "recovery_trigger",
-            RecoveryTrigger(
-                threshold=recovery.threshold,
-                persistence_s=recovery.persistence_s,
-                period_s=self.scenario.control_period_s,
-                offset_s=offset_s,
-            ),
-        )
-        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
-        return trigger
-
-    def _switched(
-        self,
-        builder: DiagramBuilder,
-        name: str,
-        nominal: OutputPort,
-        recovering: OutputPort,
-        trigger: RecoveryTrigger,
-    ) -> OutputPort:
-        switch = builder.AddNamedSystem(name, PortSwitch(nominal.size()))
-        builder.Connect(
-            trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
-        )
-        builder.Connect(nominal, switch.DeclareInputPort("nominal"))
-        builder.Connect(recovering, switch.DeclareInputPort("recovery"))
-        return switch.GetOutputPort("value")
-
-    def _recovering_command(
-        self, builder: DiagramBuilder, command: OutputPort, trigger: RecoveryTrigger
-    ) -> OutputPort:
-        """The command, or that of the branches "stop" and "slower" during recovery."""
-        recovery = self.scenario.parameters.recovery
-        if recovery.branch not in ("stop", "slower"):
-            return command
-        share = recovery.slower_share if recovery.branch == "slower" else 0.0
-        slower = builder.AddNamedSystem("slower_command", MatrixGain(share * np.eye(3)))
-        builder.Connect(command, slower.get_input_port())
-        return self._switched(builder, "command_switch", command, slower.get_output_port(), trigger)
-
-    def _recovering_joints(
-        self,
-        builder: DiagramBuilder,
-        joint_state: OutputPort,
-        measured: OutputPort,
-        command: OutputPort,
-        trigger: RecoveryTrigger,
-    ) -> OutputPort:
-        """The joints' set points, or those of "crouch" and "policy" during recovery."""
-        recovery, scenario = self.scenario.parameters.recovery, self.scenario
-        offset_s = 0.5 * scenario.time_step_s
-        if recovery.branch == "crouch":
-            stated = [
-                by_pattern(recovery.crouch, name, "crouch", self.robot.name)
-                for name in self.kinematics.joint_names
-            ]
-            standing = self.kinematics.standing_positions()[NUM_BASE_POSITIONS:]
-            posture = [
-                rest if value is None else value
-                for value, rest in zip(stated, standing.tolist(), strict=True)
-            ]
-            other = builder.AddNamedSystem(
-                "crouch_controller",
-                CrouchController(
-                    self.kinematics,
-                    np.array(posture),
-                    step_rad=recovery.crouch_step_rad,
-                    period_s=scenario.control_period_s,
-                    offset_s=offset_s,
-                ),
-            )
-        elif recovery.branch == "policy":
-            policy = load_policy(policy_file(scenario, recovery.policy), self.kinematics)
-            if policy.gains != self.policy.gains:
-                raise ValueError(
-                    f"recovery: policy '{recovery.policy}' has other joint gains than "
-                    f"'{scenario.parameters.policy}', and the servos have one set"
-                )
-            other = builder.AddNamedSystem(
-                "recovery_policy_controller",
-                PolicyController(self.kinematics, policy, offset_s=offset_s),
-            )
-            builder.Connect(command, other.GetInputPort("command"))
-        else:
-            return joint_state
-        builder.Connect(measured, other.GetInputPort("plant_state"))
-        return self._switched(
-            builder,
-            "joint_switch",
-            joint_state,
-            other.GetOutputPort("desired_joint_state"),
-            trigger,
-        )
 
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
@@ -349,8 +262,8 @@ class Walking(LeggedLoop):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts at rest in the standing posture with a constant command."""
-        self._enter(context, replace(self.standing_start(), plan=self.command_plan(goal)))
+        """Starts where the policy has settled at a command of zero, with a constant command."""
+        self._enter(context, replace(self.settled_start(), plan=self.command_plan(goal)))
         self._observers.reseed(context, rng)
         self._observers.silence(context)
 
@@ -427,6 +340,12 @@ class Walking(LeggedLoop):
         q[:4] /= np.linalg.norm(q[:4])
         q[4:6] = 0.0
         return replace(start, q=q)
+
+    def settled_start(self) -> EpisodeStart:
+        """A start where the policy has stood for a second, with a command of zero."""
+        if self._settled is None:
+            self._settled = self.rehearse(np.zeros(3), _SETTLING_S)
+        return self._settled
 
     def standing_start(self) -> EpisodeStart:
         """A start at rest in the standing posture, with a command of zero."""

@@ -23,8 +23,6 @@ from studies.walking_motions import WalkedMotion
 
 EARLY_S = 0.2
 """Time before a fall that an alarm should leave [s]."""
-WATCHED_FROM_S = 0.5
-"""Time from which alarms count: a motion begins in the standing posture [s]."""
 _LEAST = 1e-6  # Of a probability and its complement, in logits.
 
 
@@ -55,12 +53,8 @@ def _in_logits(alarm: Alarm) -> Alarm:
 
 
 def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
-    """The alarm's value of each row; NaN, "don't know", is below every threshold.
-
-    While the robot sinks into its stance it is not watched, and its value is infinite.
-    """
-    value = np.nan_to_num(alarm.value(motion), nan=-math.inf)
-    return np.where(motion.time_s < WATCHED_FROM_S - 1e-9, math.inf, value)
+    """The alarm's value of each row; NaN, "don't know", is below every threshold."""
+    return np.nan_to_num(alarm.value(motion), nan=-math.inf)
 
 
 def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:

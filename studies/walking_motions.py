@@ -77,7 +77,7 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> WalkedMo
     context = simulator.get_mutable_context()
     loop.simplify(context)
     plan = profile(commands, changes[:-1], duration_s)
-    loop.reset_to(context, rng, replace(loop.standing_start(), plan=plan))
+    loop.reset_to(context, rng, replace(loop.settled_start(), plan=plan))
     simulator.Initialize()
     ports = (*SEEN, "margins", "output", "desired_output")
     guarded = loop.HasOutputPort("guard_active")
