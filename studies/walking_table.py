@@ -24,7 +24,9 @@ def walking_text(results: Results) -> str:
         results: Stored results with those of the study.
     """
     entries, found = results.entries["walking"], results.estimates
-    lines = [f"```sh\n{entries['command']}\n```\n"]
+    commands = [results.entries.get("train_command"), results.entries.get("command")]
+    commands = [*filter(None, commands), entries["command"]]
+    lines = ["```sh", *commands, "```\n", *_plan_lines(results)]
     lines += [
         f"Of {found['tours.without_fall'].n} tours of a minute "
         f"{_percent(found['tours.without_fall'])} are without a fall. Of "
@@ -79,6 +81,46 @@ def walking_text(results: Results) -> str:
             f"{_plain(difference)} m/s (median)."
         )
     return "\n".join(lines)
+
+
+def _plan_lines(results: Results) -> list[str]:
+    """Verdicts on fresh command profiles at their first row."""
+    methods = {
+        "sharpened": "Γ, `sharpened`",
+        "paper": "Γ, `paper`",
+        "gradient_boosting": "gradient boosting",
+        "mlp": "MLP",
+    }
+    found = results.estimates
+    shown = [name for name in methods if results.has(f"plans.{name}.auc")]
+    if not shown:
+        return []
+    safe = found["plans.outcomes.safe"]
+    lines = [
+        f"Of {safe.n} fresh command profiles {_percent(safe)} stay in the safe set. Verdicts at "
+        "their first row:\n",
+        "| | AUC | safe recall | unsafe recall |",
+        "|---|---|---|---|",
+    ]
+    for name in shown:
+        cells = [_share(found[f"plans.{name}.{key}"]) for key in _RATES]
+        lines.append(f"| {methods[name]} | {' | '.join(cells)} |")
+    promise = "calibration.sharpened.plan"
+    if results.has(f"{promise}.miss_rate"):
+        promised, missed = found[f"{promise}.promised_miss_rate"], found[f"{promise}.miss_rate"]
+        lines.append(
+            f"\nΓ's threshold promises that {100 * promised.value:g} % of the unsafe ones are "
+            f"missed: {_percent(missed)} are. The others' thresholds come from "
+            f"{results.entries.get('calibration_episodes')} other profiles."
+        )
+    return [*lines, ""]
+
+
+_RATES = ("auc", "safe_recall", "unsafe_recall")
+
+
+def _share(one: Estimate) -> str:
+    return f"{one.value:.3f} ({one.low:.3f}–{one.high:.3f})"
 
 
 def _percent(one: Estimate) -> str:

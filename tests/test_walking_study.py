@@ -1,6 +1,7 @@
 """Figures of the study of walking, from motions made by hand."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,11 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
         entries={"walking": {"command": "run me", "thresholds": {"sharpened": 1, "tilt": 2}}},
     )
     text = walking_text(results)
-    assert text.startswith("```sh\nrun me\n```")
+    assert text.startswith("```sh\nrun me\n```\n\nOf 10 tours")
     assert text.count("50.0 % (40.0–60.0)") == 8
+    plans = {f"plans.mlp.{key}": estimate for key in ("auc", "safe_recall", "unsafe_recall")}
+    plans["plans.outcomes.safe"] = estimate
+    with_plans = walking_text(replace(results, estimates=results.estimates | plans))
+    assert "| MLP | 0.500 (0.400–0.600) | 0.500" in with_plans
     for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| crouch |"):
         assert row in text
