@@ -24,8 +24,8 @@ def walking_text(results: Results) -> str:
         results: Stored results with those of the study.
     """
     entries, found = results.entries["walking"], results.estimates
-    commands = [results.entries.get("train_command"), results.entries.get("command")]
-    commands = [*filter(None, commands), entries["command"]]
+    stated = (results.entries.get(key) for key in ("train_command", "command"))
+    commands = [*(str(one) for one in stated if one), str(entries["command"])]
     lines = ["```sh", *commands, "```\n", *_plan_lines(results)]
     lines += [
         f"Of {found['tours.without_fall'].n} tours of a minute "
