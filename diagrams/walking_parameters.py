@@ -158,7 +158,7 @@ class WalkingStart:
 class GuardParameters:
     """The command guard."""
 
-    threshold: float = 0.5
+    threshold: float = 0.9
     """Lowest calibrated Γ of a command that is passed on."""
     period_s: float = 0.1
     """Time between two decisions [s]."""
