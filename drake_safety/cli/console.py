@@ -12,16 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Column, Table
+
+from drake_safety.learning import progress
+from drake_safety.learning.progress import Stages
 
 if TYPE_CHECKING:
     import numpy as np
@@ -178,40 +172,8 @@ def versions() -> dict[str, str]:
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
-class Stages:
-    """Progress bars, one a stage, with the remaining time.
-
-    Args:
-        progress: Display of the bars.
-    """
-
-    def __init__(self, progress: Progress):
-        self._progress = progress
-        self._tasks: dict[str, TaskID] = {}
-
-    def __call__(self, stage: str, done: float, total: float) -> None:
-        """Updates the bar of a stage, created at the first call.
-
-        Args:
-            stage: Name of the stage.
-            done: Number done.
-            total: Number wanted.
-        """
-        if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(stage, total=total)
-        self._progress.update(self._tasks[stage], completed=done, total=total)
-
-
 @contextlib.contextmanager
 def open_stages() -> Iterator[Stages]:
-    """Shows progress bars while the block runs."""
-    columns = (
-        TextColumn("{task.description:<34}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        yield Stages(progress)
+    """Shows progress while the block runs: bars on a terminal, a line every 10 s elsewhere."""
+    with progress.open_stages(console) as stages:
+        yield stages

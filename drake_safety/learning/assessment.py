@@ -35,6 +35,7 @@ from drake_safety.learning.inputs import (
 )
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
+from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.trained_maps import INPUT_LIMIT
@@ -95,15 +96,14 @@ class SafetyAssessment:
         return len(self.info_.constraint_names)
 
     def fit(
-        self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
+        self, episodes: Episodes, progress: Callable[[str, float], None] | bool | None = None
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
             episodes: Nominal episodes with the parameters' horizon.
-            progress: Called with a stage ("distances", "t-SNE", "training",
-                "innovation", "beliefs") and the
-                fraction done.
+            progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
+                "beliefs") and the fraction done; True shows it.
 
         Returns:
             Itself.
@@ -114,8 +114,11 @@ class SafetyAssessment:
         from threadpoolctl import threadpool_limits
 
         # The order of sums depends on the number of threads, and the last bits with it.
-        with threadpool_limits(1, user_api="blas"):
-            self._learn(episodes, progress)
+        with (
+            threadpool_limits(1, user_api="blas"),
+            shown(progress, lambda stages: stages.report_share) as report,
+        ):
+            self._learn(episodes, report)
         return self
 
     def _learn(self, episodes: Episodes, progress: Callable[[str, float], None] | None) -> None:

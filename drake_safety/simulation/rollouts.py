@@ -157,7 +157,7 @@ def run_episodes(
     seed: int = 0,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
     is_standing: bool = False,
@@ -177,7 +177,7 @@ def run_episodes(
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes; episodes of the same set that it already holds are not
             simulated again.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
         extra: Stored with the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             cannot be stored.
@@ -224,7 +224,7 @@ def collect_episodes(
     *,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     accept_code_change: bool = False,
 ) -> Episodes:
@@ -243,15 +243,19 @@ def collect_episodes(
     """
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
-    if progress is not None:
-        progress(len(done), num_episodes)
     episodes: list[Episode] = []
     writer = None
     if path is not None:
         writer = EpisodeWriter(path, info, extra, accept_code_change=accept_code_change)
         episodes += (e for e in load_episodes(path) if e.index in done) if done else ()
     results = run_batches(
-        _call, remaining, task, num_workers=num_workers, progress=progress, num_done=len(done)
+        _call,
+        remaining,
+        task,
+        num_workers=num_workers,
+        progress=progress,
+        num_done=len(done),
+        stage=f"episodes of '{info.scenario}'",
     )
     with writer or nullcontext(), closing(results):
         for episode in results:
