@@ -8,6 +8,7 @@ import pytest
 
 import gliding_task
 from drake_safety import load_scenario
+from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation import scenario as scenario_module
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -87,7 +88,10 @@ def test_a_missing_scenario_file_is_named(tmp_path):
         ("robot: none", "must be a mapping with the key 'task'"),
         (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
         (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
-        (BALANCING + "parameters: {push: {sharee: 1}}", "'push.sharee'; keys there are .*'share'"),
+        (
+            BALANCING + "parameters: {push: {sharee: 1}}",
+            "push.sharee' .* keys there are .*'share'",
+        ),
         (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
         (
             BALANCING + "parameters: {demonstration: [{mas_kg: 1}]}",
@@ -95,7 +99,25 @@ def test_a_missing_scenario_file_is_named(tmp_path):
         ),
         (BALANCING + "parameters: {demonstration: [{mass_kg: 0}]}", "throw: mass_kg must be pos"),
         (BALANCING + "parameters: 3", "parameters: this must be a mapping"),
-        (BALANCING + "step_s: fast", "scenario 'mine'.*float.*fast"),
+        (BALANCING + "step_s: fast", "scenario 'mine': 'step_s' must be a number; got 'fast'"),
+        (BALANCING + "step_s: [1]", r"'step_s' must be a number; got \[1\]"),
+        (
+            BALANCING + "variations: {nominal: {mass_scale: heavy}}",
+            "'variations.nominal.mass_scale' must be a number; got 'heavy'",
+        ),
+        (
+            BALANCING + "parameters: {safe_set: {height_m: [1, two]}}",
+            "'safe_set.height_m.1' must be a number; got 'two'",
+        ),
+        (
+            BALANCING + "parameters: {safe_set: {height_m: 3}}",
+            "'safe_set.height_m' must be a list; got 3",
+        ),
+        (BALANCING + "assessment: {horizon: 1.5}", "'assessment.horizon' must be an integer"),
+        (
+            BALANCING + "assessment: {horzon: 3}",
+            r"horzon' \(did you mean 'horizon'\?\)",
+        ),
         (BALANCING + "assessment: {mode: dull}", r"unknown mode 'dull'.*'paper', 'sharpened'"),
         (BALANCING + "step_s: 0", "step_s must be positive and finite; got 0"),
         (BALANCING + "step_s: .nan", "step_s must be positive and finite; got nan"),
@@ -140,6 +162,20 @@ def test_an_unknown_robot_is_answered_with_those_that_exist():
     )
     with pytest.raises(ValueError, match=r"robot 'nobody' does not exist; robots are"):
         scenario.make_loop()
+
+
+def test_a_misspelt_name_is_answered_with_the_one_that_was_meant():
+    with pytest.raises(ValueError, match=r"did you mean 'laikago_balancing'\?"):
+        load_scenario("laikago_balncing")
+    scenario = load_scenario("laikago_balancing")
+    with pytest.raises(ValueError, match=r"no variation 'actul' \(did you mean 'actual'\?\)"):
+        scenario.variation("actul")
+    with pytest.raises(ValueError, match=r"\['recovry'\] \(did you mean 'recovery'\?\)"):
+        scenario.make_loop(recovry=False)
+    with pytest.raises(ValueError, match=r"'Balancig' \(did you mean 'Balancing'\?\)"):
+        parsed("task: drake_safety.diagrams.balancing:Balancig\nrobot: laikago\n")
+    with pytest.raises(ValueError, match=r"robot 'laikgo' does not exist \(did you mean 'laikago'"):
+        load_robot("laikgo")
 
 
 def test_an_unknown_variation_is_answered_with_those_that_exist():

@@ -18,7 +18,7 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
 from drake_safety.learning.assessment import AssessmentParameters
-from drake_safety.robots.reading import parse_yaml, reading
+from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -107,7 +107,8 @@ class Scenario:
         """
         if name not in self.variations:
             raise ValueError(
-                f"scenario '{self.name}' has no variation '{name}'; it has {list(self.variations)}"
+                f"scenario '{self.name}' has no variation '{name}'"
+                f"{did_you_mean(name, self.variations)}; it has {list(self.variations)}"
             )
         return self.variations[name]
 
@@ -244,7 +245,10 @@ def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
     known = [parameter.name for parameter in parameters if parameter.name not in common]
     unknown = [name for name in options if name not in known]
     if unknown:
-        raise ValueError(f"task '{task.__name__}' has no options {unknown}; it has {known}")
+        raise ValueError(
+            f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], known)}; it "
+            f"has {known}"
+        )
 
 
 def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
@@ -272,8 +276,8 @@ def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
     }
     if class_name not in known:
         raise ValueError(
-            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'; "
-            f"it has {list(known)}"
+            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'"
+            f"{did_you_mean(class_name, known)}; it has {list(known)}"
         )
     return known[class_name]
 
@@ -335,8 +339,8 @@ def _scenario_file(name: str | Path) -> Path:
         path = _scenario_folder() / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(
-                f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give "
-                "the path of a YAML file"
+                f"scenario '{name}' does not exist{did_you_mean(name, scenario_names())}; "
+                f"scenarios are {scenario_names()}, or give the path of a YAML file"
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
