@@ -31,6 +31,7 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     assessment_folder,
     check_fresh,
+    check_writable,
     feedback_folder,
     load_assessment,
 )
@@ -102,6 +103,7 @@ def adapt(
     print_shipped(learned)
     folder = adapted_folder(learned.out, name)
     judged: dict[str, Estimate] = {}
+    check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
             pairs = _logged_pairs(loaded, logs, log_map, seed)

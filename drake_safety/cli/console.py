@@ -7,6 +7,7 @@ import math
 import shlex
 import sys
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +30,10 @@ if TYPE_CHECKING:
 
 ScenarioArgument = Annotated[
     str,
-    typer.Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
+    typer.Argument(
+        help="Name of a scenario (see `scenarios`), or the path of your own YAML file.",
+        autocompletion=lambda incomplete: _scenario_names(incomplete),
+    ),
 ]
 AssessmentOption = Annotated[
     Path | None,
@@ -156,13 +160,23 @@ def print_shipped(folder: AssessmentFolder) -> None:
         print_path("assessment        comes with the package,", folder.path)
 
 
-def command_line(program: str = "drake-safety") -> str:
+def command_line(program: str = "drake-safety", option: str = "") -> str:
     """The command line.
 
     Args:
         program: Name of the program.
+        option: An option that is added unless it is there; "" for none.
     """
-    return shlex.join([*program.split(), *sys.argv[1:]])
+    added = [option] if option and option not in sys.argv else []
+    return shlex.join([*program.split(), *sys.argv[1:], *added])
+
+
+def _scenario_names(incomplete: str) -> list[str]:
+    """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
+    names = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
+    return sorted(
+        name.stem for name in names if name.suffix == ".yaml" and name.stem.startswith(incomplete)
+    )
 
 
 def versions() -> dict[str, str]:
