@@ -149,6 +149,31 @@ def run_episode(
     return episode
 
 
+def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The assessment's inputs for a hypothetical state and plan; nothing is simulated.
+
+    ``assessment.predict_one(*inputs_at(loop, start))`` is the verdict on them.
+
+    Args:
+        loop: The closed loop, whose task can begin with a given start.
+        start: State and plan, such as ``replace(loop.standing_start(), plan=plan)`` of a legged
+            robot.
+
+    Returns:
+        State (n_s,) without noise, desired preview (H*n_z,) and features (n_f,).
+
+    Raises:
+        ValueError: The task takes no start, or the start does not fit the plant.
+    """
+    context = loop.CreateDefaultContext()
+    require(loop, CanStartAnywhere).reset_to(context, None, start)
+    state, preview, features = (
+        loop.GetOutputPort(name).Eval(context).copy()
+        for name in ("state", "desired_preview", "features")
+    )
+    return state, preview, features
+
+
 def run_episodes(
     scenario: Scenario,
     num_episodes: int,
