@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 LINE_PERIOD_S = 10.0
 """Longest time without a line where there are no bars [s]."""
 
+StageProgress = Callable[[str, int, int], Any]
+"""Called with the name of a stage, the number done and the number wanted."""
+
 _Report = TypeVar("_Report", bound=Callable[..., Any])
 
 

@@ -189,6 +189,9 @@ class RobotModel:
     the feet and ``shapes``, for files with meshes or without shapes (URDF only)."""
     shapes: dict[str, list[CollisionShape]] = field(default_factory=dict)
     """Shapes for ``stated`` collisions, by regular expression over body names."""
+    without_collision: list[str] = field(default_factory=list)
+    """Links that lost the collision meshes of their source when ``new`` wrote the model file, and
+    have no other shape; ``check`` warns of them."""
     foot_friction: float = 0.8
     """Coulomb friction coefficient of the contact points."""
     source_dir: str = ""
