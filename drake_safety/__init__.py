@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from drake_safety.learning.segments import Episode, Episodes
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.contract import check_contract
+    from drake_safety.simulation.episode_start import EpisodeStart
     from drake_safety.simulation.recording import record_episodes
-    from drake_safety.simulation.rollouts import run_episode, run_episodes
+    from drake_safety.simulation.rollouts import inputs_at, run_episode, run_episodes
     from drake_safety.simulation.scenario import Scenario, load_scenario
     from drake_safety.systems.novelty_monitor import NoveltyMonitor
     from drake_safety.systems.recovery_switch import RecoverySwitch
@@ -26,6 +27,7 @@ __all__ = [
     "AssessmentParameters",
     "ClosedLoop",
     "Episode",
+    "EpisodeStart",
     "Episodes",
     "NoveltyMonitor",
     "RecoverySwitch",
@@ -34,6 +36,7 @@ __all__ = [
     "Scenario",
     "__version__",
     "check_contract",
+    "inputs_at",
     "load_assessment",
     "load_scenario",
     "record_episodes",
@@ -73,6 +76,7 @@ _HOMES = {
     "AssessmentParameters": "drake_safety.learning.assessment_parameters",
     "ClosedLoop": "drake_safety.simulation.closed_loop",
     "Episode": "drake_safety.learning.segments",
+    "EpisodeStart": "drake_safety.simulation.episode_start",
     "Episodes": "drake_safety.learning.segments",
     "NoveltyMonitor": "drake_safety.systems.novelty_monitor",
     "RecoverySwitch": "drake_safety.systems.recovery_switch",
@@ -80,6 +84,7 @@ _HOMES = {
     "SafetyAssessor": "drake_safety.systems.safety_assessor",
     "Scenario": "drake_safety.simulation.scenario",
     "check_contract": "drake_safety.simulation.contract",
+    "inputs_at": "drake_safety.simulation.rollouts",
     "load_assessment": "drake_safety.assessments",
     "load_scenario": "drake_safety.simulation.scenario",
     "record_episodes": "drake_safety.simulation.recording",

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from drake_safety.robots.model_files import add_to_package_map, required_file
+from drake_safety.robots.reading import did_you_mean
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
 __all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]
@@ -26,8 +27,8 @@ def load_robot(name: str) -> RobotModel:
     if Path(name).suffix in (".yaml", ".yml"):
         return load_robot_file(name)
     raise ValueError(
-        f"robot '{name}' does not exist; robots are {robot_names()}, or pass the path of a "
-        "robot.yaml"
+        f"robot '{name}' does not exist{did_you_mean(name, robot_names())}; robots are "
+        f"{robot_names()}, or pass the path of a robot.yaml"
     )
 
 

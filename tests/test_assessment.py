@@ -360,9 +360,9 @@ sys.exit(", ".join(heavy & set(sys.modules)) or 0)
 
 def test_inputs_of_another_width_are_refused_with_the_expected_one(assessment, held_out):
     state, preview, features = inputs(held_out)
-    with pytest.raises(ValueError, match=r"of 'lip': state has the shape .* expected 6 columns"):
+    with pytest.raises(ValueError, match=r"of 'lip': state has the shape \(\d+, 5\), expected \("):
         assessment.predict(state[:, 1:], preview, features)
-    with pytest.raises(ValueError, match="expected 6 columns"):
+    with pytest.raises(ValueError, match=r"state has the shape \(1, 5\), expected \(1, 6\)"):
         assessment.predict_one(state[0, 1:], preview[0], features[0])
 
 
@@ -463,9 +463,30 @@ def test_parts_of_the_input_that_are_swapped_are_refused_by_name(assessment, hel
         with pytest.raises(ValueError, match=rf"{name} has the shape \({len(state)}, \d+\), exp"):
             assessment.predict(*swapped)
     if assessment.parameters.is_sharpened:
-        for wrong in (None, features[:, :-1]):
-            with pytest.raises(ValueError, match=r"features has the shape"):
-                assessment.predict(state, preview, wrong)
+        with pytest.raises(ValueError, match=r"features has the shape"):
+            assessment.predict(state, preview, features[:, :-1])
+        with pytest.raises(ValueError, match=r"features are missing, expected \d+ columns: \["):
+            assessment.predict(state, preview)
+
+
+def test_inputs_of_other_lengths_a_single_one_and_words_are_refused_by_name(assessment, held_out):
+    state, preview, features = inputs(held_out)
+    n, width = preview.shape
+    message = rf"desired_preview has the shape \({n - 1}, {width}\), expected \({n}, {width}\), as"
+    with pytest.raises(ValueError, match=message):
+        assessment.predict(state, preview[1:], features)
+    with pytest.raises(ValueError, match=r"state has the shape \(6,\), expected \(N, n_s\)"):
+        assessment.predict(state[0], preview[0], features[0])
+    with pytest.raises(ValueError, match=r"state must be an array of numbers: .*'three'"):
+        assessment.predict([["three"] * 6], preview[:1], features[:1])
+
+
+def test_an_assessment_says_scenario_mode_and_counts(assessment, episodes):
+    mode = assessment.parameters.mode
+    assert repr(SafetyAssessment()) == "SafetyAssessment(mode 'sharpened', not fitted)"
+    told = repr(assessment)
+    assert told.startswith(f"SafetyAssessment('lip', mode '{mode}', ")
+    assert told.endswith(f"training on {len(episodes)} episodes of 'nominal')")
 
 
 def test_learning_gives_the_same_bits_for_any_number_of_threads():

@@ -2,13 +2,16 @@
 
 import json
 import math
+import os
 import shutil
+import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
 import typer
 
+import drake_safety
 from command_line import call
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.cli import app, main
@@ -115,13 +118,100 @@ def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
     assert "Usage: drake-safety scenarios" in printed.out + printed.err
 
 
-def test_a_run_that_is_stopped_says_that_episodes_are_kept(monkeypatch, capsys):
-    def stopped(arguments, **options):
+@pytest.fixture
+def stopped(monkeypatch):
+    """Simulations that are stopped at once, as by Ctrl-C."""
+
+    def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drake_safety.cli.app", stopped)
+    monkeypatch.setattr("drake_safety.simulation.rollouts.run_episodes", stop)
+
+
+def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, stopped, tmp_path):
+    out = tmp_path / "my run"
+    assert call(monkeypatch, "train", "pendulum", "--out", out, "--mode", "paper") == 130
+    line = f"continue with: drake-safety train pendulum --out '{out}' --mode paper --resume"
+    assert capsys.readouterr().out.splitlines() == ["stopped; finished episodes are kept", line]
+    # The option is not added twice.
+    assert call(monkeypatch, "train", "pendulum", "--out", out, "--resume") == 130
+    assert capsys.readouterr().out.splitlines()[1].endswith(f"--out '{out}' --resume")
+
+
+def test_what_keeps_its_episodes_is_continued_by_the_same_command(
+    monkeypatch, capsys, stopped, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "calibrate", "laikago_balancing", "--episodes", 7) == 130
+    (line,) = capsys.readouterr().out.splitlines()[-1:]
+    assert line == "continue with: drake-safety calibrate laikago_balancing --episodes 7"
+
+
+def test_sigterm_says_what_continues_too(tmp_path):
+    program = (
+        "import os, signal; import drake_safety.simulation.rollouts as rollouts;"
+        "rollouts.run_episodes = lambda *a, **k: os.kill(os.getpid(), signal.SIGTERM);"
+        "from drake_safety.cli import main; main()"
+    )
+    arguments = ["train", "pendulum", "--out", str(tmp_path)]
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 130
+    assert f"continue with: drake-safety train pendulum --out {tmp_path} --resume" in ended.stdout
+
+
+def test_a_command_that_keeps_nothing_is_not_continued(monkeypatch, capsys):
+    def stop(arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("drake_safety.cli.app", stop)
     assert call(monkeypatch, "scenarios") == 130
-    assert "finished episodes are kept" in capsys.readouterr().out
+    assert capsys.readouterr().out == "stopped; finished episodes are kept\n"
+
+
+def test_the_version_is_that_of_the_package(monkeypatch, capsys):
+    assert call(monkeypatch, "--version") in (0, None)
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"drake-safety {drake_safety.__version__}, drake ")
+
+
+def test_a_shell_completes_commands_and_scenarios_without_drake():
+    program = "import sys; sys.modules['pydrake'] = None; from drake_safety.cli import main; main()"
+    for words, found in (
+        ("drake-safety cal", "calibrate"),
+        ("drake-safety train pend", "pendulum"),
+    ):
+        asked = {
+            "_DRAKE_SAFETY_COMPLETE": "complete_bash",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(words.count(" ")),
+        }
+        ended = subprocess.run(
+            [sys.executable, "-c", program],
+            env=os.environ | asked,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ended.stdout.split() == [found]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (["train", "pendulum", "--out"], "file"),
+        (["compare", "pendulum", "--out"], "file/inside"),
+        (["evaluate", "pendulum", "--assessment", ".", "--out"], "file"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
+    monkeypatch, capsys, stopped, tmp_path, arguments, what
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert call(monkeypatch, *arguments, what) == 2
+    assert f"error folder '{what}' cannot be written" in capsys.readouterr().out
 
 
 def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):

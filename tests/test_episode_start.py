@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from balancing_loops import PACKAGED, standing_loop
 from cart_episodes import ARRAYS
-from drake_safety import load_scenario, run_episode
+from drake_safety import inputs_at, load_scenario, run_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episode_rng
 from gliding_task import gliding
@@ -77,6 +77,17 @@ def test_without_a_generator_the_first_instant_is_seen_as_it_is(balancing):
     np.testing.assert_array_equal(evaluated(balancing, context, "state"), true_state)
     balancing.reset_to(context, np.random.default_rng(0), start)
     assert not np.array_equal(evaluated(balancing, context, "state"), true_state)
+
+
+def test_inputs_of_a_hypothetical_start_are_those_of_its_first_row(balancing):
+    start = balancing.standing_start()
+    first = run_episode(balancing, start=start)
+    state, preview, features = inputs_at(balancing, start)
+    np.testing.assert_allclose(state, first.true_state[0], atol=1e-12)
+    np.testing.assert_allclose(preview, first.desired_preview[0], atol=1e-12)
+    assert features.shape == first.features[0].shape
+    with pytest.raises(ValueError, match="has no episodes from a given start"):
+        inputs_at(gliding().make_loop(), start)
 
 
 def test_feet_that_are_not_named_stand_on_the_ground_below_where_they_are():

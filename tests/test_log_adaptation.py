@@ -11,7 +11,15 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
-from log_files import FORMATS, balancing_loop, balancing_scenario, map_text, recorded, write
+from log_files import (
+    FORMATS,
+    balancing_loop,
+    balancing_scenario,
+    frame_of,
+    map_text,
+    recorded,
+    write,
+)
 
 INDICES = (10, 0)
 
@@ -98,3 +106,39 @@ def test_a_log_that_is_given_twice_or_without_a_map_is_refused(folder, capsys, m
     twice = ("--log", log, "--log", log, "--map", log)
     assert call(monkeypatch, *asked, *twice) == 2
     assert "logs must differ" in capsys.readouterr().out
+
+
+def logged(index, folder, **missing):
+    """A recorded run as a CSV file, without the values of some rows by column, and its map."""
+    frame = frame_of(recorded(index), balancing_loop().kinematics.joint_names)
+    for column, row in missing.items():
+        frame.loc[row, column] = np.nan
+    frame.to_csv(folder / "run.csv", index=False)
+    (folder / "columns.yaml").write_text(map_text("csv"))
+    return "--log", folder / "run.csv", "--map", folder / "columns.yaml"
+
+
+def test_a_log_is_cut_where_a_value_is_missing_and_strictly_refused(
+    folder, capsys, monkeypatch, tmp_path
+):
+    options = ("--assessment", folder, "--out", tmp_path / "out")
+    log = logged(0, tmp_path, gyro_x=20)
+    assert not call(monkeypatch, "adapt", folder / "short.yaml", *log, *options)
+    printed = capsys.readouterr().out
+    assert "99.2 % of 0.6 s are kept, in 2 pieces" in printed
+    assert "line 22, column 'gyro_x': the value is nan" in printed
+    assert load(tmp_path / "out", "sharpened").adaptation_.num_sets == 1
+    assert call(monkeypatch, "adapt", folder / "short.yaml", *log, *options, "--strict") == 2
+    assert "line 22, column 'gyro_x': the value is nan, expected" in capsys.readouterr().out
+
+
+def test_a_short_log_without_a_difference_is_said_to_change_nothing(
+    folder, capsys, monkeypatch, tmp_path
+):
+    options = ("--assessment", folder, "--out", tmp_path / "out")
+    log = logged(0, tmp_path)
+    assert not call(monkeypatch, "adapt", folder / "short.yaml", *log, *options)
+    printed = capsys.readouterr().out
+    assert "nothing changed (sharpened): the only pair ends as on the nominal plant" in printed
+    assert "about 40 pairs, as of 24 s of logs" in printed
+    assert "unchanged" in printed and "+0.00" not in printed

@@ -104,7 +104,7 @@ SPOILT = {
     "a missing column": (lambda f: f.drop(columns=["base_y"]), [],
                          r"no columns \['base_y'\]; it has .*'base_x', 'base_z'"),
     "an empty cell": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7)), [],
-                      "line 9, column 'gyro_x': '' is not a number"),
+                      "line 9, column 'gyro_x': the value is nan"),
     "a NaN": (lambda f: f.assign(gyro_x=f.gyro_x.where(f.index != 7, np.inf)), [],
               "line 9, column 'gyro_x': the value is inf"),
     "a word": (lambda f: f.assign(goal_x=["stop", *f.goal_x[1:]]), [],
@@ -170,7 +170,7 @@ def test_a_file_that_was_cut_off_is_refused(kind, few_rows, tmp_path):
 def test_a_line_that_was_cut_off_is_refused(few_rows, tmp_path):
     path = write(few_rows, JOINTS, "csv", tmp_path)
     path.write_text(path.read_text().rsplit(",", 30)[0])
-    with pytest.raises(ValueError, match=r"line 41, column .* is not a number"):
+    with pytest.raises(ValueError, match=r"line 41, column .*: the value is nan"):
         read_log(path, map_of("csv", tmp_path), ROBOT)
 
 

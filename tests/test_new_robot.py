@@ -180,6 +180,73 @@ def test_a_base_whose_shape_is_a_mesh_collides_as_its_box(tmp_path):
     assert problems(written.folder / "balancing.yaml") == {}
 
 
+@pytest.fixture
+def bare(tmp_path):
+    """A URDF two of whose links collide by meshes that Drake does not read."""
+    shape = '<collision><geometry><mesh filename="femur.stl"/></geometry></collision></link>'
+    stl(tmp_path / "femur.stl", [[0, 0, 0], [0.1, 0.02, 0.02], [0.1, 0.0, 0.0]])
+
+    def changed(text):
+        for name in ("femur_0", "femur_1"):
+            head, found, tail = text.partition(f'<link name="{name}">')
+            assert found
+            text = head + found + tail.replace("</link>", shape, 1)
+        return text
+
+    return urdf_of_spider(tmp_path, changed)
+
+
+def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
+    out = tmp_path / "spider"
+    result = CliRunner().invoke(app, ["new", "spider", "--urdf", str(bare), "--out", str(out)])
+    assert result.exit_code == 0
+    assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
+    assert "everything passes through femur_0, femur_1. Add boxes" in result.output
+    assert yaml.safe_load((out / "robot.yaml").read_text())["without_collision"] == [
+        "femur_0",
+        "femur_1",
+    ]
+
+
+def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path):
+    written = write_robot("spider", bare, "balancing", tmp_path / "spider")
+    file = written.folder / "balancing.yaml"
+    result = CliRunner().invoke(app, ["check", str(file), "--quick"])
+    assert result.exit_code == 0
+    assert "warning  collision shapes: 2 links have none" in result.output
+    assert "mend: add a <collision> with a box, sphere or capsule [m]" in result.output
+    urdf = written.files[0]
+    box = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision></link>'
+    head, found, tail = urdf.read_text().partition('<link name="femur_0"')
+    urdf.write_text(head + found + tail.replace("</link>", box, 1))
+    (finding,) = (f for f in check_scenario(file, num_episodes=0) if f.item == "collision shapes")
+    assert finding.is_warning and finding.message.endswith("passes through femur_1")
+    edited(written.folder / "robot.yaml", without_collision=["femur_0"])
+    (finding,) = (f for f in check_scenario(file, num_episodes=0) if f.item == "collision shapes")
+    assert finding.is_ok and not finding.is_warning
+
+
+def test_a_quick_check_leaves_out_the_episodes_and_says_so(spider):
+    file = spider.folder / "balancing.yaml"
+    result = CliRunner().invoke(app, ["check", str(file), "--quick"])
+    assert result.exit_code == 0
+    assert "starts can be sampled" not in result.output
+    assert "not checked: the share of unsafe episodes" in result.output
+
+
+def test_a_check_says_how_far_it_is(spider):
+    file, told = spider.folder / "balancing.yaml", []
+    for _ in check_scenario(file, num_episodes=2, progress=lambda *count: told.append(count)):
+        pass
+    assert told == [
+        ("stands for 1 s", 0, 1),
+        ("stands for 1 s", 1, 1),
+        ("episodes", 0, 2),
+        ("episodes", 1, 2),
+        ("episodes", 2, 2),
+    ]
+
+
 def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
     urdf = urdf_of_spider(
         tmp_path, lambda text: re.sub("<collision>.*?</collision>", "", text, count=1)

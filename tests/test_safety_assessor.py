@@ -124,6 +124,12 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
         np.testing.assert_allclose(value(assessor, context, name), numbers)
 
 
+def test_before_the_first_evaluation_nothing_is_known():
+    _, assessor, _, context = running()
+    np.testing.assert_array_equal(value(assessor, context, "belief"), [0.0, 0.0, 1.0])
+    assert value(assessor, context, "safety_probability") == [0.0]
+
+
 def test_the_assessment_is_asked_with_what_stands_at_the_ports():
     assessment, _, simulator, _ = running()
     simulator.Initialize()

@@ -1,13 +1,17 @@
 """A scenario is one YAML file; what it misspells is answered with what exists."""
 
 import importlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import drake_safety
 import gliding_task
 from drake_safety import load_scenario
+from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation import scenario as scenario_module
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -58,6 +62,80 @@ def test_an_own_task_in_an_own_folder_needs_no_line_in_the_package(tmp_path):
     assert isinstance(scenario.make_loop(), Gliding)
 
 
+@pytest.fixture
+def beside(tmp_path):
+    """A scenario whose task, and a module that this imports, stand in its own folder."""
+    module = Path(gliding_task.__file__).read_text()
+    imported = "from beside_period import period\n\nCONTROL_PERIOD_S = period()"
+    lines = module.replace("CONTROL_PERIOD_S = 0.01", imported)
+    (tmp_path / "beside_task.py").write_text(lines)
+    (tmp_path / "beside_period.py").write_text("def period():\n    return 0.01\n")
+    path = tmp_path / "beside.yaml"
+    path.write_text(SCENARIO.replace("gliding_task:", "beside_task:"))
+    yield path
+    for name in ("beside_task", "beside_period"):
+        sys.modules.pop(name, None)
+
+
+def test_a_task_beside_its_scenario_is_found_and_nothing_else_afterwards(beside):
+    searched = list(sys.path)
+    scenario = load_scenario(beside)
+    assert scenario.task_class().__module__ == "beside_task"
+    assert scenario.simulation_hash() == load_scenario(beside).simulation_hash()
+    names = {path.name for path in scenario_module.own_files(sys.modules["beside_task"])}
+    assert names == {"beside_task.py", "beside_period.py"}
+    assert sys.path == searched
+    with pytest.raises(ValueError, match=r"no module 'beside_other' .*beside the scenario"):
+        load_scenario(changed(beside, "beside_task:", "beside_other:"))
+
+
+def changed(path, old, new):
+    path.write_text(path.read_text().replace(old, new))
+    return path
+
+
+def test_a_task_beside_its_scenario_runs_in_worker_processes(beside):
+    code = (
+        "from drake_safety import load_scenario, run_episodes\n"
+        f"scenario = load_scenario({str(beside)!r})\n"
+        "episodes = run_episodes(scenario, 12, num_workers=2)\n"
+        "same = run_episodes(scenario, 12, num_workers=1)\n"
+        "assert all((a.state == b.state).all() for a, b in zip(episodes, same, strict=True))"
+    )
+    # The folder is neither that of the process nor on its path.
+    environment = os.environ | {"PYTHONPATH": str(Path(drake_safety.__file__).parents[1])}
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(
+        command, cwd="/", env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_a_task_of_a_name_that_is_taken_is_refused_with_both_files(beside, tmp_path):
+    load_scenario(beside)
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("beside.yaml", "beside_task.py", "beside_period.py"):
+        (other / name).write_text((tmp_path / name).read_text())
+    with pytest.raises(
+        ValueError, match=r"module 'beside_task' is .*, and not .*other/beside_task"
+    ):
+        load_scenario(other / "beside.yaml")
+    # A module that is installed is not replaced by a file beside the scenario either.
+    (tmp_path / "yaml.py").write_text("")
+    with pytest.raises(ValueError, match=r"module 'yaml' is .*: give the file a name of its own"):
+        load_scenario(changed(beside, "beside_task:", "yaml:"))
+
+
+def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run(beside):
+    findings = list(check_scenario(beside, is_imported=False))
+    assert findings[0].is_ok and "was not imported" in findings[1].message
+    assert "beside_task" not in sys.modules
+    # A text, as that of a run's report, says nothing of a folder either.
+    with pytest.raises(ValueError, match="no module 'beside_task'"):
+        parse_scenario(beside.read_text(), name="beside", folder=beside.parent)
+
+
 def test_an_option_that_the_task_does_not_have_is_answered_with_those_it_has():
     with pytest.raises(ValueError, match=r"'Gliding' has no options \['ball'\]; it has \[\]"):
         parsed(SCENARIO).make_loop(ball=True)
@@ -87,7 +165,10 @@ def test_a_missing_scenario_file_is_named(tmp_path):
         ("robot: none", "must be a mapping with the key 'task'"),
         (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
         (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
-        (BALANCING + "parameters: {push: {sharee: 1}}", "'push.sharee'; keys there are .*'share'"),
+        (
+            BALANCING + "parameters: {push: {sharee: 1}}",
+            "push.sharee' .* keys there are .*'share'",
+        ),
         (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
         (
             BALANCING + "parameters: {demonstration: [{mas_kg: 1}]}",
@@ -95,7 +176,25 @@ def test_a_missing_scenario_file_is_named(tmp_path):
         ),
         (BALANCING + "parameters: {demonstration: [{mass_kg: 0}]}", "throw: mass_kg must be pos"),
         (BALANCING + "parameters: 3", "parameters: this must be a mapping"),
-        (BALANCING + "step_s: fast", "scenario 'mine'.*float.*fast"),
+        (BALANCING + "step_s: fast", "scenario 'mine': 'step_s' must be a number; got 'fast'"),
+        (BALANCING + "step_s: [1]", r"'step_s' must be a number; got \[1\]"),
+        (
+            BALANCING + "variations: {nominal: {mass_scale: heavy}}",
+            "'variations.nominal.mass_scale' must be a number; got 'heavy'",
+        ),
+        (
+            BALANCING + "parameters: {safe_set: {height_m: [1, two]}}",
+            "'safe_set.height_m.1' must be a number; got 'two'",
+        ),
+        (
+            BALANCING + "parameters: {safe_set: {height_m: 3}}",
+            "'safe_set.height_m' must be a list; got 3",
+        ),
+        (BALANCING + "assessment: {horizon: 1.5}", "'assessment.horizon' must be an integer"),
+        (
+            BALANCING + "assessment: {horzon: 3}",
+            r"horzon' \(did you mean 'horizon'\?\)",
+        ),
         (BALANCING + "assessment: {mode: dull}", r"unknown mode 'dull'.*'paper', 'sharpened'"),
         (BALANCING + "step_s: 0", "step_s must be positive and finite; got 0"),
         (BALANCING + "step_s: .nan", "step_s must be positive and finite; got nan"),
@@ -140,6 +239,20 @@ def test_an_unknown_robot_is_answered_with_those_that_exist():
     )
     with pytest.raises(ValueError, match=r"robot 'nobody' does not exist; robots are"):
         scenario.make_loop()
+
+
+def test_a_misspelt_name_is_answered_with_the_one_that_was_meant():
+    with pytest.raises(ValueError, match=r"did you mean 'laikago_balancing'\?"):
+        load_scenario("laikago_balncing")
+    scenario = load_scenario("laikago_balancing")
+    with pytest.raises(ValueError, match=r"no variation 'actul' \(did you mean 'actual'\?\)"):
+        scenario.variation("actul")
+    with pytest.raises(ValueError, match=r"\['recovry'\] \(did you mean 'recovery'\?\)"):
+        scenario.make_loop(recovry=False)
+    with pytest.raises(ValueError, match=r"'Balancig' \(did you mean 'Balancing'\?\)"):
+        parsed("task: drake_safety.diagrams.balancing:Balancig\nrobot: laikago\n")
+    with pytest.raises(ValueError, match=r"robot 'laikgo' does not exist \(did you mean 'laikago'"):
+        load_robot("laikgo")
 
 
 def test_an_unknown_variation_is_answered_with_those_that_exist():

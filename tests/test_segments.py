@@ -182,3 +182,31 @@ def test_samples_of_a_segment_are_a_preview_stride_apart_and_so_are_the_steps_of
             assert segments.score[i] == pytest.approx(expected)
     with pytest.raises(ValueError, match="preview_stride is 0, expected >= 1"):
         dataclasses.replace(info, preview_stride=0)
+
+
+def test_a_set_says_scenario_plant_and_counts(episodes):
+    assert repr(episodes) == (
+        f"Episodes('lip', variation 'nominal', seed {episodes.info.seed}, 40 episodes: "
+        f"{episodes.num_safe} safe, {episodes.num_unsafe} unsafe)"
+    )
+    assert repr(episodes[:0]).endswith("0 episodes)")
+
+
+def test_a_table_has_every_row_and_every_column_by_name(episodes):
+    table = episodes.to_frame()
+    info = episodes.info
+    assert table.num_rows == sum(len(episode.time_s) for episode in episodes)
+    assert table.num_columns == 6 + sum(info.widths.values())
+    is_of_it = table["episode"].to_numpy() == episodes[3].index
+    for name, array in {
+        f"state.{info.state_names[1]}": episodes[3].state[:, 1],
+        f"margins.{info.constraint_names[0]}": episodes[3].margins[:, 0],
+        f"desired_preview.{info.output_names[-1]}[{HORIZON - 1}]": (
+            episodes[3].desired_preview[:, -1]
+        ),
+        "time_s": episodes[3].time_s,
+    }.items():
+        np.testing.assert_array_equal(table[name].to_numpy()[is_of_it], array)
+    causes = set(np.array(table["cause"].to_pylist())[is_of_it])
+    assert causes == {episodes[3].cause}
+    assert episodes[:0].to_frame().column_names == table.column_names

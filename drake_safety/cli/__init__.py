@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
 from rich.logging import RichHandler
@@ -26,7 +27,7 @@ from drake_safety.cli import (
     run,
     train,
 )
-from drake_safety.cli.console import console
+from drake_safety.cli.console import command_line, console
 from drake_safety.cli.targets import TargetCommand
 
 # In the order in which the help lists them.
@@ -45,6 +46,8 @@ _COMMANDS = (
     report.report,
 )
 
+# What continues a stopped command that keeps finished episodes: the same line with this option.
+_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "compare": "", "adapt": ""}
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 
@@ -68,19 +71,43 @@ app = typer.Typer(
     f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
     no_args_is_help=True,
     rich_markup_mode=None,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for _command in _COMMANDS:
     app.command(cls=_Command)(_command)
 
 
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        from drake_safety.learning.segments import installed_versions
+
+        found = installed_versions("drake")
+        console.print(
+            f"drake-safety {found['drake_safety']}, drake {found['drake']}, "
+            f"Python {sys.version.split()[0]}",
+            highlight=False,
+        )
+        raise typer.Exit()
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
 def main() -> None:
     """Runs the command."""
-    run_app(app, "drake-safety")
+    run_app(app, "drake-safety", _RESUMED)
 
 
-def run_app(commands: typer.Typer, program: str) -> None:
+def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | None = None) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
     SIGTERM stops it as Ctrl-C does.
@@ -88,6 +115,7 @@ def run_app(commands: typer.Typer, program: str) -> None:
     Args:
         commands: The commands.
         program: Name of the program.
+        resumed: Commands that can be continued after Ctrl-C, and the option that does so or "".
     """
     handler = RichHandler(console=console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
@@ -100,6 +128,10 @@ def run_app(commands: typer.Typer, program: str) -> None:
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         console.print("stopped; finished episodes are kept", highlight=False)
+        option = (resumed or {}).get(next(iter(arguments), ""))
+        if option is not None:
+            line = command_line(program, option)
+            console.print("continue with:", line, highlight=False, soft_wrap=True)
         sys.exit(_STOPPED)
     except Exception as error:
         from drake_safety.learning.segments import EpisodeError

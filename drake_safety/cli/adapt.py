@@ -31,6 +31,7 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     assessment_folder,
     check_fresh,
+    check_writable,
     feedback_folder,
     load_assessment,
 )
@@ -40,11 +41,13 @@ if TYPE_CHECKING:
     from drake_safety.evaluation.metrics import Estimate
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
+    from drake_safety.logs.robot_log import LogPieces, RobotLog
     from drake_safety.simulation.feedback import EpisodePairs
     from drake_safety.simulation.scenario import Scenario
 
 _JUDGED = {"before": "before feedback", "after": "after feedback"}
 _COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
+_MOST_CUTS = 3  # Printed of a log.
 _THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
 
 
@@ -69,6 +72,16 @@ def adapt(
     log_map: Annotated[
         Path | None, typer.Option("--map", help="Map of the columns of the logs, a YAML file.")
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; ASSESSMENT/adapted-VARIATION by default.")
+    ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict",
+            help="Refuse a log with a missing value or a gap, instead of cutting it there.",
+        ),
+    ] = False,
     seed: Annotated[
         int, typer.Option(help="Seed of the feedback; that of the evaluation follows.")
     ] = ADAPTATION.first,
@@ -100,11 +113,12 @@ def adapt(
         raise ValueError(f"adapt: logs must differ; got {', '.join(str(one) for one in logs)}")
     name = logs[0].stem if logs else variation
     print_shipped(learned)
-    folder = adapted_folder(learned.out, name)
+    folder = out or adapted_folder(learned.out, name)
     judged: dict[str, Estimate] = {}
+    check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
-            pairs = _logged_pairs(loaded, logs, log_map, seed)
+            pairs = _logged_pairs(loaded, logs, log_map, seed, is_strict=strict)
         else:
             pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
         sets = pairs.feedback()
@@ -147,6 +161,8 @@ def adapt(
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(_adaptation_table(adapted, differing, num_pairs, name))
+    if not differing:
+        _print_unchanged(loaded, adapted, num_pairs)
     if judged:
         console.print(_judged_table(judged, variation))
     for mode in adapted:
@@ -226,15 +242,64 @@ def fresh_actual_episodes(
     )
 
 
-def _logged_pairs(scenario: Scenario, logs: list[Path], log_map: Path, seed: int) -> EpisodePairs:
+def _logged_pairs(
+    scenario: Scenario, logs: list[Path], log_map: Path, seed: int, *, is_strict: bool
+) -> EpisodePairs:
     from drake_safety.logs.episodes import cut_log
-    from drake_safety.logs.robot_log import read_log
+    from drake_safety.logs.robot_log import read_log, read_pieces
     from drake_safety.models import load_robot
     from drake_safety.simulation.feedback import pair_starts
 
     robot = load_robot(scenario.robot)
-    actual, starts = cut_log([read_log(log, log_map, robot) for log in logs], scenario)
+    pieces: list[RobotLog] = []
+    for log in logs:
+        if is_strict:
+            pieces.append(read_log(log, log_map, robot))
+            continue
+        found = read_pieces(log, log_map, robot)
+        pieces += found.pieces
+        if found.cuts:
+            _print_cuts(log, found)
+    actual, starts = cut_log(pieces, scenario)
     return pair_starts(scenario, actual, starts, seed=seed)
+
+
+def _print_unchanged(
+    scenario: Scenario, adapted: dict[str, SafetyAssessment], num_pairs: int
+) -> None:
+    """Says which modes have learned nothing from pairs that all end alike, and what it takes."""
+    unchanged = [mode for mode, one in adapted.items() if _is_unchanged(one)]
+    if not unchanged:
+        return
+    num_needed = scenario.assessment.adaptation.update_interval
+    duration_s = num_needed * scenario.episode_duration_s
+    pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
+    console.print(
+        f"nothing changed ({', '.join(unchanged)}): {pairs} as on the nominal plant, and it learns "
+        f"from those that do not. A first update takes about {num_needed} pairs, as of "
+        f"{duration_s:g} s of logs, some of which end otherwise",
+        style="yellow",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _is_unchanged(adapted: SafetyAssessment) -> bool:
+    found = adapted.adaptation_
+    is_corrected = found is not None and found.method == "recalibration"
+    return is_corrected and not adapted.correction_.is_any
+
+
+def _print_cuts(log: Path, found: LogPieces) -> None:
+    lines = [
+        f"log '{log}' is cut where values are missing and at gaps: {100 * found.kept_share:.1f} % "
+        f"of {found.duration_s:.1f} s are kept, in {len(found.pieces)} pieces",
+        *found.cuts[:_MOST_CUTS],
+    ]
+    if len(found.cuts) > _MOST_CUTS:
+        lines.append(f"... and {len(found.cuts) - _MOST_CUTS} more; --strict refuses such a log")
+    for line in lines:
+        console.print(line, style="yellow", highlight=False, soft_wrap=True)
 
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
@@ -272,6 +337,8 @@ def _adaptation_table(
         if found is not None:
             is_changed = found.method == "recalibration"
             change = [f"{value:+.2f}" if is_changed else "-" for value in one.correction_.change]
+            if _is_unchanged(one):
+                change = ["unchanged"] * len(change)
             table.add_row(mode, found.method, *change)
     return table
 

@@ -24,6 +24,7 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     assessment_folder,
     check_fresh,
+    check_writable,
     load_assessment,
     run_fresh_episodes,
 )
@@ -94,6 +95,7 @@ def calibrate(
     for gamma in learned.values():
         check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
+    check_writable(folder.out)
     with open_stages() as stages:
         progress = partial(stages, "calibration episodes")
         fresh = run_fresh_episodes(

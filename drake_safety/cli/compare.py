@@ -18,6 +18,7 @@ from drake_safety.cli.console import (
     print_path,
     versions,
 )
+from drake_safety.cli.training_folder import check_writable
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.report.tables import Table
@@ -57,6 +58,7 @@ def compare(
     if twice:
         raise ValueError(f"compare: {twice} are named more than once")
     effort = Effort(num_episodes=episodes, num_fresh=fresh, num_throws=throws, seed=seed)
+    check_writable(out)
     rows = []
     with open_stages() as stages:
         for scenario in loaded:

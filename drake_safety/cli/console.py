@@ -7,21 +7,16 @@ import math
 import shlex
 import sys
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Column, Table
+
+from drake_safety.learning import progress
+from drake_safety.learning.progress import Stages
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +30,10 @@ if TYPE_CHECKING:
 
 ScenarioArgument = Annotated[
     str,
-    typer.Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
+    typer.Argument(
+        help="Name of a scenario (see `scenarios`), or the path of your own YAML file.",
+        autocompletion=lambda incomplete: _scenario_names(incomplete),
+    ),
 ]
 AssessmentOption = Annotated[
     Path | None,
@@ -162,13 +160,23 @@ def print_shipped(folder: AssessmentFolder) -> None:
         print_path("assessment        comes with the package,", folder.path)
 
 
-def command_line(program: str = "drake-safety") -> str:
+def command_line(program: str = "drake-safety", option: str = "") -> str:
     """The command line.
 
     Args:
         program: Name of the program.
+        option: An option that is added unless it is there; "" for none.
     """
-    return shlex.join([*program.split(), *sys.argv[1:]])
+    added = [option] if option and option not in sys.argv else []
+    return shlex.join([*program.split(), *sys.argv[1:], *added])
+
+
+def _scenario_names(incomplete: str) -> list[str]:
+    """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
+    names = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
+    return sorted(
+        name.stem for name in names if name.suffix == ".yaml" and name.stem.startswith(incomplete)
+    )
 
 
 def versions() -> dict[str, str]:
@@ -178,40 +186,8 @@ def versions() -> dict[str, str]:
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
-class Stages:
-    """Progress bars, one a stage, with the remaining time.
-
-    Args:
-        progress: Display of the bars.
-    """
-
-    def __init__(self, progress: Progress):
-        self._progress = progress
-        self._tasks: dict[str, TaskID] = {}
-
-    def __call__(self, stage: str, done: float, total: float) -> None:
-        """Updates the bar of a stage, created at the first call.
-
-        Args:
-            stage: Name of the stage.
-            done: Number done.
-            total: Number wanted.
-        """
-        if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(stage, total=total)
-        self._progress.update(self._tasks[stage], completed=done, total=total)
-
-
 @contextlib.contextmanager
 def open_stages() -> Iterator[Stages]:
-    """Shows progress bars while the block runs."""
-    columns = (
-        TextColumn("{task.description:<34}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        yield Stages(progress)
+    """Shows progress while the block runs: bars on a terminal, a line every 10 s elsewhere."""
+    with progress.open_stages(console) as stages:
+        yield stages

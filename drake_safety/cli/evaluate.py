@@ -34,6 +34,7 @@ from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
     check_fresh,
+    check_writable,
     episodes_folder,
     load_assessment,
     run_fresh_episodes,
@@ -138,6 +139,7 @@ def evaluate(
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
+    check_writable(assessment, out or assessment)
     if shifts:
         evaluate_shifts_command(
             loaded,

@@ -6,9 +6,23 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
-from drake_safety.cli.console import ScenarioArgument, console, new_table, print_path
+from drake_safety.cli.console import (
+    ScenarioArgument,
+    console,
+    new_table,
+    open_stages,
+    print_path,
+)
 from drake_safety.learning.seeds import DEMONSTRATION
+
+# By whether a check passed, and whether with a warning.
+_WORDS = {
+    (True, False): ("OK     ", "green"),
+    (True, True): ("warning", "bold yellow"),
+    (False, False): ("problem", "red"),
+}
 
 
 def scenarios() -> None:
@@ -94,6 +108,16 @@ def new(
         print_path("wrote", path)
     for what in written.left_out:
         console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    if written.bare:
+        console.print(
+            f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
+            "missing or no OBJ, glTF or VTK: everything passes through "
+            f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
+            style="bold red",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
     for what in asked:
         console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     print_path("next: drake-safety check", written.files[-1])
@@ -104,6 +128,9 @@ def check(
     episodes: Annotated[
         int, typer.Option(help="Episodes simulated for the share of unsafe ones.", min=0)
     ] = 16,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave these episodes out, as by --episodes 0.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
     import_: Annotated[
         bool,
@@ -121,22 +148,29 @@ def check(
     from drake_safety.simulation.scenario_check import check_scenario
 
     num_problems = 0
-    findings = check_scenario(scenario, num_episodes=episodes, seed=seed, is_imported=import_)
-    for finding in findings:
-        num_problems += not finding.is_ok
-        word, style = ("OK     ", "green") if finding.is_ok else ("problem", "red")
-        console.print(f"{word}  ", style=style, end="")
-        console.print(
-            f"{finding.item}: {finding.message}", markup=False, highlight=False, soft_wrap=True
-        )
-        if not finding.is_ok:
-            console.print(
-                f"         mend: {finding.remedy}", markup=False, highlight=False, soft_wrap=True
-            )
+    with open_stages() as stages:
+        for finding in check_scenario(
+            scenario,
+            num_episodes=0 if quick else episodes,
+            seed=seed,
+            is_imported=import_,
+            progress=stages,
+        ):
+            num_problems += not finding.is_ok
+            word, style = _WORDS[finding.is_ok, finding.is_warning]
+            text = Text.assemble((word, style), f"  {finding.item}: {finding.message}")
+            if finding.remedy:
+                text.append(f"\n         mend: {finding.remedy}")
+            console.print(text, highlight=False, soft_wrap=True)
     if num_problems:
         console.print(f"{num_problems} problems", style="red", highlight=False)
         raise typer.Exit(1)
     if import_:
+        if quick:
+            console.print(
+                "not checked: the share of unsafe episodes; leave out --quick before you train",
+                highlight=False,
+            )
         console.print("ready: drake-safety train", scenario, "--out FOLDER", highlight=False)
     else:
         console.print("its files are right; its code was not run", highlight=False)

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from drake_safety.cli.console import console
+from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -92,7 +93,8 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     if len(entries) == 3 and all(map(_is_number, entries)):
         return np.array([float(entry) for entry in entries])
     raise ValueError(
-        f"{words.goal} '{text}': give {' '.join(words.axes)}, three numbers "
+        f"{words.goal} '{text}'{did_you_mean(text, named_targets)}: give {' '.join(words.axes)}, "
+        "three numbers "
         f"[{', '.join(words.units)}], or one of the names that scenario '{loop.scenario.name}' "
         f"gives: {list(named_targets)}"
     )

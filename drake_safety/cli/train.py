@@ -27,6 +27,7 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
+    check_writable,
     episodes_folder,
     training_options,
 )
@@ -80,6 +81,7 @@ def train(
                 f"{folder} already holds {len(completed(folder))} episodes: pass --resume to "
                 "continue with them, or choose another --out"
             )
+    check_writable(out)
     with open_stages() as stages:
         for folder, options in sets.items():
             run_episodes(

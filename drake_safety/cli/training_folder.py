@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -220,6 +221,31 @@ def check_fresh(
             f"{scenario_hash[:12]}: train again"
         )
     assessment.check_unused(*seeds)
+
+
+def check_writable(*folders: Path) -> None:
+    """Checks that files can be written into folders, before hours of simulations.
+
+    Nothing is left behind; folders that do not exist are not made.
+
+    Args:
+        *folders: Folders of results.
+
+    Raises:
+        ValueError: A folder cannot be written; the message says what is in the way.
+    """
+    for folder in folders:
+        nearest = folder.absolute()
+        while not nearest.exists() and nearest != nearest.parent:
+            nearest = nearest.parent
+        try:
+            with tempfile.TemporaryFile(dir=nearest):
+                pass
+        except OSError as error:
+            where = "" if nearest == folder.absolute() else f" in '{nearest}'"
+            raise ValueError(
+                f"folder '{folder}' cannot be written{where}: {error.strerror}; choose another"
+            ) from error
 
 
 def goal_threshold(folder: Path, assessment: SafetyAssessment) -> GoalThreshold:

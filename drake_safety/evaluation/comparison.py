@@ -19,6 +19,7 @@ from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
+from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.capabilities import HasBall, judging_options
@@ -62,7 +63,7 @@ def compare_scenario(
     effort: Effort,
     *,
     num_workers: int | None = None,
-    progress: StageProgress,
+    progress: StageProgress | bool | None = None,
 ) -> dict[str, Any]:
     """Trains and evaluates Γ of a scenario, and reuses what the folder already holds.
 
@@ -74,7 +75,7 @@ def compare_scenario(
         folder: Folder of its episodes, its assessment and its row.
         effort: Numbers of simulations.
         num_workers: Number of worker processes.
-        progress: Called with a stage, the number done and the number wanted.
+        progress: Called with a stage, the number done and the number wanted; True shows it.
 
     Returns:
         The row: names and numbers, and for each estimate its value, interval and n.
@@ -99,48 +100,52 @@ def compare_scenario(
     seed, robot = effort.seed, scenario.robot
     seeds = EVALUATION.seeds(EVALUATION.first + seed)
     judging = judging_options(scenario.task_class())
-    training = run(
-        effort.num_episodes,
-        seed=seed,
-        path=folder / "episodes",
-        progress=partial(progress, f"{scenario.name}: training"),
-    )
-    fresh, calibration = (
-        run(
-            number,
-            seed=seeds[purpose],
-            path=folder / name,
-            progress=partial(progress, f"{scenario.name}: {name}"),
-            **judging,
+    with shown(progress, lambda stages: stages) as given:
+        report = given or (lambda stage, done, total: None)
+        training = run(
+            effort.num_episodes,
+            seed=seed,
+            path=folder / "episodes",
+            progress=partial(report, f"{scenario.name}: training"),
         )
-        for name, number, purpose in (
-            ("fresh", effort.num_fresh, "evaluation"),
-            ("calibration", max(effort.num_fresh // 2, 20), "thresholds"),
+        fresh, calibration = (
+            run(
+                number,
+                seed=seeds[purpose],
+                path=folder / name,
+                progress=partial(report, f"{scenario.name}: {name}"),
+                **judging,
+            )
+            for name, number, purpose in (
+                ("fresh", effort.num_fresh, "evaluation"),
+                ("calibration", max(effort.num_fresh // 2, 20), "thresholds"),
+            )
         )
-    )
-    assessment = SafetyAssessment(scenario.assessment).fit(
-        training,
-        lambda stage, share: progress(f"{scenario.name}: {stage}", round(100 * share), 100),
-    )
-    assessment.save(folder / "sharpened.safetensors")
-    published = "calibrated"
-    if recovery is not None:
-        published = "normalized" if recovery.is_normalized else "safety_probability"
-    scorer = assessment_scorer("sharpened", assessment, published)
-    estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
-    if recovery is not None:
-        study = evaluate_throws(
-            scenario,
-            [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
-            persistence_s=recovery.persistence_s,
-            num_throws=effort.num_throws,
-            num_calibration=0,
-            seed=seeds["disturbances"],
-            calibration_seed=seeds["disturbance thresholds"],
-            num_workers=num_workers,
-            progress=lambda stage, done, total: progress(f"{scenario.name}: {stage}", done, total),
+        assessment = SafetyAssessment(scenario.assessment).fit(
+            training,
+            lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
         )
-        estimates |= study.estimates
+        assessment.save(folder / "sharpened.safetensors")
+        published = "calibrated"
+        if recovery is not None:
+            published = "normalized" if recovery.is_normalized else "safety_probability"
+        scorer = assessment_scorer("sharpened", assessment, published)
+        estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
+        if recovery is not None:
+            study = evaluate_throws(
+                scenario,
+                [TriggerRule(name="sharpened", scorer=scorer, threshold=recovery.threshold)],
+                persistence_s=recovery.persistence_s,
+                num_throws=effort.num_throws,
+                num_calibration=0,
+                seed=seeds["disturbances"],
+                calibration_seed=seeds["disturbance thresholds"],
+                num_workers=num_workers,
+                progress=lambda stage, done, total: report(
+                    f"{scenario.name}: {stage}", done, total
+                ),
+            )
+            estimates |= study.estimates
     row = {
         "scenario": scenario.name,
         # A user's scenario may name its robot by the path of its file.

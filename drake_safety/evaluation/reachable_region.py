@@ -13,6 +13,7 @@ from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import BASELINES, Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.progress import shown
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -82,7 +83,7 @@ def reachable_region(
     step_m: float = 0.1,
     variation: str = "nominal",
     num_workers: int | None = None,
-    progress: StageProgress | None = None,
+    progress: StageProgress | bool | None = None,
 ) -> ReachableRegion:
     """Evaluates Γ and inverse kinematics on a plane of the target box, and simulates it.
 
@@ -94,7 +95,7 @@ def reachable_region(
         step_m: Spacing of the simulated targets [m].
         variation: Variation of the plant.
         num_workers: Number of worker processes.
-        progress: Called with a stage, the number done and the number wanted.
+        progress: Called with a stage, the number done and the number wanted; True shows it.
 
     Raises:
         ValueError: The task's plans have no goal, the plane misses the target box, or the step is
@@ -108,34 +109,37 @@ def reachable_region(
     ]
 
     targets = _targets(x_m, *coarse)
-    episodes = run_episodes(
-        scenario,
-        len(targets),
-        variation=variation,
-        num_workers=num_workers,
-        goals=targets,
-        is_standing=True,
-        progress=None if progress is None else partial(progress, "targets of the plane"),
-    )
-    outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
+    with shown(progress, lambda stages: stages) as report:
+        episodes = run_episodes(
+            scenario,
+            len(targets),
+            variation=variation,
+            num_workers=num_workers,
+            goals=targets,
+            is_standing=True,
+            progress=None if report is None else partial(report, "targets of the plane"),
+        )
+        outcomes = np.array([SAFE if episode.is_safe else episode.cause for episode in episodes])
 
-    targets = _targets(x_m, *fine)
-    reachability = {}
-    if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
-        for name, is_base_free in BASELINES.items():
-            reachability[name] = Reachability(loop.robot, loop.hand, is_base_free=is_base_free)
-    scorer = assessment_scorer("sharpened", assessment, "calibrated")
-    probability = []
-    reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
-    for start in range(0, len(targets), _REPORT_EVERY):
-        if progress is not None:
-            progress("verdicts on the plane", start, len(targets))
-        chunk = targets[start : start + _REPORT_EVERY]
-        probability.append(np.nan_to_num(scorer.probability(*goal_inputs(loop, chunk)), nan=0.0))
-        for name, kinematics in reachability.items():
-            reachable[name].append(kinematics.is_reachable(chunk))
-    if progress is not None:
-        progress("verdicts on the plane", len(targets), len(targets))
+        targets = _targets(x_m, *fine)
+        reachability = {}
+        if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
+            for name, is_base_free in BASELINES.items():
+                reachability[name] = Reachability(loop.robot, loop.hand, is_base_free=is_base_free)
+        scorer = assessment_scorer("sharpened", assessment, "calibrated")
+        probability = []
+        reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
+        for start in range(0, len(targets), _REPORT_EVERY):
+            if report is not None:
+                report("verdicts on the plane", start, len(targets))
+            chunk = targets[start : start + _REPORT_EVERY]
+            probability.append(
+                np.nan_to_num(scorer.probability(*goal_inputs(loop, chunk)), nan=0.0)
+            )
+            for name, kinematics in reachability.items():
+                reachable[name].append(kinematics.is_reachable(chunk))
+        if report is not None:
+            report("verdicts on the plane", len(targets), len(targets))
     shape = (len(fine[1]), len(fine[0]))
     edge = [np.arange(low, high + 0.5 * _EDGE_STEP_M, _EDGE_STEP_M) for low, high in box.T]
     distance = _obstacle_distance(loop, loop.CreateDefaultContext(), _targets(x_m, *edge))

@@ -10,6 +10,7 @@ import numpy as np
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import UNCERTAINTY
+from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
 
@@ -73,24 +74,25 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
 
 
 def classifier_scorers(
-    episodes: Episodes, progress: StageProgress | None = None, *, shortest: int | None = None
+    episodes: Episodes, progress: StageProgress | bool | None = None, *, shortest: int | None = None
 ) -> list[Scorer]:
     """The baseline classifiers, trained on the training episodes of the assessment.
 
     Args:
         episodes: Training episodes.
-        progress: Called with a stage, the number done and the number wanted.
+        progress: Called with a stage, the number done and the number wanted; True shows it.
         shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
     """
     scorers = []
-    for i, kind in enumerate(KINDS):
-        if progress is not None:
-            progress("baseline classifiers", i, len(KINDS))
-        classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
-        used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
-        scorers.append(_classifier_scorer(classifier, used))
-    if progress is not None:
-        progress("baseline classifiers", len(KINDS), len(KINDS))
+    with shown(progress, lambda stages: stages) as report:
+        for i, kind in enumerate(KINDS):
+            if report is not None:
+                report("baseline classifiers", i, len(KINDS))
+            classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
+            used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
+            scorers.append(_classifier_scorer(classifier, used))
+        if report is not None:
+            report("baseline classifiers", len(KINDS), len(KINDS))
     return scorers
 
 

@@ -20,6 +20,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.progress import shown
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.watched_motion import SEEN
 
@@ -364,7 +365,7 @@ def evaluate_shifts(
     assessment: SafetyAssessment,
     classifiers: Sequence[Scorer],
     training: Episodes | None,
-    progress: StageProgress | None = None,
+    progress: StageProgress | bool | None = None,
 ) -> dict[str, ShiftResult]:
     """Evaluates Γ, its monitor and the baselines on every shift.
 
@@ -373,7 +374,7 @@ def evaluate_shifts(
         assessment: Γ.
         classifiers: Baseline classifiers.
         training: Training episodes, for the published detectors; None to leave these out.
-        progress: Called with a stage, the number done and the number wanted.
+        progress: Called with a stage, the number done and the number wanted; True shows it.
     """
     judges = {
         "gamma": assessment_judge(assessment),
@@ -383,10 +384,11 @@ def evaluate_shifts(
     if training is not None:
         judges |= detector_judges(assessment, training)
     results = {}
-    for i, (name, shifted) in enumerate(sets.items()):
-        if progress is not None:
-            progress("shifts", i, len(sets))
-        results[name] = evaluate_shift(shifted, assessment, judges)
-    if progress is not None:
-        progress("shifts", len(sets), len(sets))
+    with shown(progress, lambda stages: stages) as report:
+        for i, (name, shifted) in enumerate(sets.items()):
+            if report is not None:
+                report("shifts", i, len(sets))
+            results[name] = evaluate_shift(shifted, assessment, judges)
+        if report is not None:
+            report("shifts", len(sets), len(sets))
     return results

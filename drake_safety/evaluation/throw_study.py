@@ -12,6 +12,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.progress import shown
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 
@@ -176,7 +177,7 @@ def evaluate_throws(
     persistence_s: float = 0.0,
     variation: str = "actual",
     num_workers: int | None = None,
-    progress: StageProgress | None = None,
+    progress: StageProgress | bool | None = None,
 ) -> ThrowStudy:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
@@ -190,7 +191,7 @@ def evaluate_throws(
         persistence_s: Time for which "don't know" must have lasted to trigger [s].
         variation: Variation of the plant.
         num_workers: Number of worker processes.
-        progress: Called with a stage, the number done and the number wanted.
+        progress: Called with a stage, the number done and the number wanted; True shows it.
 
     Raises:
         ValueError: The seeds are equal, or no threshold can be chosen because every calibration
@@ -198,49 +199,50 @@ def evaluate_throws(
     """
     if seed == calibration_seed:
         raise ValueError(f"throws: seed and calibration seed are both {seed}; they must differ")
-    report = progress or (lambda stage, done, total: None)
     throw = partial(run_throws, scenario, variation=variation, num_workers=num_workers)
     thresholds = {rule.name: rule.threshold for rule in rules if rule.threshold is not None}
-    calibration: list[ThrowLog] = []
-    if len(thresholds) < len(rules):
-        calibration = throw(
-            list(range(num_calibration)),
-            seed=calibration_seed,
-            progress=partial(report, "calibration throws"),
+    with shown(progress, lambda stages: stages) as given:
+        report = given or (lambda stage, done, total: None)
+        calibration: list[ThrowLog] = []
+        if len(thresholds) < len(rules):
+            calibration = throw(
+                list(range(num_calibration)),
+                seed=calibration_seed,
+                progress=partial(report, "calibration throws"),
+            )
+            for rule in rules:
+                if rule.threshold is None:
+                    probabilities = [
+                        log_probability(log, rule.scorer, persistence_s) for log in calibration
+                    ]
+                    thresholds[rule.name] = choose_threshold(calibration, probabilities)
+        logs = throw(
+            list(range(num_throws)), seed=seed, progress=partial(report, "throws, balancing alone")
         )
-        for rule in rules:
-            if rule.threshold is None:
-                probabilities = [
-                    log_probability(log, rule.scorer, persistence_s) for log in calibration
+        triggers = {
+            rule.name: np.array(
+                [
+                    trigger_time(
+                        log,
+                        log_probability(log, rule.scorer, persistence_s),
+                        thresholds[rule.name],
+                    )
+                    for log in logs
                 ]
-                thresholds[rule.name] = choose_threshold(calibration, probabilities)
-    logs = throw(
-        list(range(num_throws)), seed=seed, progress=partial(report, "throws, balancing alone")
-    )
-    triggers = {
-        rule.name: np.array(
-            [
-                trigger_time(
-                    log,
-                    log_probability(log, rule.scorer, persistence_s),
-                    thresholds[rule.name],
-                )
-                for log in logs
-            ]
-        )
-        for rule in rules
-    }
-    triggered = {
-        name: {
-            log.index: float(time)
-            for log, time in zip(logs, times, strict=True)
-            if not math.isnan(time)
+            )
+            for rule in rules
         }
-        for name, times in triggers.items()
-    }
-    # Rules often trigger at the same instant: each distinct recovery is simulated once.
-    wanted = {pair for times in triggered.values() for pair in times.items()}
-    simulated = _simulate_recoveries(partial(throw, seed=seed), wanted, report)
+        triggered = {
+            name: {
+                log.index: float(time)
+                for log, time in zip(logs, times, strict=True)
+                if not math.isnan(time)
+            }
+            for name, times in triggers.items()
+        }
+        # Rules often trigger at the same instant: each distinct recovery is simulated once.
+        wanted = {pair for times in triggered.values() for pair in times.items()}
+        simulated = _simulate_recoveries(partial(throw, seed=seed), wanted, report)
     recovered = {
         name: {index: simulated[index, time] for index, time in times.items()}
         for name, times in triggered.items()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +34,11 @@ from drake_safety.learning.inputs import (
 )
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
+from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.trained_maps import INPUT_LIMIT
-from drake_safety.learning.training import learned_maps, segments_for
+from drake_safety.learning.training import check_preview, learned_maps, segments_for
 
 __all__ = [
     "MODES",
@@ -84,6 +84,16 @@ class SafetyAssessment:
         # A copy, so that later changes of a scenario do not change a trained assessment.
         self.parameters = copy.deepcopy(parameters or AssessmentParameters())
 
+    def __repr__(self) -> str:
+        mode = f"mode '{self.parameters.mode}'"
+        if not hasattr(self, "beliefs_"):
+            return f"SafetyAssessment({mode}, not fitted)"
+        words = [f"'{self.info_.scenario}'", mode, f"{len(self.beliefs_)} maps"]
+        for one in self.used_:
+            count = "" if one.num_episodes is None else f"{one.num_episodes} "
+            words.append(f"{one.purpose} on {count}episodes of '{one.variation}'")
+        return f"SafetyAssessment({', '.join(words)})"
+
     @property
     def uses_features(self) -> bool:
         """Whether x contains the features, as in the sharpened mode."""
@@ -95,15 +105,14 @@ class SafetyAssessment:
         return len(self.info_.constraint_names)
 
     def fit(
-        self, episodes: Episodes, progress: Callable[[str, float], None] | None = None
+        self, episodes: Episodes, progress: Callable[[str, float], None] | bool | None = None
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
             episodes: Nominal episodes with the parameters' horizon.
-            progress: Called with a stage ("distances", "t-SNE", "training",
-                "innovation", "beliefs") and the
-                fraction done.
+            progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
+                "beliefs") and the fraction done; True shows it.
 
         Returns:
             Itself.
@@ -114,20 +123,17 @@ class SafetyAssessment:
         from threadpoolctl import threadpool_limits
 
         # The order of sums depends on the number of threads, and the last bits with it.
-        with threadpool_limits(1, user_api="blas"):
-            self._learn(episodes, progress)
+        with (
+            threadpool_limits(1, user_api="blas"),
+            shown(progress, lambda stages: stages.report_share) as report,
+        ):
+            self._learn(episodes, report)
         return self
 
     def _learn(self, episodes: Episodes, progress: Callable[[str, float], None] | None) -> None:
         parameters = self.parameters
         info = episodes.info
-        for name in ("horizon", "preview_stride"):
-            here, there = getattr(parameters, name), getattr(info, name)
-            if here != there:
-                raise ValueError(
-                    f"SafetyAssessment: {name} is {here}, but that of the episodes of "
-                    f"'{info.scenario}' is {there}"
-                )
+        check_preview(info, parameters)
         segments, has_target = segments_for(episodes, parameters)
         self.info_ = info
         self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
@@ -349,15 +355,7 @@ class SafetyAssessment:
     ) -> tuple[np.ndarray, Correction]:
         beliefs = self.beliefs_ if beliefs is None else beliefs
         correction = self.correction_ if correction is None else correction
-        pairs = [("beliefs", beliefs, self.beliefs_)]
-        for field in fields(Correction):
-            sides = (getattr(one, field.name) for one in (correction, self.correction_))
-            pairs.append((f"the correction's {field.name}", *sides))
-        for name, given, own in pairs:
-            if given.shape != own.shape:
-                raise ValueError(
-                    f"SafetyAssessment: the shape of {name} is {given.shape}, expected {own.shape}"
-                )
+        prediction.check_shapes((beliefs, correction), (self.beliefs_, self.correction_))
         return beliefs, correction
 
     def predict(
@@ -391,7 +389,10 @@ class SafetyAssessment:
         beliefs, correction = self._or_own(beliefs, correction)
         x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 2:
-            raise ValueError(f"SafetyAssessment: inputs have {x.ndim} axes, expected (N, columns)")
+            raise ValueError(
+                f"SafetyAssessment of '{self.info_.scenario}': state has the shape "
+                f"{np.shape(state)}, expected (N, n_s); predict_one assesses a single input"
+            )
         with np.errstate(over="ignore", invalid="ignore"):
             is_usable = np.einsum("ij,ij->i", x, x) < INPUT_LIMIT
         return prediction.predict(

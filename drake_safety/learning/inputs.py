@@ -42,23 +42,35 @@ def inputs(
         parameters: The assessment's. A feature unit u appends asinh(features / u).
 
     Raises:
-        ValueError: One of them has another width.
+        ValueError: One of them has another width or number of rows, is missing, or is no number.
     """
     is_used = used_states(info, parameters)
     widths = {
         "state": (state, len(is_used)),
         "desired_preview": (desired_preview, info.horizon * len(info.output_names)),
     }
+    who = f"SafetyAssessment of '{info.scenario}'"
     if parameters.is_sharpened and info.feature_names:
-        given = np.empty(0) if features is None else features
-        widths["features"] = (given, len(info.feature_names))
-    parts = []
-    for name, (values, width) in widths.items():
-        part = np.asarray(values, dtype=float)
-        if part.shape[-1:] != (width,):
+        if features is None:
             raise ValueError(
-                f"SafetyAssessment of '{info.scenario}': {name} has the shape {part.shape}, "
-                f"expected {width} columns"
+                f"{who}: features are missing, expected {len(info.feature_names)} columns: "
+                f"{info.feature_names}"
+            )
+        widths["features"] = (features, len(info.feature_names))
+    parts: list[np.ndarray] = []
+    for name, (values, width) in widths.items():
+        try:
+            part = np.asarray(values, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{who}: {name} must be an array of numbers: {error}") from error
+        if part.shape[-1:] != (width,):
+            expected = (*part.shape[:-1], width)
+            raise ValueError(f"{who}: {name} has the shape {part.shape}, expected {expected}")
+        if parts and part.shape[:-1] != parts[0].shape[:-1]:
+            expected = (*parts[0].shape[:-1], width)
+            raise ValueError(
+                f"{who}: {name} has the shape {part.shape}, expected {expected}, as state has the "
+                f"shape {parts[0].shape}"
             )
         parts.append(part)
     if not is_used.all():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -192,6 +192,23 @@ class Correction:
         shift = self.change[0] + heads @ self.change[1:] + residual
         shift = np.clip(shift, -SHIFT_LIMIT, SHIFT_LIMIT)
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
+
+
+def check_shapes(given: tuple[np.ndarray, Correction], own: tuple[np.ndarray, Correction]) -> None:
+    """Checks that beliefs and a correction are shaped as those of an assessment.
+
+    Raises:
+        ValueError: An array has another shape.
+    """
+    pairs = [("beliefs", given[0], own[0])]
+    for field in fields(Correction):
+        sides = (getattr(correction, field.name) for _, correction in (given, own))
+        pairs.append((f"the correction's {field.name}", *sides))
+    for name, one, expected in pairs:
+        if one.shape != expected.shape:
+            raise ValueError(
+                f"SafetyAssessment: the shape of {name} is {one.shape}, expected {expected.shape}"
+            )
 
 
 def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:

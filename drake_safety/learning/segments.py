@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 RECORDED = (
     "state",
@@ -177,6 +180,56 @@ class Episodes(Sequence[Episode]):
 
     def __len__(self) -> int:
         return len(self._episodes)
+
+    def __repr__(self) -> str:
+        counts = {"safe": self.num_safe, "unsafe": self.num_unsafe, "diverged": self.num_diverged}
+        words = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        return (
+            f"Episodes('{self.info.scenario}', variation '{self.info.variation}', seed "
+            f"{self.info.seed}, {len(self)} episodes{': ' if words else ''}{words})"
+        )
+
+    def to_frame(self) -> pa.Table:
+        """Returns all rows of all episodes as one table.
+
+        Columns are ``episode``, ``row`` and ``time_s``, those of the arrays (``state.NAME``,
+        ``margins.NAME``, ``desired_preview.NAME[k]``, ...), and of the row's episode ``is_safe``,
+        ``cause`` and ``first_step``. ``to_frame().to_pandas()`` is a pandas DataFrame.
+        """
+        import pyarrow as pa
+
+        episodes, info = self._episodes, self.info
+        counts = [len(episode.time_s) for episode in episodes]
+
+        def repeated(values: list) -> np.ndarray:
+            return np.repeat(np.array(values), counts)
+
+        columns = {
+            "episode": repeated([episode.index for episode in episodes]),
+            "row": np.concatenate([np.arange(0), *map(np.arange, counts)]),
+            "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
+        }
+        names = {
+            "state": info.state_names,
+            "true_state": info.state_names,
+            "output": info.output_names,
+            "desired_output": info.output_names,
+            "desired_preview": [
+                f"{name}[{k}]" for k in range(info.horizon) for name in info.output_names
+            ],
+            "features": info.feature_names,
+            "margins": info.constraint_names,
+        }
+        for array in RECORDED:
+            table = np.concatenate(
+                [np.empty((0, len(names[array]))), *(getattr(one, array) for one in episodes)]
+            )
+            for name, column in zip(names[array], table.T, strict=True):
+                columns[f"{array}.{name}"] = column
+        columns["is_safe"] = repeated([episode.is_safe for episode in episodes])
+        columns["cause"] = repeated([episode.cause for episode in episodes])
+        columns["first_step"] = repeated([episode.first_step for episode in episodes])
+        return pa.table(columns)
 
     @overload
     def __getitem__(self, key: int) -> Episode: ...

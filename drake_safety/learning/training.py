@@ -18,7 +18,7 @@ from drake_safety.learning.embedding import (
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
-from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.learning.segments import Episodes, EpisodesInfo, Segments, split
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 
 _NUM_NEIGHBOURS = 15
@@ -29,6 +29,21 @@ _logger = logging.getLogger("drake_safety")
 
 StageProgress = Callable[[str, float], None]
 """Called with a stage and the fraction done."""
+
+
+def check_preview(info: EpisodesInfo, parameters: AssessmentParameters) -> None:
+    """Checks that episodes have the preview of an assessment's parameters.
+
+    Raises:
+        ValueError: They have another one.
+    """
+    for name in ("horizon", "preview_stride"):
+        here, there = getattr(parameters, name), getattr(info, name)
+        if here != there:
+            raise ValueError(
+                f"SafetyAssessment: {name} is {here}, but that of the episodes of "
+                f"'{info.scenario}' is {there}"
+            )
 
 
 def segments_for(

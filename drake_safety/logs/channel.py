@@ -48,6 +48,10 @@ class Channel:
         """Returns the time since an instant of the log's clock, exact for integers, (N,) [s]."""
         return (self.time - origin) / TIME_UNITS[self.time_unit]
 
+    def steps_s(self) -> np.ndarray:
+        """Returns the time between consecutive rows, (N - 1,) [s]."""
+        return np.diff(self.time) / TIME_UNITS[self.time_unit]
+
     def table(self, names: Iterable[str]) -> np.ndarray:
         """Returns columns as an array, (N, n)."""
         return np.stack([self.columns[name] for name in names], axis=1)

@@ -13,8 +13,9 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
 
+MIN_ROWS = 3
+"""Least number of rows, for derivatives."""
 _LARGEST = 1e12  # Of any quantity in SI units.
-_MIN_ROWS = 3  # For derivatives.
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _NORM_TOLERANCE = 0.01
 _MAX_TILT_RAD = math.radians(60.0)
@@ -37,11 +38,39 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
     Raises:
         ValueError: A check failed; the message names the row.
     """
+    check_clock(channel)
+    for row in rows_after_gaps(channel, max_gap_s).tolist():
+        raise ValueError(
+            f"{channel.where(row, channel.time_name)}: a gap of {channel.steps_s()[row - 1]:g} s "
+            f"before it, expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
+        )
+
+
+def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
+    """Returns the rows before which a gap is longer than a limit.
+
+    Args:
+        channel: A table or topic.
+        max_gap_s: Largest time between two rows [s].
+    """
+    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
+    return np.flatnonzero(channel.steps_s() > max_gap_s * (1 + 1e-6)) + 1
+
+
+def check_clock(channel: Channel) -> None:
+    """Checks that time is finite, increasing and in plausible units.
+
+    Args:
+        channel: A table or topic.
+
+    Raises:
+        ValueError: A check failed; the message names the row.
+    """
     time = channel.time
-    if len(time) < _MIN_ROWS:
+    if len(time) < MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
         raise ValueError(
-            f"log '{channel.path}'{of} has {len(time)} rows, expected at least {_MIN_ROWS}"
+            f"log '{channel.path}'{of} has {len(time)} rows, expected at least {MIN_ROWS}"
         )
     if not np.isfinite(time).all():
         row = int(np.argmin(np.isfinite(time)))
@@ -62,14 +91,6 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
             f"{channel.where(0, channel.time_name)}: rows are {usual:g} apart, which as "
             f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
         )
-    step_s = step / TIME_UNITS[channel.time_unit]
-    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
-    if step_s.max() > max_gap_s * (1 + 1e-6):
-        row = int(np.argmax(step_s > max_gap_s * (1 + 1e-6))) + 1
-        raise ValueError(
-            f"{channel.where(row, channel.time_name)}: a gap of {step_s[row - 1]:g} s before it, "
-            f"expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
-        )
 
 
 def check_finite(channel: Channel) -> None:
@@ -78,7 +99,7 @@ def check_finite(channel: Channel) -> None:
     Raises:
         ValueError: A value is not; the message names the first row and the column.
     """
-    bad = {name: ~(np.abs(values) < _LARGEST) for name, values in channel.columns.items()}
+    bad = bad_values(channel)
     rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
     if rows:
         name = min(rows, key=lambda key: rows[key])
@@ -87,6 +108,11 @@ def check_finite(channel: Channel) -> None:
             f"{channel.where(row, name)}: the value is {channel.columns[name][row]}, expected a "
             f"finite number below {_LARGEST:g}"
         )
+
+
+def bad_values(channel: Channel) -> dict[str, np.ndarray]:
+    """Returns which values are missing, not finite or absurdly large, (N,) by column."""
+    return {name: ~(np.abs(values) < _LARGEST) for name, values in channel.columns.items()}
 
 
 def check_norms(channel: Channel, names: list[str]) -> None:

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
@@ -44,11 +45,12 @@ def cut_log(
 ) -> tuple[Episodes, list[EpisodeStart]]:
     """Converts logs to consecutive episodes of the actual robot, with the starts of their twins.
 
-    Episodes have the scenario's duration. The last episode of a log ends where the robot leaves the
-    safe set at a tick of the loop's monitor; later rows are ignored. A safe remainder that is too
-    short for a segment is dropped. No noise is added to the logged states, which contain
-    measurement noise. The preview is the logged z*, constant after the last row, in the stance
-    frame of the episode's first row.
+    Episodes have the scenario's duration; none reaches over a cut of
+    :func:`~drake_safety.logs.robot_log.read_pieces`. The last episode of a log ends where the robot
+    leaves the safe set at a tick of the loop's monitor; later rows are ignored. A safe remainder
+    that is too short for a segment is dropped. No noise is added to the logged states, which
+    contain measurement noise. The preview is the logged z*, constant after the last row, in the
+    stance frame of the episode's first row.
 
     Args:
         log: The log, or several of one robot, whose episodes are numbered consecutively.
@@ -67,20 +69,51 @@ def cut_log(
         loop = loop.make_loop("actual")
     episodes: list[Episode] = []
     starts: list[EpisodeStart] = []
-    for one in [log] if isinstance(log, RobotLog) else log:
-        for episode, start in _cut(one, loop, _desired_output(one, loop, desired_output)):
-            episodes.append(replace(episode, index=len(episodes)))
-            starts.append(start)
+    for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
+        num_before = len(episodes)
+        for one in pieces:
+            found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output))
+            for episode, start in found:
+                episodes.append(replace(episode, index=len(episodes)))
+                starts.append(start)
+            if has_left:
+                break
+        if len(episodes) == num_before:
+            longest_s = max(one.duration_s for one in pieces)
+            scenario = loop.scenario
+            raise ValueError(
+                f"log '{pieces[0].path}' lasts {longest_s:g} s: too short for a segment of "
+                f"{shortest_steps(scenario.assessment)} steps of {scenario.step_s} s of scenario "
+                f"'{scenario.name}'"
+            )
     return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
+
+
+def shortest_steps(assessment: AssessmentParameters) -> int:
+    """Least number of steps of a safe part of a log that gives an episode."""
+    return assessment.preview_stride * (assessment.shortest_segment or assessment.horizon)
+
+
+def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:
+    """The pieces of each log."""
+    found: list[list[RobotLog]] = []
+    for one in logs:
+        if one.piece == 0 or not found:
+            found.append([])
+        found[-1].append(one)
+    return found
 
 
 def _cut(
     log: RobotLog, loop: LeggedLoop, desired: np.ndarray
-) -> list[tuple[Episode, EpisodeStart]]:
-    """Episodes and starts of one log with z* in the world, (N, n_z) [m]."""
+) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
+    """Episodes and starts of a piece with z* in the world, (N, n_z) [m].
+
+    Returns:
+        These, and whether the robot has left the safe set.
+    """
     scenario = loop.scenario
-    assessment = scenario.assessment
-    shortest = assessment.preview_stride * (assessment.shortest_segment or assessment.horizon)
+    shortest = shortest_steps(scenario.assessment)
     context = loop.CreateDefaultContext()
     found: list[tuple[Episode, EpisodeStart]] = []
     begin_s = 0.0
@@ -89,6 +122,8 @@ def _cut(
         loop.reset_to(context, None, start)
         episode = _episode(log, loop, context, begin_s)
         if not episode.is_safe and episode.num_steps == 0 and not found:
+            if log.piece:
+                return [], True
             raise ValueError(
                 f"log '{log.path}' begins outside the safe set of scenario '{scenario.name}': "
                 f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
@@ -96,14 +131,9 @@ def _cut(
         if not episode.is_safe or episode.num_steps >= shortest:
             found.append((episode, start))
         if not episode.is_safe:
-            break
+            return found, True
         begin_s += float(episode.time_s[-1])
-    if not found:
-        raise ValueError(
-            f"log '{log.path}' lasts {log.duration_s:g} s: too short for a segment of {shortest} "
-            f"steps of {scenario.step_s} s of scenario '{scenario.name}'"
-        )
-    return found
+    return found, False
 
 
 def _desired_output(

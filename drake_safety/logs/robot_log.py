@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,12 +25,14 @@ from drake_safety.logs.conversion import (
 )
 from drake_safety.logs.log_map import LogMap, load_log_map
 from drake_safety.logs.messages import read_bag, read_mcap
+from drake_safety.logs.pieces import cut_channels
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
 FORMATS = (".csv", ".parquet", ".mcap", ".bag")
 """Suffixes of readable files; a folder is a ROS 2 bag."""
 
+_MOST_CUTS = 3  # In a message.
 _NUM_LOOKS = 50  # Number of rows at which the slip of the feet is checked.
 
 
@@ -45,6 +48,7 @@ class RobotLog:
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
         desired_output: z* in the world, (N, n_z) [m], or None.
         foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
+        piece: Number of this piece of a log that was cut, from 0.
     """
 
     path: Path
@@ -54,6 +58,7 @@ class RobotLog:
     v: np.ndarray
     desired_output: np.ndarray | None = None
     foot_positions: np.ndarray | None = None
+    piece: int = 0
 
     @property
     def duration_s(self) -> float:
@@ -71,6 +76,82 @@ class RobotLog:
         )
         rest = values_at(self.time_s, np.hstack([self.q[:, 4:], self.v]), at_s)
         return np.hstack([rotations.as_quat(scalar_first=True), rest])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogPieces:
+    """What is left of a log that was cut at missing values and gaps.
+
+    Attributes:
+        pieces: The pieces, in order of time.
+        duration_s: Duration of the whole log [s].
+        cuts: The reasons of the cuts.
+    """
+
+    pieces: list[RobotLog]
+    duration_s: float
+    cuts: list[str]
+
+    @property
+    def kept_share(self) -> float:
+        """Share of the log's duration that was kept."""
+        return sum(piece.duration_s for piece in self.pieces) / self.duration_s
+
+
+def read_pieces(
+    path: str | PathLike[str],
+    log_map: LogMap | str | PathLike[str],
+    robot: RobotModel,
+    *,
+    step_s: float | None = None,
+) -> LogPieces:
+    """Reads a log as :func:`read_log` does, but cuts it where values are missing and at gaps.
+
+    The first piece is checked as a log is, since these checks are about the map: a later one may
+    begin in mid-motion, or after a fall.
+
+    Args:
+        path: See :func:`read_log`.
+        log_map: See :func:`read_log`.
+        robot: See :func:`read_log`.
+        step_s: See :func:`read_log`.
+
+    Raises:
+        ValueError: See :func:`read_log`; or nothing is left.
+    """
+    path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
+    found, cuts = cut_channels(channels, log_map.max_gap_s)
+    pieces: list[RobotLog] = []
+    for part in found:
+        if _num_rows(log_map, part, step_s) < 2:
+            continue
+        checks.check_norms(part[log_map.base_orientation.topic], log_map.base_orientation.columns)
+        one = _converted(path, log_map, kinematics, part, step_s, is_checked=not pieces)
+        pieces.append(replace(one, piece=len(pieces)))
+    if not pieces:
+        raise ValueError(
+            f"log '{path}' has no {checks.MIN_ROWS} rows without a missing value or a gap between "
+            f"them: {'; '.join(cuts[:_MOST_CUTS])}"
+        )
+    begin, end = _common_time(channels)
+    return LogPieces(pieces=pieces, duration_s=end - begin, cuts=cuts)
+
+
+def _num_rows(log_map: LogMap, channels: dict[str, Channel], step_s: float | None) -> int:
+    """Number of rows of a converted piece."""
+    begin, end = _common_time(channels)
+    if step_s is not None:
+        return int((end - begin) / step_s + 1e-9) + 1
+    origin = min(channel.time[0] for channel in channels.values())
+    base_time = channels[log_map.base_position.topic].seconds_since(origin)
+    return int(np.sum((base_time >= begin) & (base_time <= end)))
+
+
+def _common_time(channels: dict[str, Channel]) -> tuple[float, float]:
+    """First and last time that all channels cover, since the first row of any [s]."""
+    origin = min(channel.time[0] for channel in channels.values())
+    spans = [channel.seconds_since(origin)[[0, -1]] for channel in channels.values()]
+    return float(max(span[0] for span in spans)), float(min(span[1] for span in spans))
 
 
 def read_log(
@@ -92,6 +173,21 @@ def read_log(
     Raises:
         ValueError: A value is missing or implausible; the message names file, row and column.
     """
+    path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
+    for channel in channels.values():
+        checks.check_time(channel, log_map.max_gap_s)
+        checks.check_finite(channel)
+    orientation = log_map.base_orientation
+    checks.check_norms(channels[orientation.topic], orientation.columns)
+    return _converted(path, log_map, kinematics, channels, step_s)
+
+
+def _opened(
+    path: str | PathLike[str],
+    log_map: LogMap | str | PathLike[str],
+    robot: RobotModel,
+    step_s: float | None,
+) -> tuple[Path, LogMap, RobotKinematics, dict[str, Channel]]:
     path = Path(path)
     if not isinstance(log_map, LogMap):
         log_map = load_log_map(Path(log_map))
@@ -99,13 +195,12 @@ def read_log(
     if step_s is not None and not step_s > 0:
         raise ValueError(f"read_log: step_s must be positive; got {step_s}")
     kinematics = RobotKinematics(robot)
-    channels = _read_channels(path, _wanted(log_map, kinematics), log_map)
-    for channel in channels.values():
-        checks.check_time(channel, log_map.max_gap_s)
-        checks.check_finite(channel)
-    orientation = log_map.base_orientation
-    checks.check_norms(channels[orientation.topic], orientation.columns)
-    return _converted(path, log_map, kinematics, channels, step_s)
+    return (
+        path,
+        log_map,
+        kinematics,
+        _read_channels(path, _wanted(log_map, kinematics), log_map),
+    )
 
 
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
@@ -174,6 +269,8 @@ def _converted(
     kinematics: RobotKinematics,
     channels: dict[str, Channel],
     step_s: float | None,
+    *,
+    is_checked: bool = True,
 ) -> RobotLog:
     origin = min(channel.time[0] for channel in channels.values())
     times = {topic: channel.seconds_since(origin) for topic, channel in channels.items()}
@@ -200,21 +297,22 @@ def _converted(
         joints = values_at(times[read_by.joint_positions.topic], table, at)
         return np.hstack([rotations.as_quat(scalar_first=True), base, joints])
 
-    checks.check_first_row(
-        kinematics, log_map, lambda read_by: positions(read_by, at_s[:1])[0], where
-    )
-    some = at_s[:: max(len(at_s) // _NUM_LOOKS, 1)]
-    checks.check_stillness(
-        kinematics, log_map, lambda read_by: positions(read_by, some), f"{where} and after it"
-    )
+    if is_checked:
+        checks.check_first_row(
+            kinematics, log_map, lambda read_by: positions(read_by, at_s[:1])[0], where
+        )
+        some = at_s[:: max(len(at_s) // _NUM_LOOKS, 1)]
+        checks.check_stillness(
+            kinematics, log_map, lambda read_by: positions(read_by, some), f"{where} and after it"
+        )
     q = positions(log_map, at_s)
-    v = _velocities(log_map, kinematics, channels, times, at_s)
-    extra = {}
+    v = _velocities(log_map, kinematics, channels, times, at_s, is_checked)
+    extra: dict[str, Any] = {}
     for name in ("desired_output", "foot_positions"):
         part = getattr(log_map, name)
         if part.columns:
             extra[name] = values_at(times[part.topic], points(part, channels), at_s)
-    if "desired_output" in extra:
+    if is_checked and "desired_output" in extra:
         unit = log_map.desired_output.unit
         checks.check_desired_output(kinematics, extra["desired_output"][0], q[0, 4:7], where, unit)
     return RobotLog(
@@ -228,6 +326,7 @@ def _velocities(
     channels: dict[str, Channel],
     times: dict[str, np.ndarray],
     at_s: np.ndarray,
+    is_checked: bool,
 ) -> np.ndarray:
     rotation_time = times[log_map.base_orientation.topic]
     rotations = base_rotations(log_map, channels)
@@ -258,7 +357,8 @@ def _velocities(
                 velocity, channels, rotations_at(rotation_time, rotations, own_time)
             )
             channel = channels[velocity.topic]
-            checks.check_rates(table, derived, channel, velocity.columns, velocity.unit or unit)
+            if is_checked:
+                checks.check_rates(table, derived, channel, velocity.columns, velocity.unit or unit)
             parts.append(values_at(own_time, table, at_s))
         else:
             parts.append(values_at(time, derived, at_s))
@@ -267,7 +367,8 @@ def _velocities(
     if rate_map.template or rate_map.columns:
         table = joint_table(log_map, channels, kinematics.joint_names, "joint_velocities")
         columns = [rate_map.column(joint) for joint in kinematics.joint_names]
-        checks.check_rates(table, derived, channels[rate_map.topic], columns, rate_map.unit)
+        if is_checked:
+            checks.check_rates(table, derived, channels[rate_map.topic], columns, rate_map.unit)
         parts.append(values_at(times[rate_map.topic], table, at_s))
     else:
         parts.append(values_at(joint_time, derived, at_s))

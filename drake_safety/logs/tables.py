@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -128,6 +129,9 @@ def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
     values = frame[name].to_numpy()
     if values.dtype.kind in "iuf":
         return values
+    if name != channel.time_name:
+        # An empty cell is a missing value, as NaN is.
+        values = np.array([math.nan if one is None or one == "" else one for one in values], object)
     for kind in (np.int64, np.float64):
         try:
             return values.astype(kind)

@@ -1,8 +1,9 @@
-"""The boundary at which the errors of file formats become errors that name the file."""
+"""The boundary at which the errors of file formats become errors that name the file and the key."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import difflib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,20 @@ def _message(path: Path, what: str, error: Exception) -> str:
 def shortened(text: str) -> str:
     """Cuts a message that quotes a large part of a file."""
     return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE - 4]} ..."
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Says for an error message which known name is like an unknown one: `` (did you mean 'x'?)``.
+
+    Args:
+        name: The unknown name.
+        known: The known ones.
+
+    Returns:
+        The words, with a space before them; "" if none is like it.
+    """
+    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1)
+    return f" (did you mean '{near[0]}'?)" if near else ""
 
 
 def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:

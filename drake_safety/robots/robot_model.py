@@ -2,16 +2,16 @@
 
 import math
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load_typed
 
-from drake_safety.robots.reading import parse_yaml, reading, shortened
+from drake_safety.robots.reading import did_you_mean, parse_yaml, reading, shortened
 
 _Value = TypeVar("_Value")
 
@@ -189,6 +189,9 @@ class RobotModel:
     the feet and ``shapes``, for files with meshes or without shapes (URDF only)."""
     shapes: dict[str, list[CollisionShape]] = field(default_factory=dict)
     """Shapes for ``stated`` collisions, by regular expression over body names."""
+    without_collision: list[str] = field(default_factory=list)
+    """Links that lost the collision meshes of their source when ``new`` wrote the model file, and
+    have no other shape; ``check`` warns of them."""
     foot_friction: float = 0.8
     """Coulomb friction coefficient of the contact points."""
     source_dir: str = ""
@@ -313,6 +316,8 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
         value = yaml_load_typed(schema=schema, data=yaml.safe_dump(raw, sort_keys=False))
         _validate(value)
     except Exception as error:  # Drake's loader raises RuntimeError and bare Exception.
+        for misfit in _ill_typed(schema, raw, ()):
+            raise ValueError(f"{who}: {misfit}") from error
         raise ValueError(f"{who}: {shortened(str(error))}") from error
     return value
 
@@ -348,13 +353,44 @@ def _misfits(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterable[str]:
             if key in known:
                 yield from _misfits(hints[key], value, (*path, key))
             else:
-                yield f"unknown key '{'.'.join((*path, str(key)))}'; keys there are {known}"
+                name = ".".join((*path, str(key)))
+                yield f"unknown key '{name}'{did_you_mean(key, known)}; keys there are {known}"
     elif isinstance(raw, dict | list):
         items = raw.items() if isinstance(raw, dict) else enumerate(raw)
         for inner in get_args(schema):
             if is_dataclass(inner):
                 for key, value in items:
                     yield from _misfits(inner, value, (*path, str(key)))
+
+
+_TYPE_WORDS = {
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "text",
+    list: "a list",
+    dict: "a mapping",
+}
+
+
+def _ill_typed(schema: Any, raw: Any, path: tuple[str, ...]) -> Iterator[str]:
+    """Messages about values that Drake's loader does not convert to their type."""
+    if is_dataclass(schema) and isinstance(raw, dict):
+        hints = get_type_hints(schema)
+        for key, value in raw.items():
+            yield from _ill_typed(hints[key], value, (*path, key))
+        return
+    origin = get_origin(schema)
+    if isinstance(raw, dict | list) and origin is type(raw):
+        for key, value in raw.items() if isinstance(raw, dict) else enumerate(raw):
+            yield from _ill_typed(get_args(schema)[-1], value, (*path, str(key)))
+        return
+    try:
+        one = make_dataclass("One", [("values", dict[str, schema], field(default_factory=dict))])
+        yaml_load_typed(schema=one, data=yaml.safe_dump({"values": {"value": raw}}))
+    except Exception:  # See `load_typed`.
+        words = _TYPE_WORDS.get(origin or schema, getattr(schema, "__name__", str(schema)))
+        yield f"'{'.'.join(path)}' must be {words}; got {shortened(repr(raw))}"
 
 
 def _validate(value: Any) -> None:

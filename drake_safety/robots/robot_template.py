@@ -34,6 +34,7 @@ class NewRobot:
         files: The files in it.
         asked: Values that the URDF lacks and the user must supply.
         left_out: Visuals of the URDF that the copy lacks, with the reasons.
+        bare: Links whose collision meshes the copy lacks, and that have no other shape.
         sizes: Sizes of the standing robot.
         joints: Its joints, in the order of its positions.
         posture: Its standing joint positions [rad].
@@ -43,6 +44,7 @@ class NewRobot:
     files: list[Path]
     asked: list[str]
     left_out: list[str]
+    bare: list[str]
     sizes: Sizes
     joints: list[str]
     posture: dict[str, float]
@@ -109,6 +111,7 @@ def write_robot(
         files=files,
         asked=found.asked,
         left_out=found.copy.left_out,
+        bare=found.copy.bare_links(),
         sizes=found.sizes,
         joints=[joint.name() for joint in found.survey.joints],
         posture=found.posture,
@@ -256,6 +259,15 @@ def _robot_yaml(found: _Findings, task: str) -> str:
     mirror = _mirror(names)
     if mirror:
         lines += ["mirror:", *(f"  {one}: {other}" for one, other in mirror.items())]
+    bare = found.copy.bare_links()
+    if bare:
+        lines += [
+            "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
+            *(f"  - {link}" for link in bare),
+        ]
+        found.asked.append(
+            f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]"
+        )
     lines += ["whole_body:", f"  orientation: {{{survey.base}: {{weight: 20.0}}}}"]
     if task == "balancing" and len(found.legs) > 2:
         lines.append("  posture: {weight: 0.001}")

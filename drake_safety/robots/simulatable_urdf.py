@@ -176,6 +176,7 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
                 mesh.set("filename", _gather(copy, file, file.name))
                 continue
             link.remove(shape)
+            copy.lost_collisions.add(link.get("name", ""))
             lost.append(url if file is None else file.name)
             box = None if file is None else _box(file)
             if box is not None:

@@ -29,6 +29,7 @@ class UrdfCopy:
         left_out: Notes about visuals that were removed.
         lost_shapes: Boxes around removed collision meshes by link: lowest and highest corner in the
             link's frame, (2, 3) [m] each.
+        lost_collisions: Links with removed collision meshes, boxes or none known.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
     """
@@ -38,6 +39,7 @@ class UrdfCopy:
     notes: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     lost_shapes: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    lost_collisions: set[str] = field(default_factory=set)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
 
@@ -56,6 +58,14 @@ class UrdfCopy:
     def link(self, name: str) -> ET.Element:
         """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
+
+    def bare_links(self) -> list[str]:
+        """Returns the links whose collision meshes were removed and that have no other shape."""
+        return [
+            link.get("name", "")
+            for link in self.root.findall("link")
+            if link.get("name") in self.lost_collisions and link.find("collision") is None
+        ]
 
     def effort_limits(self) -> dict[str, float]:
         """Returns the effort limits of all movable joints by name [N·m]; NaN without a limit."""

@@ -22,7 +22,7 @@ class Finding:
         item: The item checked.
         is_ok: Whether the check passed.
         message: Description of the result.
-        remedy: How to correct a failure; "" if the check passed.
+        remedy: How to correct a failure, or what a warning is about; "" if all is well.
     """
 
     item: str
@@ -30,10 +30,20 @@ class Finding:
     message: str
     remedy: str = ""
 
+    @property
+    def is_warning(self) -> bool:
+        """Whether the check passed, but something should be known or done."""
+        return self.is_ok and bool(self.remedy)
+
 
 def passed(item: str, message: str) -> Finding:
     """A finding of a check that passed."""
     return Finding(item=item, is_ok=True, message=message)
+
+
+def warned(item: str, message: str, remedy: str) -> Finding:
+    """A finding of a check that passed with a warning."""
+    return Finding(item=item, is_ok=True, message=message, remedy=remedy)
 
 
 def failed(item: str, message: str, remedy: str) -> Finding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require
@@ -59,7 +61,7 @@ def run_pairs(
     seed: int = ADAPTATION.first,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     **loop_options: Any,
 ) -> EpisodePairs:
@@ -75,7 +77,7 @@ def run_pairs(
         num_workers: Number of processes; that of cores by default.
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        progress: Called with the number of episodes done and in all, two per pair.
+        progress: Called with the number of episodes done and in all, two per pair; True shows it.
         extra: Stored with the episodes' info.
         **loop_options: Options of the task; they replace those of
             :func:`~drake_safety.simulation.capabilities.pairing_options`.
@@ -83,26 +85,27 @@ def run_pairs(
     Raises:
         ValueError: No such variation, or the folder holds other sets.
     """
-
-    def report(offset: int) -> Progress | None:
-        if progress is None:
-            return None
-        return lambda done, total: progress(offset + done, 2 * num_pairs)
-
     loop_options = pairing_options(scenario, variation) | loop_options
     sets = {}
-    for offset, name in enumerate((variation, _TWINS)):
-        sets[name] = run_episodes(
-            scenario,
-            num_pairs,
-            variation=name,
-            seed=seed,
-            num_workers=num_workers,
-            path=None if path is None else Path(path) / name,
-            progress=report(offset * num_pairs),
-            extra=extra,
-            **loop_options,
-        )
+    with shown(progress, lambda stages: partial(stages, "episodes and their twins")) as report:
+
+        def report_of(offset: int) -> Progress | None:
+            if report is None:
+                return None
+            return lambda done, total: report(offset + done, 2 * num_pairs)
+
+        for i, name in enumerate((variation, _TWINS)):
+            sets[name] = run_episodes(
+                scenario,
+                num_pairs,
+                variation=name,
+                seed=seed,
+                num_workers=num_workers,
+                path=None if path is None else Path(path) / name,
+                progress=report_of(i * num_pairs),
+                extra=extra,
+                **loop_options,
+            )
     return EpisodePairs(
         actual=sets[variation], nominal=sets[_TWINS], nominal_hash=scenario.simulation_hash()
     )
@@ -167,7 +170,7 @@ def run_twins(
     *,
     seed: int = ADAPTATION.first,
     num_workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Episodes:
     """Simulates the nominal twins of recorded windows.
 
@@ -176,7 +179,7 @@ def run_twins(
         windows: Windows of a `FeedbackRecorder`.
         seed: Seed of the noise.
         num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
 
     Raises:
         ValueError: The task cannot begin with a given start.
@@ -189,6 +192,7 @@ def run_twins(
         lambda batch: (scenario, seed, [windows[i] for i in batch]),
         num_workers=num_workers,
         progress=progress,
+        stage="nominal twins",
     )
     return Episodes(info, sorted(twins, key=lambda episode: episode.index))
 

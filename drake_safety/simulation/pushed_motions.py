@@ -70,7 +70,7 @@ def run_pushed_motions(
     variation: str = "actual",
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> list[WatchedMotion]:
     """Simulates random safe motions, each undisturbed and pushed, in worker processes.
 
@@ -82,7 +82,7 @@ def run_pushed_motions(
         num_workers: Number of processes; that of cores by default.
         path: Folder for the pairs; pairs of the same set that it already holds are not simulated
             again.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
 
     Raises:
         ValueError: The folder holds another set or a damaged pair, the task has no goals or
@@ -96,8 +96,6 @@ def run_pushed_motions(
         folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
         pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
     remaining = [index for index in range(num_motions) if index not in pairs]
-    if progress is not None:
-        progress(len(pairs), num_motions)
     results = run_batches(
         _motion_batch,
         remaining,
@@ -105,6 +103,7 @@ def run_pushed_motions(
         num_workers=num_workers,
         progress=progress,
         num_done=len(pairs),
+        stage="pushed motions",
     )
     with closing(results):
         for pair in results:

@@ -51,7 +51,7 @@ def record_episodes(
     seed: int = 0,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     accept_code_change: bool = False,
 ) -> Episodes:
     """Simulates a set of episodes of any diagram, in worker processes.
@@ -99,7 +99,7 @@ def record_episodes(
         path: Folder for the episodes; episodes of the same set that it already holds are not
             simulated again. A set is identified by name, parameters, ports, times and the source
             text of ``make_diagram`` and ``reset``, not by the code that these call.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
         accept_code_change: Whether to continue a folder's set begun with another version of this
             package.
 

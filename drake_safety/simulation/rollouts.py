@@ -149,6 +149,31 @@ def run_episode(
     return episode
 
 
+def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The assessment's inputs for a hypothetical state and plan; nothing is simulated.
+
+    ``assessment.predict_one(*inputs_at(loop, start))`` is the verdict on them.
+
+    Args:
+        loop: The closed loop, whose task can begin with a given start.
+        start: State and plan, such as ``replace(loop.standing_start(), plan=plan)`` of a legged
+            robot.
+
+    Returns:
+        State (n_s,) without noise, desired preview (H*n_z,) and features (n_f,).
+
+    Raises:
+        ValueError: The task takes no start, or the start does not fit the plant.
+    """
+    context = loop.CreateDefaultContext()
+    require(loop, CanStartAnywhere).reset_to(context, None, start)
+    state, preview, features = (
+        loop.GetOutputPort(name).Eval(context).copy()
+        for name in ("state", "desired_preview", "features")
+    )
+    return state, preview, features
+
+
 def run_episodes(
     scenario: Scenario,
     num_episodes: int,
@@ -157,7 +182,7 @@ def run_episodes(
     seed: int = 0,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
     is_standing: bool = False,
@@ -177,7 +202,7 @@ def run_episodes(
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes; episodes of the same set that it already holds are not
             simulated again.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
         extra: Stored with the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             cannot be stored.
@@ -224,7 +249,7 @@ def collect_episodes(
     *,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     accept_code_change: bool = False,
 ) -> Episodes:
@@ -243,15 +268,19 @@ def collect_episodes(
     """
     done = completed(path) & set(range(num_episodes)) if path is not None else set()
     remaining = [index for index in range(num_episodes) if index not in done]
-    if progress is not None:
-        progress(len(done), num_episodes)
     episodes: list[Episode] = []
     writer = None
     if path is not None:
         writer = EpisodeWriter(path, info, extra, accept_code_change=accept_code_change)
         episodes += (e for e in load_episodes(path) if e.index in done) if done else ()
     results = run_batches(
-        _call, remaining, task, num_workers=num_workers, progress=progress, num_done=len(done)
+        _call,
+        remaining,
+        task,
+        num_workers=num_workers,
+        progress=progress,
+        num_done=len(done),
+        stage=f"episodes of '{info.scenario}'",
     )
     with writer or nullcontext(), closing(results):
         for episode in results:

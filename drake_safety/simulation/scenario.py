@@ -1,5 +1,6 @@
 """Scenarios: YAML files that combine a robot and a task."""
 
+import contextlib
 import hashlib
 import importlib
 import inspect
@@ -7,7 +8,7 @@ import math
 import re
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +19,7 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
 from drake_safety.learning.assessment import AssessmentParameters
-from drake_safety.robots.reading import parse_yaml, reading
+from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -64,6 +65,7 @@ class Scenario:
     """Parameters of the assessment."""
 
     parameters = cast(Any, None)  # Set by the loader: an instance of the task's Parameters.
+    folder = ""  # Set by the loader: the scenario file's folder, where its task may stand.
 
     def __post_init__(self) -> None:
         for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
@@ -107,7 +109,8 @@ class Scenario:
         """
         if name not in self.variations:
             raise ValueError(
-                f"scenario '{self.name}' has no variation '{name}'; it has {list(self.variations)}"
+                f"scenario '{self.name}' has no variation '{name}'"
+                f"{did_you_mean(name, self.variations)}; it has {list(self.variations)}"
             )
         return self.variations[name]
 
@@ -117,7 +120,11 @@ class Scenario:
         Raises:
             ValueError: The import path is malformed or is not that of a ClosedLoop.
         """
-        return _import_task(self.task, self.name)
+        return _import_task(self.task, self.name, self.folder)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A worker process imports the task before it reads the parameters, which are the task's.
+        return _unpickled, (self.task, self.name, self.folder), vars(self)
 
     def make_loop(
         self,
@@ -244,23 +251,73 @@ def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
     known = [parameter.name for parameter in parameters if parameter.name not in common]
     unknown = [name for name in options if name not in known]
     if unknown:
-        raise ValueError(f"task '{task.__name__}' has no options {unknown}; it has {known}")
+        raise ValueError(
+            f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], known)}; it "
+            f"has {known}"
+        )
 
 
-def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
+def _unpickled(task: str, name: str, folder: str) -> Scenario:
+    """An empty scenario, whose task is imported if it stands beside the scenario's file."""
+    if _file_beside(task.partition(":")[0], folder):
+        _import_task(task, name, folder)
+    return Scenario.__new__(Scenario)
+
+
+def _file_beside(module_name: str, folder: str) -> Path | None:
+    """The file of a module in a folder, if there is one."""
+    if not folder:
+        return None
+    path = Path(folder, *module_name.split("."))
+    files = (path.with_suffix(".py"), path / "__init__.py")
+    return next((file for file in files if file.is_file()), None)
+
+
+@contextlib.contextmanager
+def _searched(folder: str) -> Iterator[None]:
+    """Lets modules of a folder be imported while the block runs, after all others."""
+    if folder in sys.path:
+        yield
+        return
+    sys.path.append(folder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if folder in sys.path:
+            sys.path.remove(folder)
+
+
+def _imported(module_name: str, scenario_name: str, folder: str) -> ModuleType:
+    """A task's module, which may stand beside the scenario's file."""
+    file = _file_beside(module_name, folder)
+    if file is None:
+        return importlib.import_module(module_name)
+    with _searched(folder):
+        module = importlib.import_module(module_name)
+    found = getattr(module, "__file__", None)
+    if found is None or Path(found).resolve() != file.resolve():
+        raise ValueError(
+            f"scenario '{scenario_name}': module '{module_name}' is {found}, and not {file} beside "
+            "the scenario: give the file a name of its own"
+        )
+    return module
+
+
+def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]:
     module_name, _, class_name = task.partition(":")
     if not (module_name and class_name):
         raise ValueError(
             f"scenario '{scenario_name}': task must be 'package.module:Class'; got '{task}'"
         )
     try:
-        module = importlib.import_module(module_name)
+        module = _imported(module_name, scenario_name, folder)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise ValueError(
-            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}'; tasks of "
-            f"the package are {task_names()}"
+            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}', installed "
+            f"or beside the scenario's file; tasks of the package are {task_names()}"
         ) from error
     known = {
         name: value
@@ -272,8 +329,8 @@ def _import_task(task: str, scenario_name: str) -> type[ClosedLoop]:
     }
     if class_name not in known:
         raise ValueError(
-            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'; "
-            f"it has {list(known)}"
+            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'"
+            f"{did_you_mean(class_name, known)}; it has {list(known)}"
         )
     return known[class_name]
 
@@ -297,7 +354,8 @@ def load_scenario(name: str | Path) -> Scenario:
     """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
     Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
-    not. A relative ``robot`` path is relative to the scenario file's folder.
+    not. The task's module may stand in the scenario file's folder, where modules are searched last,
+    while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
 
     Args:
         name: Name of a scenario of the package, or a path.
@@ -307,9 +365,9 @@ def load_scenario(name: str | Path) -> Scenario:
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
-        return parse_scenario(
-            path.read_text(encoding="utf-8"), name=path.stem, folder=path.resolve().parent
-        )
+        folder = path.resolve().parent
+        text = path.read_text(encoding="utf-8")
+        return parse_scenario(text, name=path.stem, folder=folder, task_folder=str(folder))
 
 
 def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
@@ -335,26 +393,28 @@ def _scenario_file(name: str | Path) -> Path:
         path = _scenario_folder() / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(
-                f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give "
-                "the path of a YAML file"
+                f"scenario '{name}' does not exist{did_you_mean(name, scenario_names())}; "
+                f"scenarios are {scenario_names()}, or give the path of a YAML file"
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
     return path
 
 
-def parse_scenario(text: str, *, name: str, folder: Path) -> Scenario:
+def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "") -> Scenario:
     """Reads a scenario from YAML text.
 
     Args:
         text: The YAML.
         name: The scenario's name.
         folder: Folder of relative robot paths.
+        task_folder: Folder in which the task's module may stand; "" for none.
 
     Raises:
         ValueError: See :func:`load_scenario`.
     """
     scenario, parameters = _parsed(text, name, folder)
+    scenario.folder = task_folder
     task = scenario.task_class()
     if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
         parameters = task.complete_parameters(scenario.robot, parameters)

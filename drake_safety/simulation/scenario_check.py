@@ -14,16 +14,19 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.learning.progress import StageProgress
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.urdf_copy import read_urdf
 from drake_safety.simulation.capabilities import HasBall, HasOwnFiles
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.contract import Finding, check_contract, failed, passed
+from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
+_STANDS = "stands for 1 s"
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
 _MATCH_M = 1e-3
@@ -41,7 +44,12 @@ class _State:
 
 
 def check_scenario(
-    name: str | Path, *, num_episodes: int = 16, seed: int = 0, is_imported: bool = True
+    name: str | Path,
+    *,
+    num_episodes: int = 16,
+    seed: int = 0,
+    is_imported: bool = True,
+    progress: StageProgress | None = None,
 ) -> Iterator[Finding]:
     """Checks a scenario item by item, the cheap ones first.
 
@@ -54,11 +62,13 @@ def check_scenario(
         seed: Seed of the episodes.
         is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
             files are checked.
+        progress: Called with a stage, the number done and the number wanted.
 
     Yields:
         The findings.
     """
     state = _State()
+    report: StageProgress = progress or (lambda stage, done, total: None)
     if is_imported:
         yield from _guarded("scenario", lambda: _scenario(state, name))
     else:
@@ -74,6 +84,7 @@ def check_scenario(
             return
         yield from _guarded("standing posture", lambda: _posture(kinematics))
         yield from _guarded("motors", lambda: _motors(kinematics))
+        yield from _guarded("collision shapes", lambda: _collisions(robot))
     if not is_imported:
         return
     own = list(_guarded("files of the task", lambda: _own(state, scenario)))
@@ -86,10 +97,12 @@ def check_scenario(
     if isinstance(loop, LeggedLoop):
         yield from _guarded("contact spheres", lambda: _contacts(loop))
         yield from _guarded("shape of the base", lambda: _target(loop))
-        yield from _guarded("stands for 1 s", lambda: _stands(loop))
+        report(_STANDS, 0, 1)
+        yield from _guarded(_STANDS, lambda: _stands(loop))
+        report(_STANDS, 1, 1)
     yield from _guarded("contract", lambda: iter(check_contract(loop, seed=seed)))
     if num_episodes:
-        yield from _guarded("episodes", lambda: _episodes(loop, num_episodes, seed))
+        yield from _guarded("episodes", lambda: _episodes(loop, num_episodes, seed, report))
 
 
 def _guarded(item: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
@@ -263,6 +276,29 @@ def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
         yield passed("effort against gravity", f"{100 * max(shares, default=0):.0f} % at most")
 
 
+def _collisions(robot: RobotModel) -> Iterator[Finding]:
+    """Checks whether links that lost their collision meshes have got a shape since."""
+    if not robot.without_collision:
+        return
+    root = read_urdf(Path(robot.source_dir) / robot.urdf).root
+    shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
+    bare = [
+        name
+        for name in robot.without_collision
+        if name not in shaped and by_pattern(robot.shapes, name, "shapes", robot.name) is None
+    ]
+    if not bare:
+        yield passed("collision shapes", "every link that lost its meshes has a shape")
+        return
+    yield warned(
+        "collision shapes",
+        f"{len(bare)} links have none, as their meshes were left out; everything passes through "
+        f"{', '.join(bare)}",
+        f"add a <collision> with a box, sphere or capsule [m] to those that touch something, in "
+        f"{Path(robot.urdf).name}, or delete them from 'without_collision' in robot.yaml",
+    )
+
+
 def _target(loop: LeggedLoop) -> Iterator[Finding]:
     """Checks that a thrown ball can hit the base."""
     if not isinstance(loop, HasBall):
@@ -344,17 +380,23 @@ def _stands(loop: LeggedLoop) -> Iterator[Finding]:
     )
     if abs(sunk) > _SINK_SHARE * kinematics.standing_height or speed > 1.0 or not touching:
         yield failed(
-            "stands for 1 s",
+            _STANDS,
             message,
             "raise 'joint_gains' [N·m/rad] if it sinks, lower them if it trembles; look for shapes "
             "that overlap",
         )
     else:
-        yield passed("stands for 1 s", message)
+        yield passed(_STANDS, message)
 
 
-def _episodes(loop: ClosedLoop, num_episodes: int, seed: int) -> Iterator[Finding]:
-    episodes = [run_episode(loop, index, seed=seed) for index in range(num_episodes)]
+def _episodes(
+    loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress
+) -> Iterator[Finding]:
+    episodes = []
+    for index in range(num_episodes):
+        report("episodes", index, num_episodes)
+        episodes.append(run_episode(loop, index, seed=seed))
+    report("episodes", num_episodes, num_episodes)
     causes: dict[str, int] = {}
     for episode in episodes:
         if not episode.is_safe:

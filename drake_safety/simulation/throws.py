@@ -270,7 +270,7 @@ def run_throws(
     variation: str = "actual",
     trigger_times_s: dict[int, float] | None = None,
     num_workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> list[ThrowLog]:
     """Throws a set of balls, in worker processes.
 
@@ -281,7 +281,7 @@ def run_throws(
         variation: The plant.
         trigger_times_s: Time of the trigger by index [s]; by default there is no recovery.
         num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all.
+        progress: Called with the number done and in all; True shows it.
 
     Returns:
         The logs, in the order of ``indices``.
@@ -300,6 +300,7 @@ def run_throws(
         ),
         num_workers=num_workers,
         progress=progress,
+        stage="throws",
     )
     by_index = {log.index: log for log in logs}
     return [by_index[index] for index in indices]

@@ -11,10 +11,13 @@ import time
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import closing
+from functools import partial
 from types import BuiltinFunctionType, ModuleType
 from typing import Any
 
 from pydrake.systems.framework import LeafSystem
+
+from drake_safety.learning.progress import shown
 
 _BATCH = 4  # Episodes, or throws, per call of a worker.
 _WATCH_PERIOD_S = 1.0
@@ -35,8 +38,9 @@ def run_batches(
     arguments: Callable[[list[int]], tuple],
     *,
     num_workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     num_done: int = 0,
+    stage: str = "simulations",
 ) -> Generator[Any, None, None]:
     """Calls a function for batches of indices in worker processes; yields results as they finish.
 
@@ -45,17 +49,21 @@ def run_batches(
         indices: The indices.
         arguments: Maps a batch of indices to the function's arguments.
         num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all, after each batch.
+        progress: Called with the number done and in all, at the start and after each batch; True
+            shows it.
         num_done: Number done beforehand.
+        stage: Name under which it is shown.
     """
     num_wanted = num_done + len(indices)
     results = parallel_map(function, [arguments(batch) for batch in batches(indices)], num_workers)
-    with closing(results):
+    with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
+        if report is not None:
+            report(num_done, num_wanted)
         for batch in results:
             yield from batch
             num_done += len(batch)
-            if progress is not None:
-                progress(num_done, num_wanted)
+            if report is not None:
+                report(num_done, num_wanted)
 
 
 def parallel_map(

@@ -17,6 +17,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.prediction import Correction
 from drake_safety.systems.float_system import FloatSystem
 
@@ -51,7 +52,8 @@ class SafetyAssessor(FloatSystem, LeafSystem):
     b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
     heads with the correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the
     distance of the inputs from those of training, novel above 1. The belief of inputs that are
-    novel or not finite is (0, 0, 1). So is every belief while ``alarm`` is above 0.5, as that of a
+    novel or not finite is (0, 0, 1), and so is the belief before the first evaluation. So is every
+    belief while ``alarm`` is above 0.5, as that of a
     :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. With ``margins``, those of the
     measured state, no belief is safe while one is negative: its mass for "safe" then counts as
     unsafe by the most violated constraint. The beliefs of the grid, the correction and the novelty
@@ -99,7 +101,10 @@ class SafetyAssessor(FloatSystem, LeafSystem):
             "calibrated_safety_probability": 1,
             "novelty": 1,
         }
-        state = self.DeclareDiscreteState(sum(sizes.values()))
+        first = np.concatenate(
+            [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
+        )
+        state = self.DeclareDiscreteState(first)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
         start = 0

@@ -1,0 +1,89 @@
+"""Progress: lines where there is no terminal, and True in place of a callback."""
+
+import io
+import time
+
+from rich.console import Console
+
+from drake_safety import SafetyAssessment, run_episodes
+from drake_safety.cli.console import open_stages as open_stages_of_commands
+from drake_safety.learning.progress import open_stages, shown
+from drake_safety.simulation.scenario import parse_scenario
+from gliding_task import SCENARIO
+
+
+def lines_of(file):
+    return file.getvalue().splitlines()
+
+
+def test_without_a_terminal_lines_come_while_a_stage_is_silent():
+    file = io.StringIO()
+    with open_stages(Console(file=file, width=200), period_s=0.05) as stages:
+        stages("throws", 0, 40)
+        stages("throws", 10, 40)
+        time.sleep(0.3)
+    assert len(lines_of(file)) >= 2
+    assert lines_of(file)[0].startswith("throws: 10/40, 0:00:00, 0:00:0")
+    assert lines_of(file)[0].endswith(" left")
+
+
+def test_the_end_of_a_stage_is_a_line_and_so_is_silence_after_it():
+    file = io.StringIO()
+    with open_stages(Console(file=file, width=200), period_s=0.05) as stages:
+        stages("throws", 40, 40)
+        assert lines_of(file) == ["throws: 40/40, 0:00:00"]
+        time.sleep(0.2)
+    assert lines_of(file)[1] == "still working, after 'throws'"
+
+
+def test_what_an_earlier_run_has_done_is_not_counted_for_the_time_left():
+    file = io.StringIO()
+    with open_stages(Console(file=file, width=200), period_s=60) as stages:
+        stages("throws", 30, 40)
+        stages.print_lines()
+    assert lines_of(file) == ["throws: 30/40, 0:00:00"]
+
+
+def test_a_log_file_that_is_told_to_have_colours_gets_lines():
+    file = io.StringIO()
+    with open_stages(Console(file=file, width=200, force_terminal=True)) as stages:
+        stages("throws", 1, 1)
+    assert lines_of(file) == ["throws: 1/1, 0:00:00"]
+
+
+def test_on_a_terminal_there_are_bars():
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    file = Terminal()
+    with open_stages(Console(file=file, width=200, force_terminal=True)) as stages:
+        stages("throws", 1, 2)
+    assert "throws" in file.getvalue() and "━" in file.getvalue()
+
+
+def test_the_commands_print_a_line_every_ten_seconds(capsys):
+    with open_stages_of_commands() as stages:
+        stages("throws", 2, 2)
+    assert capsys.readouterr().out == "throws: 2/2, 0:00:00\n"
+
+
+def test_a_callback_is_used_as_it_is_and_false_is_none():
+    def report(done, total):
+        pass
+
+    with shown(report, lambda stages: stages) as given:
+        assert given is report
+    for nothing in (None, False):
+        with shown(nothing, lambda stages: stages) as given:
+            assert given is None
+
+
+def test_true_shows_the_progress_of_episodes_and_of_learning(capsys, tmp_path):
+    scenario = parse_scenario(SCENARIO, name="gliding", folder=tmp_path)
+    episodes = run_episodes(scenario, 12, num_workers=1, progress=True)
+    assert "episodes of 'gliding': 12/12" in capsys.readouterr().err
+    scenario.assessment.perplexity = 5.0
+    SafetyAssessment(scenario.assessment).fit(episodes, progress=True)
+    printed = capsys.readouterr().err
+    assert "t-SNE: 100/100" in printed and "beliefs: 100/100" in printed
