@@ -330,7 +330,7 @@ class Walking(LeggedLoop):
         period_s = self.policy.parameters.period_s
         simulator = Simulator(other)
         context = simulator.get_mutable_context()
-        other.simplify(context)
+        other.remove_visuals(context)
         plan = PiecewisePolynomial(command[:, None])
         other.reset_to(context, None, replace(self.standing_start(), plan=plan))
         simulator.Initialize()

@@ -75,7 +75,7 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> WalkedMo
         changes.append(changes[-1] + rng.uniform(*_HELD_S))
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    loop.simplify(context)
+    loop.remove_visuals(context)
     plan = profile(commands, changes[:-1], duration_s)
     loop.reset_to(context, rng, replace(loop.settled_start(), plan=plan))
     simulator.Initialize()

@@ -238,7 +238,7 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
     [
         ([], "needs a target: pass --target x y z, or one of the names ['blue_box', 'red_can']"),
         (["--push", "torso"], "needs a target"),
-        (["--force"], "--force goes to a target that Γ refuses: pass --target too"),
+        (["--force"], "--force goes to a target that Γ refuses: pass that too"),
         (["--target", "blue_box", "--push", "ball"], "no such push"),
         (["--target", "blue_box", "--push", "torso", "--push", "torso"], "takes one push"),
         (

@@ -6,7 +6,7 @@ from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.live.commanded_session import LiveCommands
-from test_live_session import click, quick
+from live_pages import click, quick
 
 
 @pytest.fixture(scope="module")

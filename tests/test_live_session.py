@@ -25,6 +25,7 @@ from drake_safety.live.session import (
     Pace,
 )
 from drake_safety.simulation.legged_loop import View
+from live_pages import click, quick
 from reaching_targets import NEAR, made_up_episodes
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -32,31 +33,9 @@ CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 FAR = ("0.95", "0.5", "1.05")
 
 
-def packed(value):
-    """MessagePack of short texts, numbers and maps: what a browser sends."""
-    if isinstance(value, dict):
-        items = [packed(one) for pair in value.items() for one in pair]
-        return bytes([0x80 + len(value)]) + b"".join(items)
-    text = value.encode()
-    assert len(text) < 32
-    return bytes([0xA0 + len(text)]) + text
-
-
-def click(session, name):
-    session.meshcat._InjectWebsocketMessage(packed({"type": "button", "name": name}))
-
-
 def move(session, values):
     for name, value in zip(session.AXES, values, strict=True):
         session.meshcat.SetSliderValue(name, float(value))
-
-
-def quick(scenario):
-    """Trains in a second; what is learned is of no account here."""
-    parameters = scenario.assessment
-    parameters.epochs, parameters.ensemble_size, parameters.hidden_sizes = 20, 1, [32]
-    parameters.perplexity, parameters.min_count = 5, 1
-    return scenario
 
 
 @pytest.fixture(scope="module")

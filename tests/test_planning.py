@@ -218,5 +218,5 @@ def test_a_task_whose_plans_have_no_goal_is_not_asked():
 
 
 def test_a_goal_is_three_numbers():
-    with pytest.raises(ValueError, match=r"three numbers \[m\]; got \[0.5, 0.0\]"):
+    with pytest.raises(ValueError, match=r"three numbers; got \[0.5, 0.0\]"):
         ask(constant(1.0), INSIDE[:2])

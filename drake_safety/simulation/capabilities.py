@@ -143,6 +143,14 @@ class CanFall(Protocol):
 
 
 @runtime_checkable
+class HasVisuals(Protocol):
+    """The diagram has shapes that only pictures need, and that cost time in each query."""
+
+    def remove_visuals(self, context: Context) -> None:
+        """Removes them from the Context of a simulation that is not rendered."""
+
+
+@runtime_checkable
 class HasBall(Protocol):
     """A ball can be thrown at the robot, and recovery can be triggered."""
 
@@ -319,6 +327,17 @@ def pairing_options(scenario: Any, variation: str) -> dict[str, Any]:
     """
     task = scenario.task_class()
     return task.pairing_options(scenario, variation) if issubclass(task, PlannedLoop) else {}
+
+
+def remove_visuals(loop: object, context: Context) -> None:
+    """Removes from a Context the shapes that only pictures need, if the loop has any.
+
+    Args:
+        loop: A closed loop.
+        context: The root Context of a simulation that is not rendered.
+    """
+    if isinstance(loop, HasVisuals):
+        loop.remove_visuals(context)
 
 
 def angular_constraints(loop: object) -> tuple[str, ...]:

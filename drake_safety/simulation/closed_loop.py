@@ -152,13 +152,6 @@ class ClosedLoop(FloatSystem, Diagram):
             return root_context
         return super().GetMyMutableContextFromRoot(root_context)
 
-    def simplify(self, context: Context) -> None:
-        """Removes from a Context what no output port depends on, such as visual shapes.
-
-        Args:
-            context: The root Context of a simulation that is not rendered.
-        """
-
     def _is_outermost(self) -> bool:
         return str(self.GetSystemPathname()).count("::") == 1
 

@@ -9,7 +9,13 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import CanBePushed, CanFall, HasGoals, require
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    HasGoals,
+    remove_visuals,
+    require,
+)
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng
@@ -103,7 +109,7 @@ def run_to_goal(
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
-    loop.simplify(context)
+    remove_visuals(loop, context)
     with_goals = require(loop, HasGoals)
     with_goals.reset_standing(context, goal, episode_rng(seed, 0))
     if push is not None:

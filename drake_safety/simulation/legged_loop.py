@@ -283,8 +283,8 @@ class LeggedLoop(PlannedLoop):
             MeshcatVisualizer.AddToBuilder(builder, self.scene_graph, meshcat)
         return assessor
 
-    def simplify(self, context: Context) -> None:
-        """Removes the visual shapes, unless the diagram has a visualiser; see `ClosedLoop`."""
+    def remove_visuals(self, context: Context) -> None:
+        """Removes the visual shapes, unless the diagram has a visualiser; see `HasVisuals`."""
         if not self._is_shown:
             remove_visuals(self.plant, self.scene_graph, context)
 

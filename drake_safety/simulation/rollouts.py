@@ -24,6 +24,7 @@ from drake_safety.simulation.capabilities import (
     HasGoals,
     OffersPlans,
     monitor_period_s,
+    remove_visuals,
     require,
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
@@ -117,7 +118,7 @@ def run_episode(
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    loop.simplify(context)
+    remove_visuals(loop, context)
     rng = episode_rng(seed, index)
     first_step = 0
     if start is not None:
