@@ -204,16 +204,16 @@ def guard_estimates(
 def speed_estimates(
     ours: Sequence[WalkedMotion], theirs: Sequence[WalkedMotion]
 ) -> dict[str, Estimate]:
-    """Difference of mean forward speeds between two engines, over the same commands.
+    """Difference of mean planar velocities between two engines, over the same commands.
 
     Args:
         ours: Tours in Drake.
-        theirs: The same in MuJoCo.
+        theirs: The same in MuJoCo; of tours that last differently the common part counts.
     """
-    pairs = [
-        (a.output.mean(axis=0), b.output.mean(axis=0))
-        for a, b in zip(ours, theirs, strict=True)
-        if not (a.has_fallen or b.has_fallen)
-    ]
+    pairs = []
+    for a, b in zip(ours, theirs, strict=True):
+        rows = min(len(a.output), len(b.output))
+        if not (a.has_fallen or b.has_fallen):
+            pairs.append((a.output[:rows].mean(axis=0), b.output[:rows].mean(axis=0)))
     difference = np.array([np.linalg.norm((a - b)[:2]) for a, b in pairs])
     return {"speed.difference_to_mujoco_m_s": median(difference)}
