@@ -168,6 +168,7 @@ def test_every_study_says_in_a_sentence_what_it_does():
         "scale",
         "soak",
         "truth",
+        "walking",
         "bench",
         "store",
         "readme",

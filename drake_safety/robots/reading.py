@@ -12,6 +12,7 @@ import yaml
 
 _LONGEST_MESSAGE = 500  # Characters, without the name of the file.
 _MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
+_LIKENESS = 0.7  # Of a name and one that may have been meant, in [0, 1].
 
 
 @contextmanager
@@ -72,7 +73,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     Returns:
         The words, with a space before them; "" if none is like it.
     """
-    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1)
+    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1, cutoff=_LIKENESS)
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 
