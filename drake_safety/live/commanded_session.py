@@ -7,7 +7,6 @@ import math
 import numpy as np
 from pydrake.geometry import Meshcat
 
-from drake_safety.learning.causes import likely_cause
 from drake_safety.live.panel import INK_RGB, RECOVERY_RGB, SAFE_RGB, UNSAFE_RGB
 from drake_safety.live.session import TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
@@ -131,10 +130,4 @@ class LiveCommands(LiveSession):
             first = "safe" if self.is_guarded else "safe, guard off"
             self.panel.show_text(first, note, rgb=SAFE_RGB if self.is_guarded else INK_RGB)
         else:
-            cause = likely_cause(
-                self.loop.constraint_names,
-                self._eval("cause_probability"),
-                self._eval("predicted_margins"),
-                self.assessment.parameters.margin_unit,
-            )
-            self.panel.show_text(f"unsafe: {cause}" if cause else "unsafe", note, rgb=UNSAFE_RGB)
+            self._show_unsafe(note)

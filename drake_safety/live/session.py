@@ -179,6 +179,15 @@ class LiveSession(ABC):
         if time_s is not None:
             self.panel.add(time_s, shown)
 
+    def _show_unsafe(self, note: str) -> None:
+        cause = likely_cause(
+            self.loop.constraint_names,
+            self._eval("cause_probability"),
+            self._eval("predicted_margins"),
+            self.assessment.parameters.margin_unit,
+        )
+        self.panel.show_text(f"unsafe: {cause}" if cause else "unsafe", note, rgb=UNSAFE_RGB)
+
     def _eval(self, port: str) -> np.ndarray:
         return self.loop.GetOutputPort(port).Eval(self.context)
 
@@ -277,13 +286,7 @@ class LiveThrows(LiveSession):
         elif self.probability >= self.threshold:
             self.panel.show_text("safe: balancing", note, rgb=SAFE_RGB)
         else:
-            cause = likely_cause(
-                self.loop.constraint_names,
-                self._eval("cause_probability"),
-                self._eval("predicted_margins"),
-                self.assessment.parameters.margin_unit,
-            )
-            self.panel.show_text(f"unsafe: {cause}" if cause else "unsafe", note, rgb=UNSAFE_RGB)
+            self._show_unsafe(note)
 
 
 class LiveGoals(LiveSession):
