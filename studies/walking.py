@@ -42,7 +42,7 @@ from studies.walking_motions import WalkedMotion, run_motions
 
 WALKING_FILE = "walking.json"
 TOUR_S, _PUSHED_S, _COMMANDED_S, _SPEED_S = 60.0, 5.0, 4.0, 12.0
-_SEEDS = {"calibration": 6_000_000, "tour": 6_000_001, "push": 6_000_002, "command": 6_000_003}
+_SEEDS = {"calibration": 6_000_000, "tour": 6_000_001, "push": 6_000_002, "command": 6_000_004}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,9 @@ def walking(
         calm = sets.run("tour", range(calibration_tours), TOUR_S, seeds="calibration")
         thresholds = alarm_thresholds(alarms, calm)
         pushed = sets.run("push", range(pushes), _PUSHED_S)
-        estimates |= alarm_estimates(alarms, thresholds, pushed)
+        estimates |= alarm_estimates(
+            alarms, thresholds, pushed, loaded.parameters.random_pushes.duration_s
+        )
         if recovered:
             fallen = [m.index for m in pushed if m.fall_time_s >= m.push_time_s and m.has_fallen]
             fallen = fallen[:recovered]

@@ -81,7 +81,10 @@ def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> d
 
 
 def alarm_estimates(
-    alarms: Sequence[Alarm], thresholds: Mapping[str, float], pushed: Sequence[WalkedMotion]
+    alarms: Sequence[Alarm],
+    thresholds: Mapping[str, float],
+    pushed: Sequence[WalkedMotion],
+    push_s: float,
 ) -> dict[str, Estimate]:
     """Shares of falls announced, lead times, and alarms in motions without a fall.
 
@@ -89,6 +92,7 @@ def alarm_estimates(
         alarms: The alarms.
         thresholds: By alarm.
         pushed: Motions with a push.
+        push_s: Duration of a push [s].
     """
     judged = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
     fallen = [motion for motion in judged if motion.has_fallen]
@@ -98,6 +102,7 @@ def alarm_estimates(
         "pushes.fallen": proportion(len(fallen), len(judged)),
         "pushes.left": proportion(sum(motion.has_left for motion in judged), len(judged)),
         "pushes.push_to_fall_s": median(until),
+        "pushes.fallen_soon": proportion(int(np.sum(until < push_s + EARLY_S)), len(fallen)),
     }
     for alarm in alarms:
         threshold = thresholds[alarm.name]

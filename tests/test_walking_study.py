@@ -58,11 +58,12 @@ def test_a_fall_is_announced_by_a_row_below_the_threshold_between_push_and_fall(
     never = motion([0, 1, 1, 1, 1, 1, 0, 1], push_s=0.2, leave_s=0.6, fall_s=0.7)
     false = motion([1, 0, 0, 1, 1, 1], push_s=0.1)
     before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
-    found = alarm_estimates(
-        [ALARM], {"value": 0.5}, [in_time, late, never, false, motion([1] * 6), before_push]
-    )
+    pushed = [in_time, late, never, false, motion([1] * 6), before_push]
+    found = alarm_estimates([ALARM], {"value": 0.5}, pushed, push_s=0.2)
     assert found["pushes.fallen"].value == pytest.approx(3 / 5)
     assert found["pushes.push_to_fall_s"].value == pytest.approx(0.5)
+    assert found["pushes.fallen_soon"].value == 0.0
+    assert alarm_estimates([], {}, pushed, push_s=0.4)["pushes.fallen_soon"].value == 1.0
     assert found["alarm.value.announced"].value == pytest.approx(1 / 3)
     assert found["alarm.value.lead_s"].value == pytest.approx(0.1)
     assert found["alarm.value.alarms_without_leaving"].value == pytest.approx(1 / 2)
@@ -114,6 +115,7 @@ def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: P
 def test_the_table_has_a_row_for_every_alarm_and_branch():
     estimate = Estimate(0.5, 0.4, 0.6, 10)
     keys = ["tours.without_fall", "tours.hours", "pushes.fallen", "pushes.push_to_fall_s"]
+    keys.append("pushes.fallen_soon")
     for alarm in ("sharpened", "tilt"):
         keys += [f"alarm.{alarm}.{x}" for x in ("announced", "lead_s", "alarms_without_leaving")]
         keys.append(f"tours.{alarm}.false_alarms_per_hour")
@@ -125,7 +127,7 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
     )
     text = walking_text(results)
     assert text.startswith("```sh\nrun me\n```\n\nOf 10 tours")
-    assert text.count("50.0 % (40.0–60.0)") == 8
+    assert text.count("50.0 % (40.0–60.0)") == 9
     plans = {f"plans.mlp.{key}": estimate for key in ("auc", "safe_recall", "unsafe_recall")}
     plans["plans.outcomes.safe"] = estimate
     with_plans = walking_text(replace(results, estimates=results.estimates | plans))
