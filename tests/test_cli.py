@@ -249,6 +249,8 @@ def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
 @pytest.mark.parametrize(
     ("push", "message"),
     [
+        ("mas=3", r"unknown 'mas' \(did you mean 'mass'\?\); give 'ball', or any of"),
+        ("bal", r"unknown 'bal' \(did you mean 'ball'\?\); give 'ball', or any of"),
         ("weight=3", r"unknown 'weight'; give 'ball', or any of \['time=NUMBER', 'mass=NUMBER'"),
         ("mass=heavy", "'heavy' is not a number"),
         ("mass=-1", "mass_kg must be positive; got -1.0"),
