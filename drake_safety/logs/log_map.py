@@ -17,8 +17,9 @@ ORDERS = ("wxyz", "xyzw")
 FRAMES = ("world", "body")
 """Frames of a velocity of the base."""
 _NO_POSITION = (
-    ": a log of joints and an inertial measurement unit has none; a state estimator for legged robots "
-    "adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base position')"
+    ": a log of joints and an inertial measurement unit has none; a state estimator for legged "
+    "robots adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base "
+    "position')"
 )
 
 
