@@ -275,7 +275,7 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     recording = SimpleNamespace(
         viewer=None,
         start=lambda: started.append(True),
-        save=lambda timeline, events: None,
+        save=lambda timeline, events, threshold: None,
         save_animation=lambda *arguments: None,
     )
     monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)

@@ -155,7 +155,7 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
         "unsafe below",
         "misses",
         "safe recall",
-        title=f"Thresholds of {GAMMA[CALIBRATED]}, {one.origin}",
+        title=f"Promised: {one.promise}",
     )
     for mode, calibrations in found.items():
         for calibration in calibrations:
