@@ -25,9 +25,9 @@ class RecoveryParameters:
     """Parameters of trigger and recovery steps."""
 
     threshold: float = 0.6
-    """Γ_thre."""
+    """Γ_thre. The default is the paper's value, which it has for literal Γ."""
     is_normalized: bool = True
-    """Whether the threshold is on b_safe / (1 - μ), or on b_safe as in the paper."""
+    """Whether the threshold is on normalised Γ, b_safe / (1 - μ), or on literal Γ, b_safe."""
     persistence_s: float = 0.02
     """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known Γ
     triggers at once. The paper has neither."""

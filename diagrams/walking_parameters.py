@@ -159,7 +159,7 @@ class GuardParameters:
     """The command guard."""
 
     threshold: float = 0.9
-    """Lowest calibrated Γ of a command that is passed on."""
+    """Lowest calibrated Γ of a command that is passed on; set after a look at Go2's figures."""
     period_s: float = 0.1
     """Time between two decisions [s]."""
 
@@ -172,7 +172,7 @@ class WalkingRecovery:
     """"stop": a command of zero; "slower": a share of the command; "crouch": down to a posture,
     with damping; "policy": another policy."""
     threshold: float = 0.5
-    """Γ_thre, on the calibrated Γ."""
+    """Γ_thre, of calibrated Γ; not tuned."""
     persistence_s: float = 0.04
     """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
     move, a single row can be unlike those of training."""

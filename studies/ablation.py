@@ -209,7 +209,7 @@ class VariantScores:
     """Unsafe scores 1 - Γ of a variant on fresh segments.
 
     Attributes:
-        calibration: Scores of the calibration set, by b_safe / (1 - μ), (M,).
+        calibration: Scores of the calibration set, 1 - normalised Γ, (M,).
         test: Scores of the test set, likewise, (N,).
         calibrated: Scores of the test set by calibrated Γ, (N,); equal to `test` in the paper's
             mode, which has no heads.

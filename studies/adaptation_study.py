@@ -20,13 +20,13 @@ from drake_safety.simulation.worker_processes import parallel_map
 SIZES = (40, 80, 120, 160, 400)
 """Numbers of feedback sets after which an assessment is evaluated."""
 THRESHOLD = 0.5
-"""Safety probability below which a segment is classified unsafe."""
+"""Γ below which a segment is classified unsafe."""
 
 PUBLISHED: dict[str, Callable[[Assessments], np.ndarray]] = {
     "calibrated": lambda result: result.calibrated,
     "grid": lambda result: result.normalized,
 }
-"""Forms of Γ by name: calibrated, and of the grid."""
+"""Γ by the key of stored results: calibrated, and normalised, that of the grid."""
 
 
 @dataclass(frozen=True, kw_only=True)

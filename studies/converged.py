@@ -34,6 +34,7 @@ from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, ev
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.quantities import LITERAL, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair
@@ -80,7 +81,7 @@ def converged(
         rules = judged_rules(prior, adapted)
         prior_alone = without_feedback_beliefs(prior).adapt(feedback, method="paper")
         for name, gamma in {"adapted": adapted, "discrepancy": prior_alone}.items():
-            rules[name] = (assessment_scorer(name, gamma, "normalized"), PAPER_THRESHOLD)
+            rules[name] = (assessment_scorer(name, gamma, NORMALIZED), PAPER_THRESHOLD)
         fair = np.array([isinstance(loop, HasGoals) and is_fair(loop, one) for one in test])
         estimates = recalls(rules, other, test, fair)
         if throws:
@@ -100,7 +101,7 @@ def converged(
                 [
                     TriggerRule(
                         name=name,
-                        scorer=assessment_scorer(name, one, "safety_probability"),
+                        scorer=assessment_scorer(name, one, LITERAL),
                         threshold=PAPER_THRESHOLD,
                     )
                     for name, one in literal.items()
@@ -156,7 +157,7 @@ def judged_rules(
         prior: The assessment before feedback.
         adapted: The same after it.
     """
-    literal, normalized = "safety_probability", "normalized"
+    literal, normalized = LITERAL, NORMALIZED
     return {
         "literal": (assessment_scorer("literal", prior, literal), PAPER_THRESHOLD),
         "converged": (assessment_scorer("converged", adapted, literal), PAPER_THRESHOLD),

@@ -41,7 +41,7 @@ class KnownTruth:
     features: np.ndarray
 
     def safety_probability(self, assessment: SafetyAssessment) -> np.ndarray:
-        """b_safe / (1 - μ) of every start, (n, n).
+        """Normalised Γ of every start, (n, n).
 
         Args:
             assessment: Γ.

@@ -63,11 +63,16 @@ def known_truth_figure(
                 fontsize=10,
             )
         all_axes[0].set_ylabel(panels[0][0].axes[1])
-        fig.colorbar(image, ax=list(all_axes), label="Γ = b_safe / (1 - μ)", fraction=0.03)
+        fig.colorbar(image, ax=list(all_axes), label="normalised Γ", fraction=0.03)
         handles = [
             Line2D([], [], color=INK, lw=2.0, label="true safe set, simulated"),
             Line2D(
-                [], [], color=SAFE_COLOUR, lw=1.6, ls="--", label=f"Γ = {panels[0][2].threshold:g}"
+                [],
+                [],
+                color=SAFE_COLOUR,
+                lw=1.6,
+                ls="--",
+                label=f"normalised Γ = {panels[0][2].threshold:g}",
             ),
             Line2D([], [], color=INK, marker="x", ls="", label="confident and wrong"),
         ]

@@ -107,8 +107,11 @@ def plan_study(
     file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     console.print(table)
     console.print(planning_verdict(study.estimates), highlight=False, soft_wrap=True)
-    if rule.remark:
-        console.print(rule.remark, highlight=False, soft_wrap=True)
+    console.print(
+        f"threshold {rule.threshold:.3f} of calibrated Γ, {rule.remark}",
+        highlight=False,
+        soft_wrap=True,
+    )
     print_path("figures", file)
     for picture in save(planning_figure(study.estimates), folder / "planning"):
         print_path("picture", picture)

@@ -173,8 +173,8 @@ def first_verdicts(
 
     Returns:
         An entry for each episode: "episode", its index; "cause" of its end, "" if it stayed safe;
-        and by mode "verdict" and "safety_probability", Γ at k = 0. Diverged episodes have no
-        modes.
+        and by mode "verdict" and "safety_probability", calibrated Γ at k = 0. Diverged episodes
+        have no modes.
     """
     episodes = run_episodes(
         scenario,

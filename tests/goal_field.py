@@ -53,7 +53,7 @@ class FieldAssessment:
         known = 1.0 - self._unknown
         unsafe = known * (1.0 - gamma)
         return Assessments(
-            safety_probability=known * gamma,
+            literal=known * gamma,
             normalized=gamma,
             belief=np.column_stack([known * gamma, unsafe, np.full(n, self._unknown)]),
             embedding=np.zeros((n, 2)),

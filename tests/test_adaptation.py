@@ -192,7 +192,7 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
                 )
         for row in range(0, len(segments), 7):
             one = adapted.predict_one(*inputs(segments, row))
-            for name in ("calibrated", "normalized", "safety_probability"):
+            for name in ("calibrated", "normalized", "literal"):
                 assert getattr(one, name) == pytest.approx(getattr(results[0], name)[row], abs=1e-3)
         unmoved = assessment.predict(*given)
         assert np.abs(unmoved.normalized - results[0].normalized).max() > 0.01

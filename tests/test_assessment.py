@@ -50,7 +50,7 @@ def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
 
 def test_held_out_episodes_are_told_apart(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
-    area = area_under_curve(result.safety_probability, ~held_out.is_unsafe)
+    area = area_under_curve(result.literal, ~held_out.is_unsafe)
     assert area > (0.88 if assessment.parameters.is_sharpened else 0.75)
 
 
@@ -58,9 +58,9 @@ def test_masses_sum_to_one_and_causes_to_the_unsafe_mass(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
     np.testing.assert_allclose(result.belief.sum(axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(result.cause_probability.sum(axis=1), result.belief[:, 1])
-    np.testing.assert_array_equal(result.safety_probability, result.belief[:, 0])
+    np.testing.assert_array_equal(result.literal, result.belief[:, 0])
     assert np.all(result.belief >= 0.0)
-    assert np.all(result.safety_probability <= 0.7 + 1e-9)
+    assert np.all(result.literal <= 0.7 + 1e-9)
 
 
 def test_the_normalised_probability_is_the_safe_share_of_what_is_known(assessment, held_out):
@@ -75,7 +75,7 @@ def test_one_input_alone_is_assessed_as_among_many(assessment, held_out):
     for row in range(0, len(held_out), 97):
         one = assessment.predict_one(*inputs(held_out, row))
         for name in (
-            "safety_probability",
+            "literal",
             "normalized",
             "belief",
             "cause_probability",
@@ -94,8 +94,8 @@ def test_an_input_that_is_not_finite_gets_the_empty_belief(assessment, held_out,
     result = assessment.predict(state, preview, features)
     one = assessment.predict_one(state[1], preview[1], features[1])
     for belief, gamma, normalized in (
-        (result.belief[1], result.safety_probability[1], result.normalized[1]),
-        (one.belief, one.safety_probability, one.normalized),
+        (result.belief[1], result.literal[1], result.normalized[1]),
+        (one.belief, one.literal, one.normalized),
     ):
         np.testing.assert_array_equal(belief, EMPTY)
         assert gamma == 0.0

@@ -196,6 +196,10 @@ def test_a_calibration_says_what_it_promises_and_refuses_what_cannot_be():
         "at most 5 % of unsafe episodes called safe, on average, "
         "on the plant 'nominal' as long as it behaves as in its episodes"
     )
+    assert made().origin == (
+        f"calibrated on {made().num_unsafe + made().num_safe} episodes for a promised miss rate: "
+        f"{made().promise}"
+    )
     assert made(confidence=0.95).promise.startswith(
         "at most 5 % of unsafe episodes called safe, 95 % confidence, on the plant 'nominal'"
     )

@@ -249,7 +249,9 @@ def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
 @pytest.mark.parametrize(
     ("push", "message"),
     [
-        ("weight=3", r"unknown 'weight'; give 'ball', or any of \['time=NUMBER', 'mass=NUMBER'"),
+        ("mas=3", r"unknown 'mas' \(did you mean 'mass'\?\); give 'ball', or any of"),
+        ("bal", r"unknown 'bal' \(did you mean 'ball'\?\); give 'ball', or any of"),
+        ("colour=3", r"unknown 'colour'; give 'ball', or any of \['time=NUMBER', 'mass=NUMBER'"),
         ("mass=heavy", "'heavy' is not a number"),
         ("mass=-1", "mass_kg must be positive; got -1.0"),
     ],

@@ -33,7 +33,7 @@ class SlowIsSafe:
         gamma = (features[:, 0] <= self.fastest + 1e-9).astype(float)
         n = len(gamma)
         return Assessments(
-            safety_probability=0.7 * gamma,
+            literal=0.7 * gamma,
             normalized=gamma,
             belief=np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(n, 0.3)]),
             embedding=np.zeros((n, 2)),

@@ -174,7 +174,7 @@ def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(robot, mode):
     result = assessment.predict(*(rng.permuted(part, axis=0) for part in parts))
     assert (result.novelty > 1.0).all()
     np.testing.assert_array_equal(result.belief, np.tile(EMPTY, (30, 1)))
-    for published in (result.safety_probability, result.normalized, result.calibrated):
+    for published in (result.literal, result.normalized, result.calibrated):
         assert not published.any()
     assert not result.cause_probability.any()
 

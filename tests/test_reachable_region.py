@@ -106,5 +106,5 @@ def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(regi
     share = np.mean(region.outcomes == "flank")
     assert f"flank {100 * share:.0f} %" in labels
     assert not any(label.startswith("front") for label in labels)
-    assert f"Γ = {region.threshold:.2f}" in labels
+    assert f"calibrated Γ = {region.threshold:.2f}" in labels
     assert not any(label.startswith("inverse kinematics") for label in labels)

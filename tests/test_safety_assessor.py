@@ -57,7 +57,7 @@ class AssessmentDouble:
             belief = [safe, 0.9 - safe, 0.1]
         calibrated = safe + correction.hidden[0, 3] * correction.guard[0, 5]
         return Assessment(
-            safety_probability=safe,
+            literal=safe,
             normalized=safe / 0.9,
             belief=np.array(belief),
             cause_probability=np.array([0.2, 0.3]),

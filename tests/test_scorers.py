@@ -26,7 +26,7 @@ class StandIn:
     def predict(self, state, desired_preview, features):
         assert (features is not None) == self.uses_features
         return SimpleNamespace(
-            safety_probability=state[:, 0],
+            literal=state[:, 0],
             normalized=2.0 * state[:, 0],
             calibrated=3.0 * state[:, 0],
             # Nothing is known of every third input.
@@ -49,7 +49,7 @@ def test_gamma_scores_by_any_of_its_forms_on_what_its_mode_sees(episodes, uses_f
     segments = split(episodes, stride=1, discount=1.0)
     literal, normalised, calibrated = (
         assessment_scorer("gamma", StandIn(uses_features), published)
-        for published in ("safety_probability", "normalized", "calibrated")
+        for published in ("literal", "normalized", "calibrated")
     )
     # The paper's mode has no noise in its data.
     assert literal.uses_true_state is not uses_features

@@ -76,7 +76,7 @@ def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
     inside = ~is_outside[:, None]
     # A row shows the state before the updates of its instant: Γ of a row is published in the next.
     for name, expected in (
-        ("safety_probability", result.safety_probability[:, None] * inside),
+        ("safety_probability", result.literal[:, None] * inside),
         ("normalized_safety_probability", result.normalized[:, None] * inside),
         ("belief", belief),
     ):
@@ -127,4 +127,4 @@ def test_an_input_that_is_not_finite_is_answered_with_dont_know(assessment):
         state, np.zeros(3 * info.horizon), np.zeros(len(info.feature_names))
     )
     np.testing.assert_array_equal(result.belief, [0.0, 0.0, 1.0])
-    assert result.safety_probability == 0.0
+    assert result.literal == 0.0

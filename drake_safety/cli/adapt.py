@@ -35,6 +35,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.learning.quantities import CALIBRATED, GAMMA, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
@@ -303,7 +304,7 @@ def _print_cuts(log: Path, found: LogPieces) -> None:
 
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
-    """Estimates of Γ on every segment of fresh actual episodes, calibrated and by its grid."""
+    """Estimates of calibrated and, as "grid", normalised Γ on every segment of fresh episodes."""
     from drake_safety.evaluation.metrics import segment_estimates
     from drake_safety.learning.segments import split
 
@@ -345,10 +346,14 @@ def _adaptation_table(
 
 def _judged_table(judged: dict[str, Estimate], variation: str) -> Table:
     n = judged[f"{MODES[0]}.before.grid.auc"].n
-    table = new_table("", *_COLUMNS, title=f"{n} fresh episodes of '{variation}'")
+    table = new_table(
+        "", *_COLUMNS, title=f"{n} fresh episodes of '{variation}', recalls at {_THRESHOLD:g}"
+    )
     for mode in MODES:
+        # Without heads both are the same.
         for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
+            quantity = GAMMA[CALIBRATED if published == "calibrated" else NORMALIZED]
             for who, label in _JUDGED.items():
                 estimates = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
-                table.add_row(f"{mode}, {published}, {label}", *map(interval, estimates))
+                table.add_row(f"{mode}, {quantity}, {label}", *map(interval, estimates))
     return table

@@ -51,7 +51,7 @@ def ask(
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     loop = loaded.make_loop(assessment=gamma, **options)
     goal = parse_target(loop, target)
-    threshold, unsafe_below, remark = goal_threshold(folder.path, gamma)
+    threshold, unsafe_below, origin = goal_threshold(folder.path, gamma)
     verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=unsafe_below)
     nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
     if as_json:
@@ -59,11 +59,11 @@ def ask(
             "assessment": str(folder.path),
             "hand": loop.hand,
             "nearest_accepted": None if nearest is None else nearest.goal.tolist(),
-            "remark": remark,
+            "threshold_origin": origin,
         }
         console.print(json.dumps(answer), soft_wrap=True, highlight=False)
     else:
         print_shipped(folder)
-        print_verdict(loop, verdict, nearest, remark)
+        print_verdict(loop, verdict, nearest, origin)
     if not verdict.is_accepted:
         raise typer.Exit(1)

@@ -28,6 +28,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
+from drake_safety.learning.quantities import CALIBRATED, GAMMA
 from drake_safety.learning.seeds import CALIBRATION
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def calibrate(
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}
     for mode, gamma in learned.items():
-        score = assessment_scorer(mode, gamma, "calibrated").unsafe_score(segments)
+        score = assessment_scorer(mode, gamma, CALIBRATED).unsafe_score(segments)
         for kind in KINDS:
             of_episodes, is_unsafe = episode_scores(segments, score, kind)
             one = choose(
@@ -150,7 +151,7 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
     table = new_table(
         "mode",
         "score",
-        "safe from Γ",
+        f"safe from {GAMMA[CALIBRATED]}",
         "unsafe below",
         "misses",
         "safe recall",

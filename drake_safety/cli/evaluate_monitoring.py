@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import fresh_episodes_folder
+from drake_safety.learning.quantities import CALIBRATED
 
 if TYPE_CHECKING:
     from drake_safety.simulation.watched_motion import WatchedMotion
@@ -59,7 +60,7 @@ def evaluate_pushes(
             progress=partial(judged.stages, what),
         )
 
-    verdict = assessment_scorer("sharpened", judged.sharpened, "calibrated")
+    verdict = assessment_scorer("sharpened", judged.sharpened, CALIBRATED)
     test = run("pushes", num_motions, seed)
     calibration = run("calibration pushes", num_calibration, calibration_seed)
     accepted = begun(test, verdict, threshold)

@@ -26,6 +26,7 @@ from drake_safety.cli.run_settings import (
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.learning.quantities import LITERAL, NORMALIZED, PORTS, gamma_of_port
 from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
 
 _DURATION_S = 5.0  # Of a run with balls.
 _PORTS = (
-    "normalized_safety_probability",
-    "safety_probability",
+    PORTS[NORMALIZED],
+    PORTS[LITERAL],
     "belief",
     "cause_probability",
     "predicted_margins",
@@ -173,7 +174,12 @@ def _run_with_balls(settings: RunSettings) -> None:
         "timeline": _timeline(loop, log, throws),
         "path": _path(loop, settings.assessment, log, throws),
     }
-    recording.save(figures, _table_of_events(loop, settings.assessment, log, throws))
+    recording.save(
+        figures,
+        _table_of_events(loop, settings.assessment, log, throws),
+        f"recovery below {loop.scenario.parameters.recovery.threshold:g} of "
+        f"{gamma_of_port(loop.trigger_port)}, that of scenario '{loop.scenario.name}'",
+    )
     recording.save_animation(
         loop,
         log.time_s,
@@ -195,6 +201,7 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
         ValueError: A key is unknown, a value is not a number, or a ball is invalid.
     """
     from drake_safety.plants.balls import Throw
+    from drake_safety.robots.reading import did_you_mean
 
     throws: list[Throw] = []
     for text in pushes:
@@ -206,7 +213,8 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
             key, _, value = pair.partition("=")
             if key not in _THROW_FIELDS:
                 raise ValueError(
-                    f"--push '{text}': unknown '{key}'; give 'ball', or any of "
+                    f"--push '{text}': unknown '{key}'"
+                    f"{did_you_mean(key, ['ball', *_THROW_FIELDS])}; give 'ball', or any of "
                     f"{[f'{key}=NUMBER' for key in _THROW_FIELDS]}"
                 )
             try:
@@ -234,6 +242,7 @@ def _path(
         log.extra[loop.trigger_port][:, 0],
         loop.scenario.parameters.recovery.threshold,
         {"start": 0.0, **events},
+        quantity=gamma_of_port(loop.trigger_port),
     )
 
 
@@ -250,6 +259,7 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
         log.time_s,
         log.extra[loop.trigger_port][:, 0],
         loop.scenario.parameters.recovery.threshold,
+        quantity=gamma_of_port(loop.trigger_port),
         throws=throws,
         trigger_times_s=triggers,
         recovery_intervals_s=log.recovery_intervals_s,
@@ -284,4 +294,5 @@ def _table_of_events(
         events.append((log.fall_time_s, "the robot fell"))
     else:
         events.append((float(log.time_s[-1]), "standing"))
-    return events_table(events, log.time_s, log.extra[loop.trigger_port][:, 0])
+    port = loop.trigger_port
+    return events_table(events, log.time_s, log.extra[port][:, 0], gamma_of_port(port))

@@ -101,12 +101,13 @@ class Recording:
             input("Press Enter when the browser shows the robot. ")
         self.viewer.StartRecording()
 
-    def save(self, figures: Mapping[str, Figure], events: Table) -> None:
+    def save(self, figures: Mapping[str, Figure], events: Table, threshold: str) -> None:
         """Writes recording and figures, and prints the events and the paths.
 
         Args:
             figures: Figures by the name of their files.
             events: Table of the events.
+            threshold: The threshold of triggers or alarms in words: value, quantity, origin.
         """
         from drake_safety.evaluation.figure_style import save
 
@@ -119,6 +120,7 @@ class Recording:
         pictures = [path for name in figures for path in save(figures[name], folder / name)]
         (folder / "run.json").write_text(_events_json(events), encoding="utf-8")
         console.print(events)
+        console.print("threshold", threshold, highlight=False, soft_wrap=True)
         print_path("recording", recording)
         for path in pictures:
             print_path("picture  ", path)
@@ -138,7 +140,7 @@ class Recording:
             loop: The simulated closed loop.
             time_s: Instants of its log [s], (N,).
             states: Positions and velocities by name of the model instance, (N, n).
-            gamma: Safety probability, (N,).
+            gamma: Γ as triggers or alarms take it, (N,).
             threshold: Threshold on Γ of triggers or alarms.
             event_times_s: Times of these [s].
         """
@@ -160,16 +162,17 @@ class Recording:
 
 
 def events_table(
-    events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray
+    events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray, quantity: str
 ) -> Table:
     """A table of events with Γ at their times.
 
     Args:
         events: Times [s] and descriptions.
         time_s: Instants of the log [s], (N,).
-        gamma: Safety probability, (N,).
+        gamma: Γ, (N,).
+        quantity: Which Γ, as in `quantities.GAMMA`.
     """
-    table = new_table("time [s]", "event", "Γ")
+    table = new_table("time [s]", "event", quantity)
     for instant, event in sorted(events, key=lambda one: one[0]):
         row = abs(time_s - instant).argmin()
         table.add_row(f"{instant:.2f}", event, f"{gamma[row]:.2f}")

@@ -15,6 +15,8 @@ from drake_safety.cli.run_settings import (
     events_table,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
+from drake_safety.learning.quantities import CALIBRATED, GAMMA, PORTS
+from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.goal_motion import GoalMotion
 
 _MOTION_PORTS = (
-    "calibrated_safety_probability",
+    PORTS[CALIBRATED],
     "belief",
     "cause_probability",
     "predicted_margins",
@@ -97,16 +99,18 @@ def run_to_target(
     calibration = settings.assessment.calibrations_.get("motion")
     # A motion has many rows: its promise has its own threshold.
     threshold = threshold if calibration is None else calibration.threshold
+    origin = "that of the verdict" if calibration is None else calibration.origin
     recording.save(
         {"timeline": draw_motion(loop, motion, threshold)},
         table_of_motion(loop, settings.assessment, motion, threshold),
+        f"alarm below {threshold:.3f} of {GAMMA[CALIBRATED]} in any row, {origin}",
     )
     alarm = alarm_row(motion, threshold)
     recording.save_animation(
         loop,
         motion.time_s,
         {loop.robot.name: motion.plant_state},
-        motion.extra["calibrated_safety_probability"][:, 0],
+        motion.extra[PORTS[CALIBRATED]][:, 0],
         threshold,
         [] if alarm is None else [float(motion.time_s[alarm])],
     )
@@ -134,24 +138,24 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
     if name not in pushes:
         raise ValueError(
             f"--push '{name}': scenario '{loop.scenario.name}' has no such push for a motion to a "
-            f"target; it has {list(pushes)}"
+            f"target{did_you_mean(name, pushes)}; it has {list(pushes)}"
         )
     return pushes[name]
 
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
-    """First row with Γ below the threshold, if Γ was above at the start; None for never."""
-    is_below = ~(motion.extra["calibrated_safety_probability"][:, 0] >= threshold)
+    """First row with calibrated Γ below the threshold, if it was above at the start, or None."""
+    is_below = ~(motion.extra[PORTS[CALIBRATED]][:, 0] >= threshold)
     return int(np.argmax(is_below)) if is_below.any() and not is_below[0] else None
 
 
 def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figure:
-    """Plots Γ along a motion, with stills.
+    """Plots calibrated Γ along a motion, with stills.
 
     Args:
         loop: The simulated closed loop.
         motion: Log of the motion, with Γ and its predictions.
-        threshold: Lowest Γ of an accepted goal.
+        threshold: Calibrated Γ below which a row is an alarm.
     """
     from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
     from drake_safety.evaluation.timeline_figure import timeline_figure
@@ -168,8 +172,9 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     alarm = alarm_row(motion, threshold)
     return timeline_figure(
         motion.time_s,
-        motion.extra["calibrated_safety_probability"][:, 0],
+        motion.extra[PORTS[CALIBRATED]][:, 0],
         threshold,
+        quantity=GAMMA[CALIBRATED],
         pushes=[] if motion.push is None else [motion.push],
         trigger_times_s=[] if alarm is None else [float(motion.time_s[alarm])],
         trigger_label="Γ falls",
@@ -185,18 +190,18 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
 def table_of_motion(
     loop: ClosedLoop, assessment: SafetyAssessment, motion: GoalMotion, threshold: float
 ) -> Table:
-    """A table of the events of a motion, with Γ at their times.
+    """A table of the events of a motion, with calibrated Γ at their times.
 
     Args:
         loop: The simulated closed loop.
         assessment: Γ.
         motion: Log of the motion, with Γ and its predictions.
-        threshold: Lowest Γ of an accepted goal.
+        threshold: Calibrated Γ below which a row is an alarm.
     """
     from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 
     words = goal_words(require(loop, HasGoals))
-    gamma = motion.extra["calibrated_safety_probability"][:, 0]
+    gamma = motion.extra[PORTS[CALIBRATED]][:, 0]
     events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         if port in motion.extra and (motion.extra[port] > 0).any():
@@ -216,7 +221,10 @@ def table_of_motion(
             motion.extra["predicted_margins"][alarm],
         )
         events.append(
-            (float(motion.time_s[alarm]), f"Γ below the threshold; expected violation: {expected}")
+            (
+                float(motion.time_s[alarm]),
+                f"Γ below {threshold:.3f}; expected violation: {expected}",
+            )
         )
     is_changed = motion.extra["alarm"][:, 0] > 0.5
     if is_changed.any():
@@ -236,4 +244,4 @@ def table_of_motion(
             reached = np.round(motion.output[len(motion.output) // 2 :].mean(axis=0), 2)
             missed = f"on its feet{place}; mean of the second half {words.value(reached)}"
         events.append((float(motion.time_s[-1]), missed))
-    return events_table(events, motion.time_s, gamma)
+    return events_table(events, motion.time_s, gamma, GAMMA[CALIBRATED])

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from drake_safety.cli.console import console
+from drake_safety.learning.quantities import CALIBRATED, GAMMA, LITERAL, NORMALIZED
 from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def nearest_accepted(
 
 
 def print_verdict(
-    loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, remark: str
+    loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, origin: str
 ) -> None:
     """Prints a verdict; for a refusal also the likely cause and the nearest accepted target.
 
@@ -124,7 +125,7 @@ def print_verdict(
         loop: The closed loop.
         verdict: The verdict.
         nearest: The nearest accepted target, for a refusal.
-        remark: Remark on the threshold, or "".
+        origin: Where the threshold comes from.
     """
     from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 
@@ -136,16 +137,21 @@ def print_verdict(
     else:
         sign = "<" if verdict.safety_probability < verdict.threshold else "≥"
         lines["verdict"] = (
-            f"{verdict.verdict}: Γ {verdict.safety_probability:.3f} {sign} "
+            f"{verdict.verdict}: {GAMMA[CALIBRATED]} {verdict.safety_probability:.3f} {sign} "
             f"threshold {verdict.threshold:.3f}"
         )
     if np.isfinite(verdict.safety_probability):
         safe, unsafe, unknown = verdict.belief.tolist()
-        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
+        known = safe + unsafe
+        lines["belief"] = (
+            f"safe {safe:.2f} ({GAMMA[LITERAL]}; {GAMMA[NORMALIZED]} "
+            f"{safe / known if known > 0 else 0.0:.2f}), unsafe {unsafe:.2f}, "
+            f"don't know {unknown:.2f}"
+        )
     if not verdict.is_accepted:
         lines |= _refusal(loop, words, verdict, nearest)
-    if remark:
-        lines["remark"] = remark
+    if nearest is not None or np.isfinite(verdict.safety_probability):
+        lines["threshold"] = f"{verdict.threshold:.3f} of {GAMMA[CALIBRATED]}, {origin}"
     for name, text in lines.items():
         console.print(f"{name:<16}  {text}", highlight=False, soft_wrap=True)
 
@@ -171,6 +177,6 @@ def _refusal(
     else:
         lines["nearest accepted"] = (
             f"{words.value(nearest.goal)}, {words.distance(nearest.goal - verdict.goal)} away, "
-            f"Γ {nearest.safety_probability:.3f}"
+            f"{GAMMA[CALIBRATED]} {nearest.safety_probability:.3f}"
         )
     return lines

@@ -36,19 +36,20 @@ class GoalThreshold(NamedTuple):
 
     Attributes:
         threshold: Lowest calibrated Γ of an accepted goal.
-        unsafe_below: Γ below which a goal is unsafe; in between the verdict is "don't know".
-        remark: Remark on their origin, or "".
+        unsafe_below: Calibrated Γ below which a goal is unsafe; in between the verdict is "don't
+            know".
+        remark: Where they come from.
     """
 
     threshold: float
     unsafe_below: float
-    remark: str = ""
+    remark: str
 
 
 MODES = ("sharpened", "paper")
 """Modes, the default first."""
 DEFAULT_THRESHOLD = 0.5
-"""Lowest Γ of an accepted goal without calibrated threshold."""
+"""Lowest calibrated Γ of an accepted goal where no promise has chosen one."""
 
 
 def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
@@ -256,14 +257,14 @@ def goal_threshold(folder: Path, assessment: SafetyAssessment) -> GoalThreshold:
         assessment: The assessment.
 
     Returns:
-        The assessment's thresholds, which `calibrate` chooses; else the default with a remark.
+        The assessment's thresholds, which `calibrate` chooses; else the default.
     """
     calibration = assessment.calibrations_.get("plan")
     if calibration is not None:
-        return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.promise)
+        return GoalThreshold(calibration.threshold, calibration.unsafe_below, calibration.origin)
     return GoalThreshold(
         DEFAULT_THRESHOLD,
         DEFAULT_THRESHOLD,
-        f"the threshold {DEFAULT_THRESHOLD:g} is not calibrated: `drake-safety calibrate` chooses "
-        f"one with a promised miss rate and keeps it in {folder}",
+        "the default, which promises nothing: `drake-safety calibrate` chooses one with a promised "
+        f"miss rate and keeps it in {folder}",
     )

@@ -13,9 +13,10 @@ import numpy as np
 
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.quantities import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.simulation.watched_motion import WatchedMotion
 
-PUBLISHED = {"": "normalized", "_literal": "safety_probability", "_calibrated": "calibrated"}
+PUBLISHED = {"": NORMALIZED, "_literal": LITERAL, "_calibrated": CALIBRATED}
 """Fields of an assessment's result, by the suffix of the alarm's name."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _TRACKING = "tracking_error_"
@@ -35,7 +36,7 @@ class Alarm:
 
 
 def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
-    """Alarms on Γ: normalised b_safe / (1 - μ), literal b_safe, and calibrated.
+    """Alarms on normalised, literal and calibrated Γ.
 
     Args:
         name: Key of the first, and prefix of the others.
@@ -45,7 +46,7 @@ def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
     return [
         scorer_alarm(assessment_scorer(f"{name}{suffix}", assessment, published))
         for suffix, published in PUBLISHED.items()
-        if has_heads or published != "calibrated"
+        if has_heads or published != CALIBRATED
     ]
 
 

@@ -46,7 +46,7 @@ def save_animation(
         loop: The closed loop that was simulated, or one with the same plant.
         time_s: Instants of the log [s], (N,), increasing.
         positions: All of the plant's positions at these instants, (N, n_q).
-        gamma: Safety probability, (N,).
+        gamma: Γ as triggers or alarms take it, (N,).
         threshold: Threshold on Γ of triggers or alarms.
         path: Path of the GIF.
         event_times_s: Times of triggers or alarms, marked on the curve [s].

@@ -20,6 +20,7 @@ from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.progress import shown
+from drake_safety.learning.quantities import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.capabilities import HasBall, judging_options
@@ -126,9 +127,9 @@ def compare_scenario(
             lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
         )
         assessment.save(folder / "sharpened.safetensors")
-        published = "calibrated"
+        published = CALIBRATED
         if recovery is not None:
-            published = "normalized" if recovery.is_normalized else "safety_probability"
+            published = NORMALIZED if recovery.is_normalized else LITERAL
         scorer = assessment_scorer("sharpened", assessment, published)
         estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
         if recovery is not None:

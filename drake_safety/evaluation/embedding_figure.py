@@ -72,7 +72,14 @@ def embedding_figure(
         safe, is_empty = cells[:, SAFE], cells[:, UNCERTAINTY] >= 1.0
         most = max(1.0 - assessment.parameters.initial_uncertainty, safe.max())
         draw_safety(
-            fig, middle, grid, safe, is_empty, count, label="belief mass of safe", most=most
+            fig,
+            middle,
+            grid,
+            safe,
+            is_empty,
+            count,
+            label="literal Γ",
+            most=most,
         )
         middle.set_title("Belief of each cell: safe")
         if right == "causes":

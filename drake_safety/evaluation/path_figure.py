@@ -10,6 +10,7 @@ import numpy as np
 from drake_safety.evaluation.embedding_figure import draw_safety
 from drake_safety.evaluation.figure_style import INK, drawing_style, new_figure
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+from drake_safety.learning.quantities import GAMMA, NORMALIZED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,6 +25,8 @@ def path_figure(
     gamma: np.ndarray,
     threshold: float,
     events: Mapping[str, float],
+    *,
+    quantity: str = "Γ",
 ) -> Figure:
     """Plots Ψ(x) of a motion over the beliefs of the cells, and its Γ over time.
 
@@ -34,8 +37,9 @@ def path_figure(
         time_s: Times [s], (N,).
         points: Ψ(x), (N, 2).
         gamma: Γ, (N,).
-        threshold: Γ_thre.
+        threshold: Threshold on Γ of triggers.
         events: Times of named events [s]; they are marked and numbered in both panels.
+        quantity: Which Γ, as in `quantities.GAMMA`.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     is_empty = cells[:, UNCERTAINTY] >= 1.0
@@ -44,7 +48,7 @@ def path_figure(
         fig = new_figure(12.0, 5.0)
         left, right = fig.subplots(1, 2, width_ratios=(1.0, 1.25))
         no_count = np.zeros(grid.num_cells, dtype=int)
-        label = "safe share of a cell"
+        label = f"{GAMMA[NORMALIZED]} of a cell"
         draw_safety(fig, left, grid, cells[:, SAFE] / known, is_empty, no_count, label=label)
         left.plot(points[:, 0], points[:, 1], color="white", linewidth=2.6, alpha=0.8)
         left.plot(points[:, 0], points[:, 1], color=INK, linewidth=1.0)
@@ -53,8 +57,8 @@ def path_figure(
         left.set(title="Path through the embedding space", xlabel="hatched: EMPTY")
         right.plot(time_s, gamma, color=INK, linewidth=1.4)
         right.axhline(threshold, color=INK, linewidth=0.8, linestyle="--")
-        right.text(time_s[0], threshold + 0.01, "Γ_thre", va="bottom")
-        right.set(title="Γ over time", xlabel="time [s]", ylim=(-0.04, 1.2))
+        right.text(time_s[0], threshold + 0.01, f"threshold {threshold:g}", va="bottom")
+        right.set(title=f"{quantity} over time", xlabel="time [s]", ylim=(-0.04, 1.2))
         ordered = sorted(events.items(), key=lambda event: event[1])
         for number, (_, at_s) in enumerate(ordered, start=1):
             row = int(np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1))

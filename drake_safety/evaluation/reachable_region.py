@@ -14,6 +14,7 @@ from drake_safety.evaluation.reachability import BASELINES, Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.progress import shown
+from drake_safety.learning.quantities import CALIBRATED
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -34,8 +35,8 @@ class ReachableRegion:
     Attributes:
         x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
-        safety_probability: Normalised Γ there, (n_z, n_y).
-        threshold: Γ_thre.
+        safety_probability: Calibrated Γ there, (n_z, n_y).
+        threshold: Lowest calibrated Γ of an accepted target.
         is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
             (n_z, n_y); empty for a task without a hand.
         obstacle_y_m, obstacle_z_m: The grid of obstacle distances, (o_y,), (o_z,) [m].
@@ -90,7 +91,7 @@ def reachable_region(
     Args:
         scenario: A scenario of a task whose plans have a goal.
         assessment: Γ.
-        threshold: Γ_thre, on the calibrated safety probability.
+        threshold: Lowest calibrated Γ of an accepted target.
         x_m: Position of the plane [m]; the middle of the fair box by default.
         step_m: Spacing of the simulated targets [m].
         variation: Variation of the plant.
@@ -126,7 +127,7 @@ def reachable_region(
         if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
             for name, is_base_free in BASELINES.items():
                 reachability[name] = Reachability(loop.robot, loop.hand, is_base_free=is_base_free)
-        scorer = assessment_scorer("sharpened", assessment, "calibrated")
+        scorer = assessment_scorer("sharpened", assessment, CALIBRATED)
         probability = []
         reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
         for start in range(0, len(targets), _REPORT_EVERY):

@@ -68,7 +68,9 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 linewidths=width,
             )
         handles.append(
-            Line2D([], [], color=UNSAFE_COLOUR, lw=2.4, label=f"Γ = {region.threshold:.2f}")
+            Line2D(
+                [], [], color=UNSAFE_COLOUR, lw=2.4, label=f"calibrated Γ = {region.threshold:.2f}"
+            )
         )
         for name, is_reachable in region.is_reachable.items():
             dashes, label = _KINEMATICS[name]

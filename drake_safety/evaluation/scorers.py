@@ -51,9 +51,8 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
     Args:
         name: Its key in tables.
         assessment: A fitted assessment.
-        published: The form of Γ: "safety_probability", literally b_safe; "normalized",
-            b_safe / (1 - μ); or "calibrated", from the maps' heads and 0 where the belief is
-            "don't know".
+        published: "literal", "normalized" or "calibrated", see
+            :mod:`drake_safety.learning.quantities`.
     """
 
     def probability(

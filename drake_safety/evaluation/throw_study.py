@@ -13,11 +13,12 @@ from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.progress import shown
+from drake_safety.learning.quantities import LITERAL, NORMALIZED
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 
 PAPER_THRESHOLD = 0.6
-"""Γ_thre of the paper, on b_safe."""
+"""Γ_thre of the paper, on literal Γ."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,16 +51,14 @@ def trigger_rules(
         paper: An assessment in the paper's mode.
         classifiers: Baseline classifiers, whose thresholds are chosen on calibration throws.
         threshold: The scenario's Γ_thre.
-        is_normalized: Whether it applies to b_safe / (1 - μ) rather than to literal b_safe.
+        is_normalized: Whether it applies to normalised rather than to literal Γ.
 
     Returns:
         The rules; the scenario's own is the first, named "sharpened".
     """
-    own = assessment_scorer(
-        "sharpened", sharpened, "normalized" if is_normalized else "safety_probability"
-    )
-    literal = assessment_scorer("literal", sharpened, "safety_probability")
-    paper_literal = assessment_scorer("paper_literal", paper, "safety_probability")
+    own = assessment_scorer("sharpened", sharpened, NORMALIZED if is_normalized else LITERAL)
+    literal = assessment_scorer("literal", sharpened, LITERAL)
+    paper_literal = assessment_scorer("paper_literal", paper, LITERAL)
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
         TriggerRule(

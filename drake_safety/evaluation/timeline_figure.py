@@ -45,6 +45,7 @@ def timeline_figure(
     gamma: np.ndarray,
     threshold: float,
     *,
+    quantity: str = "Γ",
     throws: Sequence[Throw] = (),
     pushes: Sequence[Push] = (),
     trigger_times_s: Sequence[float] = (),
@@ -61,8 +62,9 @@ def timeline_figure(
 
     Args:
         time_s: Instants [s], (N,).
-        gamma: Safety probability, held until the next instant, (N,).
+        gamma: Γ, held until the next instant, (N,).
         threshold: Threshold on Γ of triggers or alarms.
+        quantity: Which Γ, as in `quantities.GAMMA`.
         throws: Balls, marked at the time of impact.
         pushes: Pushes, marked for their duration.
         trigger_times_s: Times of triggers or alarms [s].
@@ -104,6 +106,7 @@ def timeline_figure(
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
         gamma_axes, *others = panels
         _draw_gamma(gamma_axes, time_s, gamma, threshold)
+        gamma_axes.set_ylabel(quantity)
         remaining = iter(others)
         if belief is not None:
             _draw_belief(next(remaining), time_s, belief)
@@ -179,7 +182,6 @@ def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: fl
     axes.step(time_s, gamma, where="post", color=SAFE_COLOUR, linewidth=2.0)
     axes.set_ylim(-0.02, 1.05)
     axes.set_yticks([0.0, 0.5, 1.0])
-    axes.set_ylabel("safety probability Γ")
 
 
 def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""A threshold of Γ that follows the outcomes of an actual robot: online conformal prediction."""
+"""A threshold of calibrated Γ that follows an actual robot: online conformal prediction."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class AdaptiveThreshold:
         step: Step of the threshold's logit; larger ones follow faster, and vary more.
 
     Attributes:
-        threshold: Present lower bound of Γ for the verdict "safe"; above 1 if none is safe.
+        threshold: Present lower bound of calibrated Γ for the verdict "safe"; above 1 if none is.
 
     Raises:
         ValueError: The step is not positive.
@@ -38,20 +38,20 @@ class AdaptiveThreshold:
 
     @property
     def threshold(self) -> float:
-        """Present lower bound of Γ for the verdict "safe"; above 1 if none is safe."""
+        """Present lower bound of calibrated Γ for the verdict "safe"; above 1 if none is safe."""
         if self._logit > _LOGIT_LIMIT:
             return math.nextafter(1.0, 2.0)
         return 1.0 / (1.0 + math.exp(-self._logit))
 
     def is_safe(self, safety_probability: float) -> bool:
-        """Whether the verdict on Γ is "safe"; never for NaN."""
+        """Whether the verdict on calibrated Γ is "safe"; never for NaN."""
         return _logit(safety_probability) >= self._logit
 
     def update(self, safety_probability: float, is_unsafe: bool) -> None:
         """Takes in the outcome of an episode; a safe one changes nothing.
 
         Args:
-            safety_probability: Γ of the episode; of its first row, or the least of a motion.
+            safety_probability: Calibrated Γ of the first row, or the least of a motion.
             is_unsafe: Whether it ended unsafely.
         """
         if is_unsafe:

@@ -1,4 +1,4 @@
-"""The safety assessment function Γ: the probability that the closed loop stays safe."""
+"""The safety assessment function Γ: how likely the closed loop stays safe."""
 
 from __future__ import annotations
 
@@ -380,7 +380,7 @@ class SafetyAssessment:
 
         Returns:
             The assessments. Novel inputs and those that are not finite get the empty belief, where
-            Γ is 0.
+            Γ is 0 in all its forms.
 
         Raises:
             ValueError: A width or a shape is wrong, or the assessment is not fitted.
@@ -455,8 +455,8 @@ class SafetyAssessment:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mean logit of an unsafe end and its gradient with respect to x.
 
-        Γ is constant where all corners of a cell agree; the safety heads' logit has a slope
-        everywhere, for planners that need a gradient. The arguments are those of `predict`.
+        Normalised Γ is constant where all corners of a cell agree; the safety heads' logit has a
+        slope everywhere, for planners that need a gradient. The arguments are those of `predict`.
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).

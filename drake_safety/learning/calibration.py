@@ -44,7 +44,7 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Two thresholds of Γ, the calibrated safety probability, and their promised rates.
+    """Two thresholds of calibrated Γ, and their promised rates.
 
     The verdict is "safe" for Γ ≥ `threshold`, "unsafe" for Γ < `unsafe_below`, and "don't know" in
     between.
@@ -55,8 +55,8 @@ class Calibration:
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
         confidence: Confidence of both rates for this calibration set; None for rates on average
             over calibration sets.
-        threshold: Lower bound of Γ for "safe".
-        unsafe_below: Upper bound of Γ for "unsafe"; at most `threshold`.
+        threshold: Lower bound of calibrated Γ for "safe".
+        unsafe_below: Upper bound of calibrated Γ for "unsafe"; at most `threshold`.
         num_unsafe: Number of unsafe calibration episodes.
         num_safe: Number of safe calibration episodes.
         num_missed: Number of unsafe calibration episodes with the verdict "safe".
@@ -106,8 +106,14 @@ class Calibration:
             f"on the plant '{self.variation}' as long as it behaves as in its episodes"
         )
 
+    @property
+    def origin(self) -> str:
+        """Where the thresholds come from, in words."""
+        num_episodes = self.num_unsafe + self.num_safe
+        return f"calibrated on {num_episodes} episodes for a promised miss rate: {self.promise}"
+
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
-        """Returns the verdicts for Γ (N,) as strings; "don't know" for NaN."""
+        """Returns the verdicts for calibrated Γ (N,) as strings; "don't know" for NaN."""
         probability = np.asarray(safety_probability, dtype=float)
         verdicts = np.full(probability.shape, UNKNOWN, dtype=object)
         verdicts[probability >= self.threshold] = SAFE
@@ -134,7 +140,7 @@ def calibrate(
     """Chooses both thresholds on episodes that were not used for training.
 
     Args:
-        unsafe_score: 1 - Γ of each episode, (N,); NaN counts as most unsafe.
+        unsafe_score: 1 - calibrated Γ of each episode, (N,); NaN counts as most unsafe.
         is_unsafe: Whether each episode ended unsafely, (N,).
         kind: "plan" or "motion", the score of an episode.
         miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).

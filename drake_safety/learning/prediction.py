@@ -22,22 +22,23 @@ class Assessments:
     """Assessments of N inputs.
 
     Attributes:
-        safety_probability: Γ = b_safe, (N,). At most 1 - mu: not a calibrated probability.
-        normalized: b_safe / (1 - mu), the safe share of the known mass, (N,); 0 where mu is 1.
+        literal: Literal Γ, b_safe of the grid, (N,). At most 1 - mu.
+        normalized: Normalised Γ, b_safe / (1 - mu), the safe share of the known mass, (N,); 0 where
+            mu is 1.
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs.
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
         unsafe_logit: Mean logit of the maps' safety heads, (N,); NaN without a head.
-        calibrated: Calibrated probability of safety from the base logit with the correction by
-            feedback, (N,); 0 where the belief is "don't know", see `is_unknown`. Without heads
-            otherwise equal to `normalized`.
+        calibrated: Calibrated Γ, a probability of safety from the base logit with the correction by
+            feedback, (N,); 0 where the belief is "don't know", see `is_unknown`. Without heads, as
+            in the paper's mode, otherwise equal to `normalized`.
         novelty: Distance of x from the training inputs in units of the largest known one, (N,);
             novel above 1, infinite for inputs that are not finite.
     """
 
-    safety_probability: np.ndarray
+    literal: np.ndarray
     normalized: np.ndarray
     belief: np.ndarray
     embedding: np.ndarray
@@ -50,7 +51,7 @@ class Assessments:
     def one(self, row: int) -> Assessment:
         """Returns the assessment in one row."""
         return Assessment(
-            safety_probability=float(self.safety_probability[row]),
+            literal=float(self.literal[row]),
             normalized=float(self.normalized[row]),
             belief=self.belief[row],
             cause_probability=self.cause_probability[row],
@@ -65,7 +66,7 @@ class Assessments:
 class Assessment:
     """Assessment of one input; the fields of `Assessments` without the axis N."""
 
-    safety_probability: float
+    literal: float
     normalized: float
     belief: np.ndarray
     cause_probability: np.ndarray
@@ -78,7 +79,7 @@ class Assessment:
         """The assessment with the empty belief."""
         return replace(
             self,
-            safety_probability=0.0,
+            literal=0.0,
             normalized=0.0,
             calibrated=0.0,
             belief=np.array([0.0, 0.0, 1.0]),
@@ -96,7 +97,7 @@ class Assessment:
         cause_probability[cause] += safe
         return replace(
             self,
-            safety_probability=0.0,
+            literal=0.0,
             normalized=0.0,
             calibrated=0.0,
             belief=np.array([0.0, unsafe + safe, uncertainty]),
@@ -291,8 +292,8 @@ def predict(
     if output.margins.shape[2]:
         margins = output.margins.mean(axis=0)
     return Assessments(
-        # Γ(x) = b_safe of the cell of Psi(x)
-        safety_probability=safe.copy(),
+        # The paper's Γ(x) = b_safe of the cell of Psi(x).
+        literal=safe.copy(),
         normalized=normalized,
         belief=masses[:, :3].copy(),
         embedding=output.embedding[0],

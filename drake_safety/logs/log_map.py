@@ -16,6 +16,11 @@ ORDERS = ("wxyz", "xyzw")
 """Orders of a quaternion's columns."""
 FRAMES = ("world", "body")
 """Frames of a velocity of the base."""
+_NO_POSITION = (
+    ": a log of joints and an inertial measurement unit has none; a state estimator for legged "
+    "robots adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base "
+    "position')"
+)
 
 
 @dataclass(kw_only=True)
@@ -139,7 +144,8 @@ class LogMap:
         """
         for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
-                raise ValueError(f"'{name}.columns' is missing")
+                hint = _NO_POSITION if name == "base_position" else ""
+                raise ValueError(f"'{name}.columns' is missing{hint}")
         for name in ("base_position", "desired_output"):
             if len(getattr(self, name).columns) not in (0, 3):
                 raise ValueError(

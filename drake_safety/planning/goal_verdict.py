@@ -13,6 +13,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.quantities import CALIBRATED
 from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -24,10 +25,10 @@ class GoalVerdict:
     Attributes:
         goal: The goal in the world, (3,) [m].
         verdict: "safe", "unsafe" or "don't know".
-        belief: (safe, unsafe, don't know), (3,).
-        safety_probability: Γ, calibrated; NaN where Γ was not evaluated, because the goal is
+        belief: (safe, unsafe, don't know), (3,); its first entry is literal Γ.
+        safety_probability: Calibrated Γ; NaN where it was not evaluated, because the goal is
             outside the region sampled in training.
-        threshold: Lowest Γ of a safe goal.
+        threshold: Lowest calibrated Γ of a safe goal.
         constraint_names: The n_c constraints, the possible causes.
         cause_probability: b_unsafe split by the violated constraint, (n_c,).
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
@@ -77,6 +78,7 @@ class GoalVerdict:
             "verdict": self.verdict,
             "reason": self.reason,
             "belief": dict(zip(("safe", "unsafe", "unknown"), self.belief.tolist(), strict=True)),
+            "quantity": CALIBRATED,
             "safety_probability": _finite(self.safety_probability),
             "threshold": self.threshold,
             "cause": self.cause or None,
@@ -103,9 +105,9 @@ def assess_goal(
         assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
             region sampled in training, is "don't know".
-        threshold: Lowest Γ, calibrated, of a safe goal.
-        unsafe_below: A Γ below this is unsafe, one between this and the threshold "don't know";
-            the threshold by default.
+        threshold: Lowest calibrated Γ of a safe goal.
+        unsafe_below: Calibrated Γ below this is unsafe, between this and the threshold "don't
+            know"; the threshold by default.
 
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
@@ -168,8 +170,8 @@ def assess_goals(
         if unsafe_below <= probability < threshold:
             verdict = UNKNOWN
             reason = (
-                f"Γ {probability:.3f} lies between {unsafe_below:.3f} and {threshold:.3f}, where "
-                f"safe and unsafe {noun}s cannot be distinguished"
+                f"calibrated Γ {probability:.3f} lies between {unsafe_below:.3f} and "
+                f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
             )
         if prediction.novelty[i] > 1.0:
             verdict = UNKNOWN

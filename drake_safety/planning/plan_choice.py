@@ -22,8 +22,8 @@ class PlanChoice:
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        safety_probability: Γ, calibrated, of each candidate, (M,).
-        threshold: Lowest Γ of an accepted plan.
+        safety_probability: Calibrated Γ of each candidate, (M,).
+        threshold: Lowest calibrated Γ of an accepted plan.
     """
 
     index: int
@@ -32,7 +32,7 @@ class PlanChoice:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether Γ of the chosen plan reaches the threshold."""
+        """Whether calibrated Γ of the chosen plan reaches the threshold."""
         return bool(self.safety_probability[self.index] >= self.threshold)
 
 
@@ -71,13 +71,13 @@ def choose_plan(
     rng: np.random.Generator,
     num_plans: int = 16,
 ) -> PlanChoice:
-    """Sets the plan with the highest Γ; the present plan is one of the candidates.
+    """Sets the plan with the highest calibrated Γ; the present plan is one of the candidates.
 
     Args:
         loop: A closed loop whose plans can be chosen.
         assessment: The assessment learned from its episodes.
         context: Its Context, in the state to plan from; the chosen plan is set in it.
-        threshold: Lowest Γ, calibrated, of an accepted plan. If no candidate reaches it, the best
+        threshold: Lowest calibrated Γ of an accepted plan. If no candidate reaches it, the best
             one is set, and ``is_accepted`` is False.
         rng: Source of the candidates.
         num_plans: Largest number of candidates.

@@ -86,7 +86,7 @@ class ClosedLoop(FloatSystem, Diagram):
     ``features``           n_f     the safe set's features of state and preview
     ``margins``            n_c     signed margins of the safe set, negative = violated
     ``safe``               1       1 while the state is inside the safe set
-    ``safety_probability`` 1       Γ, with an assessment (also ``normalized_…``)
+    ``safety_probability`` 1       literal Γ, with an assessment (also ``normalized_…``)
     ``belief``             3       (safe, unsafe, unknown), with an assessment
     ``alarm``              1       1 since the monitor's alarm (also ``alarm_cause``, ``levels``)
     ``recovery_active``    1       1 during recovery, with recovery

@@ -36,9 +36,10 @@ class CommandGuard(FloatSystem, LeafSystem):
     ``desired_output`` is the asked command. Otherwise it is the accepted one nearest to it,
     measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
     none is accepted, the one with the largest Γ. A command is accepted if its calibrated Γ reaches
-    the threshold and the inputs are not novel. ``safety_probability`` is that of the asked command.
-    All outputs are discrete states, and preview and outlook hold the command. Whether the guard
-    acts is a parameter of the Context; one that does not passes on everything.
+    the threshold and the inputs are not novel. ``safety_probability`` is calibrated Γ of the asked
+    command; the port of that name of :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`
+    is literal Γ. All outputs are discrete states, and preview and outlook hold the command. Whether
+    the guard acts is a parameter of the Context; one that does not passes on everything.
 
     Args:
         assessment: A fitted assessment.
@@ -146,7 +147,7 @@ class CommandGuard(FloatSystem, LeafSystem):
         *,
         is_acting: bool = True,
     ) -> tuple[np.ndarray, float]:
-        """Returns the command to pass on, (3,), and the Γ of the asked one.
+        """Returns the command to pass on, (3,), and calibrated Γ of the asked one.
 
         Args:
             asked: (3,) [m/s, rad/s].

@@ -41,7 +41,8 @@ class RecoverySwitch(FloatSystem, Diagram):
     Args:
         kinematics: The controller's model of the robot.
         parameters: Parameters of the recovery steps.
-        threshold: Γ_thre.
+        threshold: Γ_thre, of what ``safety_probability`` is connected to; see
+            :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
         persistence_s: Time for which Γ must have been below it while nothing is known [s].
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].

@@ -24,6 +24,9 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         - port_selector
         - recovery_active
 
+    Γ is what ``safety_probability`` is connected to: literal Γ in the paper, normalised Γ in
+    balancing, calibrated Γ in walking.
+
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A Γ that is NaN
     activates it. ``belief`` (3,) tells a Γ that is low from one of which nothing is known: while it
     is (0, 0, 1), Γ must have been below Γ_thre for ``persistence_s``. An impact makes a single
@@ -31,7 +34,7 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
     ``nominal`` first, ``recovery`` second.
 
     Args:
-        threshold: Γ_thre in [0, 1]; the paper's value is 0.6.
+        threshold: Γ_thre in [0, 1], of that quantity; the paper's value is 0.6, of literal Γ.
         persistence_s: Time for which Γ must have been below Γ_thre while nothing is known [s]; none
             by default, as in the paper.
         period_s: Update period [s].

@@ -48,10 +48,11 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         - novelty
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
-    ``safety_probability`` is the paper's Γ = b_safe; ``normalized_safety_probability`` is
-    b_safe / (1 - μ), 0 where μ = 1; ``calibrated_safety_probability`` is the output of the safety
-    heads with the correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the
-    distance of the inputs from those of training, novel above 1. The belief of inputs that are
+    ``safety_probability`` is literal Γ, b_safe as in the paper, at most 1 - μ;
+    ``normalized_safety_probability`` is normalised Γ, b_safe / (1 - μ), 0 where μ = 1;
+    ``calibrated_safety_probability`` is calibrated Γ, the probability by the maps' heads with the
+    correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the distance of the
+    inputs from those of training, novel above 1. The belief of inputs that are
     novel or not finite is (0, 0, 1), and so is the belief before the first evaluation. So is every
     belief while ``alarm`` is above 0.5, as that of a
     :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. With ``margins``, those of the
@@ -200,7 +201,7 @@ class SafetyAssessor(FloatSystem, LeafSystem):
         discrete_state.set_value(
             np.concatenate(
                 [
-                    (prediction.safety_probability, prediction.normalized),
+                    (prediction.literal, prediction.normalized),
                     prediction.belief,
                     prediction.cause_probability,
                     prediction.embedding,

@@ -19,6 +19,7 @@ INPUTS = (
     "features; paper uses its next H steps and no features."
 )
 """Note beside every table that compares them."""
+_SCORES = "Modes are judged by calibrated Γ, classifiers by their probability."
 _SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
 _SET_TITLES = {
     "plans": "all targets",
@@ -45,6 +46,7 @@ def verdict_tables(results: Results) -> list[Table]:
             "segments",
             "Every segment of the motion",
             "Each segment of fresh motions is classified: does the motion stay safe to its end? "
+            f"{_SCORES} Recalls are at the threshold of best balanced accuracy on other motions. "
             f"{INPUTS}",
             judged,
         ),
@@ -63,7 +65,7 @@ def verdict_tables(results: Results) -> list[Table]:
                 prefix,
                 f"Targets before the motion starts: {set_title(prefix)}",
                 "Each target is classified at k = 0; the simulated motion towards it is the "
-                f"reference. {INPUTS}",
+                f"reference. {_SCORES} {INPUTS}",
                 columns_of("targets"),
             )
             for prefix in plan_sets(results)
@@ -82,7 +84,7 @@ def verdict_tables(results: Results) -> list[Table]:
             results,
             "calibration",
             "Stored calibrations on fresh motions",
-            "Promised and observed rates of calibrated thresholds.",
+            "Promised and observed rates of the thresholds of calibrated Γ.",
             columns_of("calibrations"),
             key="calibrations",
         ),
@@ -200,7 +202,10 @@ def _triggers(results: Results) -> Table:
 
 def alarm_table(results: Results) -> Table:
     """Detection rate, lead time and false-alarm rate of alarms on pushed motions."""
-    meaning = "Thresholds are chosen for the same share of false alarms on calibration motions."
+    meaning = (
+        "Thresholds are chosen for the same share of false alarms on calibration motions; those of "
+        "sharpened and paper apply to normalised Γ, unless a row names another."
+    )
     refused = results.estimates.get("monitoring.motions.refused")
     if refused is not None and refused.n:
         meaning += (
