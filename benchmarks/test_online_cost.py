@@ -22,6 +22,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from threadpoolctl import threadpool_limits
 
 from drake_safety import SafetyAssessment, Scenario
+from drake_safety.evaluation.baselines import DirectClassifier
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.systems.novelty_monitor import NoveltyMonitor
@@ -229,4 +230,30 @@ def test_novelty_and_monitor_beside_an_evaluation(
         at_most=0.75 * peers["Γ in a diagram"],
         peers=peers,
         note=f"{x.shape[1]} inputs, {assessment.innovation_.num_states} states",
+    )
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_one_prediction_beside_gradient_boosting(
+    benchmark: Any, report: Callable[..., None], scenario: Scenario, episodes: Episodes
+) -> None:
+    gamma = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes[:NUM_EPISODES])
+    boosting = DirectClassifier("gradient_boosting", shortest=gamma.parameters.shortest)
+    boosting.fit(episodes)  # All: the cost grows with the number of trees.
+    inputs = [getattr(episodes[0], name)[0] for name in INPUT_NAMES]
+    x = np.concatenate(inputs)[None].astype(np.float32)
+    with threadpool_limits(1):
+        cost_s, peers_s = alternate(
+            benchmark,
+            repeat(lambda: gamma.predict_one(*inputs)),
+            {"gradient boosting": repeat(lambda: boosting.model_.predict_proba(x))},
+            rounds=3,
+        )
+    report(
+        "Γ, one prediction",
+        per_update_us(cost_s),
+        "us CPU",
+        at_most=MAX_US,
+        peers={name: per_update_us(seconds) for name, seconds in peers_s.items()},
+        note=f"{x.size} inputs, boosting of {len(episodes)} episodes",
     )
