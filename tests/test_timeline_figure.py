@@ -39,7 +39,9 @@ def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
         assert line.coords2 is gamma.transData
         assert line.coords1 is axes.transAxes
         np.testing.assert_allclose(line.xy2, (instant, gamma.get_ylim()[1]))
-        down = [c.get_segments()[0] for c in gamma.collections if c.get_segments()[0][0, 0] == instant]
+        down = [
+            c.get_segments()[0] for c in gamma.collections if c.get_segments()[0][0, 0] == instant
+        ]
         np.testing.assert_allclose(down, [[(instant, value), (instant, gamma.get_ylim()[1])]])
     assert stills[0].get_title(loc="left") == "(a)  0.50 s"
     assert [axes.images[0].get_array().max() for axes in stills] == [0, 255]
@@ -56,7 +58,9 @@ def test_the_timeline_marks_throw_threshold_trigger_and_recovery(run):
 
 
 @pytest.mark.parametrize("times_s", [(0.3, 0.34, 0.4), (0.3, 1.9, 1.96)])
-def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_instant(run, times_s):
+def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_instant(
+    run, times_s
+):
     *throws_s, trigger_s = times_s
     throws = [SimpleNamespace(time_s=at_s, mass_kg=3.0, speed_m_s=8.0) for at_s in throws_s]
     events = {

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 _WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 5.6, 3.5, 1.1  # [inches]
 _DOTS_PER_INCH = 100
-_FRAMES_PER_SECOND = 12.5
-_COLOURS, _PALETTE_FRAMES = 255, 8
+_FRAMES_PER_SECOND = 10.0
+_COLOURS, _PALETTE_FRAMES = 127, 8
 
 
 def save_animation(
@@ -104,7 +104,7 @@ def save_animation(
             picture.set_data(camera.render(positions[row]))
             turn = math.remainder(_heading(loop, positions[row]) - heading, 2.0 * math.pi)
             words.set_text(
-                f"fixed direction of view, robot turned by {round(math.degrees(turn)) + 0}°"
+                f"the camera does not turn; the robot turned by {round(math.degrees(turn))}°"
             )
             curve.set_data(time_s[: row + 1], gamma[: row + 1])
             dot.set_data([time_s[row]], [gamma[row]])

@@ -100,7 +100,9 @@ def timeline_figure(
                 f"timeline_figure: a still at {instant} s is outside {time_s[0]}..{time_s[-1]} s"
             )
     labels = _labels(throws, pushes, trigger_times_s, trigger_label, leave_time_s)
-    labels += [_Label(start, "recovery steps", RECOVERY_COLOUR) for start, _ in recovery_intervals_s]
+    labels += [
+        _Label(start, "recovery steps", RECOVERY_COLOUR) for start, _ in recovery_intervals_s
+    ]
     rows = _label_rows(labels, time_s[0], time_s[-1])
     heights = [_GAMMA_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
     if belief is not None:
