@@ -92,6 +92,6 @@ def test_the_diagram_shows_each_curve_with_its_error():
     label = np.array([True, False] * 20)
     one = reliability(np.linspace(0, 1, 40), label)
     fig = reliability_figure({"sharpened": one, "paper": one})
-    (axes,), (legend,) = fig.axes, fig.legends
+    (legend,) = fig.legends
     told = [text.get_text() for text in legend.get_texts()]
     assert told == [f"{name}   {one.calibration_error:.3f}" for name in ("sharpened", "paper")]
