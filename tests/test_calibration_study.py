@@ -91,6 +91,7 @@ def test_what_is_no_probability_is_refused():
 def test_the_diagram_shows_each_curve_with_its_error():
     label = np.array([True, False] * 20)
     one = reliability(np.linspace(0, 1, 40), label)
-    (axes,) = reliability_figure({"sharpened": one, "paper": one}).axes
-    told = [text.get_text() for text in axes.get_legend().get_texts()]
+    fig = reliability_figure({"sharpened": one, "paper": one})
+    (legend,) = fig.legends
+    told = [text.get_text() for text in legend.get_texts()]
     assert told == [f"{name}   {one.calibration_error:.3f}" for name in ("sharpened", "paper")]

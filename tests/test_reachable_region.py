@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,3 +110,18 @@ def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(regi
     assert not any(label.startswith("front") for label in labels)
     assert f"calibrated Γ = {region.threshold:.2f}" in labels
     assert not any(label.startswith("inverse kinematics") for label in labels)
+    assert any("don't know" in label for label in labels) == bool(
+        np.isnan(region.safety_probability).any()
+    )
+
+
+def test_what_is_not_known_is_hatched_and_not_accepted(region):
+    probability = np.full_like(region.safety_probability, 0.9)
+    probability[: len(probability) // 2] = np.nan
+    half = replace(region, safety_probability=probability)
+    labels = [text.get_text() for text in region_figure(half, ["flank"]).legends[0].get_texts()]
+    share = 100 * np.isnan(probability).mean()
+    assert f"Γ: don't know, {share:.0f} %" in labels
+    accepted = probability[::4, ::4] >= half.threshold
+    right = (accepted == (half.outcomes == SAFE)).mean()
+    assert half.estimates()["sharpened.right"].value == pytest.approx(right)

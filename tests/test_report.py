@@ -248,7 +248,11 @@ def test_what_a_half_finished_run_lacks_is_named_and_the_rest_shown(copy, gone, 
         path = copy / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     page = Page(page_of(copy).read_text(encoding="utf-8"))
-    assert page.all("section", id="missing")
+    # At the end, folded.
+    assert page.all("section")[-1] == {"id": "missing"}
+    assert page.words.index("Not in this run:") > page.words.index("Provenance")
+    start = page.elements.index(("section", {"id": "missing"}))
+    assert page.elements[start + 1] == ("details", {})
     assert named.lower() in page.words.lower()
     if "evaluation.json" not in gone:
         assert "0.900 (0.795–0.962)" in page.words

@@ -38,7 +38,11 @@ def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
     for line, axes, instant, value in zip(lines, stills, (0.5, 1.2), (0.9, 0.2), strict=True):
         assert line.coords2 is gamma.transData
         assert line.coords1 is axes.transAxes
-        np.testing.assert_allclose(line.xy2, (instant, value))
+        np.testing.assert_allclose(line.xy2, (instant, gamma.get_ylim()[1]))
+        down = [
+            c.get_segments()[0] for c in gamma.collections if c.get_segments()[0][0, 0] == instant
+        ]
+        np.testing.assert_allclose(down, [[(instant, value), (instant, gamma.get_ylim()[1])]])
     assert stills[0].get_title(loc="left") == "(a)  0.50 s"
     assert [axes.images[0].get_array().max() for axes in stills] == [0, 255]
 
@@ -51,6 +55,34 @@ def test_the_timeline_marks_throw_threshold_trigger_and_recovery(run):
     assert [1.0, 0.6] in marks
     (span,) = [p for p in gamma.patches if to_hex(p.get_facecolor()) == RECOVERY_COLOUR]
     assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((1.0, 1.6))
+
+
+@pytest.mark.parametrize("times_s", [(0.3, 0.34, 0.4), (0.3, 1.9, 1.96)])
+def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_instant(
+    run, times_s
+):
+    *throws_s, trigger_s = times_s
+    throws = [SimpleNamespace(time_s=at_s, mass_kg=3.0, speed_m_s=8.0) for at_s in throws_s]
+    events = {
+        "throws": throws,
+        "trigger_times_s": [trigger_s],
+        "recovery_intervals_s": [(trigger_s, 2)],
+    }
+    fig = timeline_figure(**run | events)
+    fig.draw_without_rendering()
+    gamma = fig.axes[2]
+    boxes = [
+        text.get_window_extent().transformed(gamma.transData.inverted())
+        for text in gamma.texts
+        if not text.get_text().startswith("threshold")
+    ]
+    assert len(boxes) == 4
+    for i, box in enumerate(boxes):
+        assert box.y0 > 1.0
+        assert box.y1 < gamma.get_ylim()[1]
+        assert gamma.get_xlim()[0] <= box.x0
+        assert box.x1 <= gamma.get_xlim()[1]
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
 
 
 def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
 _WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 5.6, 3.5, 1.1  # [inches]
 _DOTS_PER_INCH = 100
-_FRAMES_PER_SECOND = 12.5
-_COLOURS, _PALETTE_FRAMES = 255, 8
+_FRAMES_PER_SECOND = 10.0
+_COLOURS, _PALETTE_FRAMES = 127, 8
 
 
 def save_animation(
@@ -40,7 +41,7 @@ def save_animation(
     event_times_s: Sequence[float] = (),
     frames_per_second: float = _FRAMES_PER_SECOND,
 ) -> Path:
-    """Writes a GIF of a logged run, in real time.
+    """Writes a GIF of a logged run, in real time, which says how far the robot has turned.
 
     Args:
         loop: The closed loop that was simulated, or one with the same plant.
@@ -81,6 +82,8 @@ def save_animation(
         picture_axes = fig.add_axes((0.0, share, 1.0, 1.0 - share))
         picture_axes.set_axis_off()
         picture = picture_axes.imshow(camera.render(positions[0]))
+        # The ground has no marks by which a turn of the robot could be told from one of the camera.
+        words = picture_axes.text(0.02, 0.95, "", transform=picture_axes.transAxes, va="top")
         axes = fig.add_axes((0.09, 0.34 * share, 0.88, 0.58 * share))
         axes.set_xlim(time_s[0], time_s[-1])
         axes.set_ylim(-0.05, 1.05)
@@ -95,9 +98,14 @@ def save_animation(
             for event in event_times_s
         ]
 
+        heading = _heading(loop, positions[0])
         frames = []
         for row in rows:
             picture.set_data(camera.render(positions[row]))
+            turn = math.remainder(_heading(loop, positions[row]) - heading, 2.0 * math.pi)
+            words.set_text(
+                f"the camera does not turn; the robot turned by {round(math.degrees(turn))}°"
+            )
             curve.set_data(time_s[: row + 1], gamma[: row + 1])
             dot.set_data([time_s[row]], [gamma[row]])
             dot.set_color(SAFE_COLOUR if gamma[row] >= threshold else UNSAFE_COLOUR)
@@ -113,6 +121,12 @@ def save_animation(
     duration_ms = round(100 / frames_per_second) * 10  # GIFs count in hundredths of a second.
     first.save(path, save_all=True, append_images=others, duration=duration_ms, loop=0)
     return path
+
+
+def _heading(loop: LeggedLoop, positions: np.ndarray) -> float:
+    """Direction of the base's forward axis from the world's x axis [rad]."""
+    w, x, y, z = loop.plant.GetPositionsFromArray(loop.robot_instance, positions)[:4]
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _joined(frames: Sequence[Image.Image]) -> Image.Image:

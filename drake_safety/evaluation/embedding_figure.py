@@ -161,7 +161,7 @@ def draw_safety(
             axes.text(
                 x, y, _short(number), ha="center", va="center_baseline", fontsize=6.5, color=ink
             )
-    axes.set_xlabel("numbers: training segments; hatched: EMPTY")
+    axes.set_xlabel("numbers: training segments; hatched: don't know")
     add_colour_bar(fig, axes, shade, label)
 
 

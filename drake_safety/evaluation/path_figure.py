@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -50,20 +51,41 @@ def path_figure(
         no_count = np.zeros(grid.num_cells, dtype=int)
         label = f"{GAMMA[NORMALIZED]} of a cell"
         draw_safety(fig, left, grid, cells[:, SAFE] / known, is_empty, no_count, label=label)
-        left.plot(points[:, 0], points[:, 1], color="white", linewidth=2.6, alpha=0.8)
-        left.plot(points[:, 0], points[:, 1], color=INK, linewidth=1.0)
+        left.plot(points[:, 0], points[:, 1], color="white", linewidth=2.0, alpha=0.6)
+        left.plot(points[:, 0], points[:, 1], color=INK, linewidth=0.7, alpha=0.7)
         half = grid.half_width
         left.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
-        left.set(title="Path through the embedding space", xlabel="hatched: EMPTY")
+        left.set(title="Path through the embedding space", xlabel="hatched: don't know")
         right.plot(time_s, gamma, color=INK, linewidth=1.4)
         right.axhline(threshold, color=INK, linewidth=0.8, linestyle="--")
-        right.text(time_s[0], threshold + 0.01, f"threshold {threshold:g}", va="bottom")
+        right.annotate(
+            f"threshold {threshold:.3g}",
+            (1.0, threshold),
+            xycoords=("axes fraction", "data"),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=9,
+        )
         right.set(title=f"{quantity} over time", xlabel="time [s]", ylim=(-0.04, 1.2))
         ordered = sorted(events.items(), key=lambda event: event[1])
         for number, (_, at_s) in enumerate(ordered, start=1):
             row = int(np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1))
             box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": INK, "lw": 0.8}
-            left.annotate(f"{number}", points[row], fontsize=8, bbox=box, ha="center", va="center")
+            # Around the path, as events may be close together.
+            angle = math.radians(120.0 - 75.0 * (number - 1))
+            left.annotate(
+                f"{number}",
+                points[row],
+                xytext=(42.0 * math.cos(angle), 42.0 * math.sin(angle)),
+                textcoords="offset points",
+                fontsize=8,
+                bbox=box,
+                ha="center",
+                va="center",
+                arrowprops={"arrowstyle": "-", "color": INK, "linewidth": 0.8},
+            )
+            left.plot(*points[row], "o", color=INK, markersize=4)
             right.axvline(at_s, color=INK, linewidth=0.6, alpha=0.5)
             # Alternating heights, as events may be close together.
             place = (at_s, 1.06 + 0.08 * (number % 2))

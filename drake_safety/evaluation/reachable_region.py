@@ -35,7 +35,7 @@ class ReachableRegion:
     Attributes:
         x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
-        safety_probability: Calibrated Γ there, (n_z, n_y).
+        safety_probability: Calibrated Γ there, (n_z, n_y); NaN for "don't know".
         threshold: Lowest calibrated Γ of an accepted target.
         is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
             (n_z, n_y); empty for a task without a hand.
@@ -134,9 +134,7 @@ def reachable_region(
             if report is not None:
                 report("verdicts on the plane", start, len(targets))
             chunk = targets[start : start + _REPORT_EVERY]
-            probability.append(
-                np.nan_to_num(scorer.probability(*goal_inputs(loop, chunk)), nan=0.0)
-            )
+            probability.append(scorer.probability(*goal_inputs(loop, chunk)))
             for name, kinematics in reachability.items():
                 reachable[name].append(kinematics.is_reachable(chunk))
         if report is not None:

@@ -34,6 +34,7 @@ _KINEMATICS = {
 def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figure:
     """Plots simulated outcomes as areas, the boundaries of Γ and of inverse kinematics as lines.
 
+    Targets inside an obstacle are grey, those that Γ answers with "don't know" are hatched.
     The view is that of the robot: its left is on the left.
 
     Args:
@@ -59,10 +60,24 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 alpha=0.28,
             )
             handles.append(Patch(color=INK, alpha=0.28, label="inside an obstacle"))
+        is_unknown = np.isnan(region.safety_probability)
+        if is_unknown.any():
+            axes.contourf(
+                region.y_m,
+                region.z_m,
+                is_unknown.astype(float),
+                levels=[0.5, 1.5],
+                colors="none",
+                hatches=["////"],
+            )
+            label = f"Γ: don't know, {100 * is_unknown.mean():.0f} %"
+            handles.append(
+                Patch(facecolor="white", edgecolor=INK, linewidth=0.4, hatch="////", label=label)
+            )
         # A white edge separates the line from the areas below.
         for colour, width in (("white", 5.0), (UNSAFE_COLOUR, 2.4)):
             axes.contour(
-                *_closed(region.y_m, region.z_m, region.safety_probability),
+                *_closed(region.y_m, region.z_m, np.nan_to_num(region.safety_probability)),
                 levels=[region.threshold],
                 colors=[colour],
                 linewidths=width,

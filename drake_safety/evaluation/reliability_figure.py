@@ -27,7 +27,7 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
         curves: Reliability by name.
     """
     with drawing_style():
-        fig = new_figure(5.4, 5.4)
+        fig = new_figure(5.4, 6.0)
         axes = fig.subplots()
         axes.plot([0, 1], [0, 1], color=FAINT_INK, linewidth=0.8)
         for i, (name, one) in enumerate(curves.items()):
@@ -50,5 +50,11 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
         axes.set_ylabel("share of unsafe episodes, 95 % intervals")
         axes.grid(color="#eceef0", linewidth=0.7)
         axes.set_title("Reliability")
-        axes.legend(loc="upper left", title="expected calibration error", alignment="left")
+        # Outside: intervals may be anywhere in the axes.
+        fig.legend(
+            loc="outside lower center",
+            ncols=2,
+            title="expected calibration error",
+            alignment="left",
+        )
     return fig

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,8 @@ _WIDTH = 12.0  # All sizes are in inches.
 _GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT = 2.6, 0.35
 _AXIS_LABEL_HEIGHT = 0.6
-_BALL_HEIGHT = 0.3  # Position of a ball on the axis of Γ.
+_LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels above the curve.
+_LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis of Γ without labels.
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
@@ -59,6 +61,8 @@ def timeline_figure(
     angular_constraints: Sequence[str] = (),
 ) -> Figure:
     """Plots Γ over time, with stills of the robot.
+
+    Names of events are in rows above the curve.
 
     Args:
         time_s: Instants [s], (N,).
@@ -97,7 +101,12 @@ def timeline_figure(
             raise ValueError(
                 f"timeline_figure: a still at {instant} s is outside {time_s[0]}..{time_s[-1]} s"
             )
-    heights = [_GAMMA_HEIGHT]
+    labels = _labels(throws, pushes, trigger_times_s, trigger_label, leave_time_s)
+    labels += [
+        _Label(start, "recovery steps", RECOVERY_COLOUR) for start, _ in recovery_intervals_s
+    ]
+    rows = _label_rows(labels, time_s[0], time_s[-1])
+    heights = [_GAMMA_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
     if belief is not None:
         heights.append(_BELIEF_HEIGHT)
     if margins is not None:
@@ -105,6 +114,7 @@ def timeline_figure(
     with drawing_style():
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
         gamma_axes, *others = panels
+        gamma_axes.set_xlim(time_s[0], time_s[-1])
         _draw_gamma(gamma_axes, time_s, gamma, threshold)
         gamma_axes.set_ylabel(quantity)
         remaining = iter(others)
@@ -114,25 +124,19 @@ def timeline_figure(
             _draw_margins(next(remaining), time_s, margins, constraint_names, angular_constraints)
         for panel in panels:
             _mark_instants(panel, throws, pushes, trigger_times_s, leave_time_s)
-        for interval in recovery_intervals_s:
-            _annotate_recovery(gamma_axes, interval)
-        for throw in throws:
-            _annotate_throw(gamma_axes, time_s, throw)
-        for push in pushes:
-            _annotate_push(gamma_axes, time_s, push)
+        for start, end in recovery_intervals_s:
+            gamma_axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
         for instant in trigger_times_s:
-            _annotate_trigger(gamma_axes, time_s, (instant, threshold), trigger_label)
-        if math.isfinite(leave_time_s):
-            _annotate_leaving(gamma_axes, time_s, leave_time_s)
+            gamma_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
+        top = _draw_labels(gamma_axes, labels, rows)
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
             _draw_still(axes, image, f"({letter})  {instant:.2f} s")
             row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
             height = gamma[row] if np.isfinite(gamma[row]) else 0.0
-            _join(fig, axes, gamma_axes, (instant, height))
+            _join(fig, axes, gamma_axes, (instant, height), top)
         for panel in panels[:-1]:
             panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time [s]")
-        gamma_axes.set_xlim(time_s[0], time_s[-1])
         fig.align_ylabels(panels)
     return fig
 
@@ -173,14 +177,13 @@ def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: fl
         f"threshold {threshold:.3g}",
         (1.0, threshold),
         xycoords=("axes fraction", "data"),
-        xytext=(-4, 3),
+        xytext=(6, 0),
         textcoords="offset points",
-        ha="right",
+        va="center",
         color=UNSAFE_COLOUR,
         fontsize=9,
     )
     axes.step(time_s, gamma, where="post", color=SAFE_COLOUR, linewidth=2.0)
-    axes.set_ylim(-0.02, 1.05)
     axes.set_yticks([0.0, 0.5, 1.0])
 
 
@@ -261,73 +264,82 @@ def _mark_instants(
         axes.axvline(leave_time_s, color=INK, linewidth=1.2, linestyle=(0, (4, 2)))
 
 
-def _annotate_recovery(axes: Axes, interval_s: tuple[float, float]) -> None:
-    start, end = interval_s
-    axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
-    # Lines to stills lead up and to the right from Γ at the trigger.
-    axes.annotate(
-        "recovery steps",
-        (end, 0.2),
-        xytext=(-6, 0),
-        textcoords="offset points",
-        ha="right",
-        color=RECOVERY_COLOUR,
-        fontsize=9,
-    )
+@dataclass(frozen=True)
+class _Label:
+    """The name of an event; that of a ball follows a mark."""
+
+    time_s: float
+    words: str
+    colour: str
+    is_ball: bool = False
 
 
-def _annotate_throw(axes: Axes, time_s: np.ndarray, throw: Throw) -> None:
-    axes.plot(
-        throw.time_s, _BALL_HEIGHT, "o", color=BALL_COLOUR, markersize=9, clip_on=False, zorder=5
-    )
-    words = f"{throw.mass_kg:.1f} kg, {throw.speed_m_s:.1f} m/s"
-    _write_before(axes, time_s, throw.time_s, words)
+def _labels(
+    throws: Sequence[Throw],
+    pushes: Sequence[Push],
+    trigger_times_s: Sequence[float],
+    trigger_label: str,
+    leave_time_s: float,
+) -> list[_Label]:
+    labels = [
+        _Label(one.time_s, f"{one.mass_kg:.1f} kg, {one.speed_m_s:.1f} m/s", INK, is_ball=True)
+        for one in throws
+    ]
+    for push in pushes:
+        words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
+        labels.append(_Label(push.time_s, words, INK))
+    labels += [_Label(instant, trigger_label, UNSAFE_COLOUR) for instant in trigger_times_s]
+    if math.isfinite(leave_time_s):
+        labels.append(_Label(leave_time_s, "leaves the safe set", INK))
+    return labels
 
 
-def _annotate_push(axes: Axes, time_s: np.ndarray, push: Push) -> None:
-    words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
-    _write_before(axes, time_s, push.time_s, words)
+def _label_rows(labels: Sequence[_Label], start_s: float, end_s: float) -> list[int]:
+    """Assigns labels to rows, 0 at the top, such that none covers another or its instant."""
+    taken: list[list[tuple[float, float]]] = []
+    found = []
+    for label in labels:
+        scale = (end_s - start_s) / (_WIDTH - 2.0)  # Seconds per inch, roughly.
+        length = scale * (len(label.words) * _LETTER_WIDTH + 2 * _LABEL_OFFSET)
+        low = label.time_s - (length if label.time_s + length > end_s else scale * _LABEL_OFFSET)
+        high = max(low + length, label.time_s + scale * _LABEL_OFFSET)
+        row = 0
+        while row < len(taken) and any(low < b and a < high for a, b in taken[row]):
+            row += 1
+        taken += [[]] if row == len(taken) else []
+        taken[row].append((low, high))
+        found.append(row)
+    return found
 
 
-def _write_before(axes: Axes, time_s: np.ndarray, instant_s: float, words: str) -> None:
-    # Left of the instant, if there is room.
-    is_early = instant_s - time_s[0] < 0.15 * (time_s[-1] - time_s[0])
-    axes.annotate(
-        words,
-        (instant_s, _BALL_HEIGHT),
-        xytext=(8 if is_early else -8, 0),
-        textcoords="offset points",
-        ha="left" if is_early else "right",
-        va="center",
-        fontsize=9,
-    )
+def _draw_labels(axes: Axes, labels: Sequence[_Label], rows: Sequence[int]) -> float:
+    """Writes labels in their rows above the curve; returns the upper end of the axis of Γ."""
+    from matplotlib.patheffects import withStroke
 
-
-def _annotate_trigger(
-    axes: Axes, time_s: np.ndarray, place: tuple[float, float], words: str
-) -> None:
-    axes.plot(*place, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
-    _write_after(axes, time_s, (place[0], 0.75), words, UNSAFE_COLOUR)
-
-
-def _annotate_leaving(axes: Axes, time_s: np.ndarray, instant_s: float) -> None:
-    _write_after(axes, time_s, (instant_s, 0.15), "leaves the safe set", INK)
-
-
-def _write_after(
-    axes: Axes, time_s: np.ndarray, place: tuple[float, float], words: str, colour: str
-) -> None:
-    # Right of the instant, if there is room.
-    is_late = time_s[-1] - place[0] < 0.15 * (time_s[-1] - time_s[0])
-    axes.annotate(
-        words,
-        place,
-        xytext=(-5 if is_late else 5, 0),
-        textcoords="offset points",
-        ha="right" if is_late else "left",
-        color=colour,
-        fontsize=9,
-    )
+    row_height = (_HIGHEST - _LOWEST) * _LABEL_ROW_HEIGHT / _GAMMA_HEIGHT
+    top = _HIGHEST + row_height * (max(rows, default=-1) + 1)
+    axes.set_ylim(_LOWEST, top)
+    start_s, end_s = axes.get_xlim()
+    for label, row in zip(labels, rows, strict=True):
+        place = (label.time_s, top - (row + 0.5) * row_height)
+        if label.is_ball:
+            axes.plot(*place, "o", color=BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
+        length = (len(label.words) * _LETTER_WIDTH + _LABEL_OFFSET) / (_WIDTH - 2.0)
+        is_late = label.time_s + length * (end_s - start_s) > end_s
+        axes.annotate(
+            label.words,
+            place,
+            xytext=(-7 if is_late else 7, 0),
+            textcoords="offset points",
+            ha="right" if is_late else "left",
+            va="center",
+            color=label.colour,
+            fontsize=9,
+            zorder=6,
+            # Lines of events and stills pass behind.
+            path_effects=[withStroke(linewidth=3.0, foreground="white")],
+        )
+    return top
 
 
 def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
@@ -337,18 +349,23 @@ def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
     axes.set_title(title, fontsize=10, pad=4)
 
 
-def _join(fig: Figure, picture: Axes, gamma_axes: Axes, point: tuple[float, float]) -> None:
-    """Draws a line from the lower edge of an image to its point on the curve of Γ."""
+def _join(
+    fig: Figure, picture: Axes, gamma_axes: Axes, point: tuple[float, float], top: float
+) -> None:
+    """Draws a line from the lower edge of an image to its instant, and down to the curve of Γ."""
     from matplotlib.patches import ConnectionPatch
 
     line = ConnectionPatch(
         xyA=(0.5, 0.0),
         coordsA=picture.transAxes,
-        xyB=point,
+        xyB=(point[0], top),
         coordsB=gamma_axes.transData,
         color=FAINT_INK,
         linewidth=0.9,
     )
     line.set_in_layout(False)
     fig.add_artist(line)
-    gamma_axes.plot(*point, "o", color="white", markeredgecolor=INK, markersize=6, zorder=6)
+    gamma_axes.vlines(point[0], point[1], top, color=FAINT_INK, linewidth=0.9, alpha=0.6, zorder=1)
+    gamma_axes.plot(
+        *point, "o", color="white", markeredgecolor=INK, markersize=6, clip_on=False, zorder=6
+    )
