@@ -45,7 +45,7 @@ clean: ## Remove the environment, the caches and what was built (runs/ stays)
 $(INSTALLED): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/it" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --constraint constraints.txt --editable .
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[live]"
 	touch $@
 
 $(DEVELOPED): $(INSTALLED) $(WALKING)

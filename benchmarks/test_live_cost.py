@@ -35,9 +35,8 @@ def begin_goals(meshcat: Meshcat, scenario_name: str) -> tuple[ClosedLoop, LiveS
     loop = scenario.make_loop("actual", assessment=gamma, meshcat=meshcat)
     session = LiveGoals(loop, meshcat, threshold=gamma.calibrations_["plan"].threshold)
     for name, value in zip(session.AXES, TARGET, strict=True):
-        meshcat.SetSliderValue(name, float(value))
-    # What the browser sends when its button Go is clicked, as MessagePack.
-    meshcat._InjectWebsocketMessage(b"\x82\xa4type\xa6button\xa4name\xa2" + session.GO.encode())
+        session.panel.set_value(name, float(value))
+    session.panel.click(session.GO)
     session.tick()
     return loop, session
 
@@ -58,7 +57,7 @@ def test_live_page_keeps_up_with_the_clock(
         meshcat = Meshcat()
         loop, session = begin(meshcat, scenario_name)
         start_s = session.context.get_time()
-        # The same motion without panel and controls.
+        # The same motion without the session.
         bare = Simulator(loop, session.context.Clone())
         start = time.perf_counter()
         bare.AdvanceTo(start_s + DURATION_S)
@@ -74,6 +73,6 @@ def test_live_page_keeps_up_with_the_clock(
         np.median(factors),
         "x",
         at_least=1.0,
-        peers={"without controls and board": float(np.median(bare_factors))},
+        peers={"without the session": float(np.median(bare_factors))},
         note=f"{DURATION_S:g} s of the actual plant, lowest of {ROUNDS}: {min(factors):.2f}",
     )

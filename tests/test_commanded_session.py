@@ -6,7 +6,7 @@ from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.live.commanded_session import LiveCommands
-from live_pages import click, quick
+from live_scenarios import quick
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def session():
 
 def ticks(session, *names, num=1):
     for name in names:
-        click(session, name)
+        session.panel.click(name)
     for _ in range(num):
         assert session.tick()
 
@@ -57,7 +57,7 @@ def test_a_push_moves_the_robot_and_a_fall_is_followed_by_standing(session):
     ticks(session, session.PUSH, num=5)
     after = session.loop.GetOutputPort("output").Eval(session.context)
     assert np.linalg.norm((after - before)[:2]) > 0.5
-    assert any("pushed with" in line for line in session.panel.text)
+    assert "pushed with" in session.panel.status.note
     session._lies_until_s = session.context.get_time()
     ticks(session)
     assert session.context.get_time() < 0.1

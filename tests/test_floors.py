@@ -36,6 +36,7 @@ HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
 # What only an extra brings, and the files that may import it.
 EXTRAS = {
     "cluster": "drake_safety/simulation/cluster",
+    "live": "drake_safety/live/page",
     "logs": "drake_safety/logs/",
     "mujoco": "drake_safety/plants/mujoco",
     "report": "drake_safety/evaluation/report/page",

@@ -76,12 +76,13 @@ HostOption = Annotated[
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 
 
-def open_viewer(host: str, port: int | None = None) -> Meshcat:
+def open_viewer(host: str, port: int | None = None, *, has_rate: bool = True) -> Meshcat:
     """Starts a Meshcat server.
 
     Args:
         host: Address that serves the page.
         port: Its port; a free one by default.
+        has_rate: Whether the real-time rate is shown.
 
     Raises:
         ValueError: The server does not start.
@@ -89,7 +90,7 @@ def open_viewer(host: str, port: int | None = None) -> Meshcat:
     from pydrake.geometry import Meshcat, MeshcatParams
 
     try:
-        return Meshcat(MeshcatParams(host=host, port=port))
+        return Meshcat(MeshcatParams(host=host, port=port, show_stats_plot=has_rate))
     except RuntimeError as error:
         place = host if port is None else f"{host}:{port}"
         raise ValueError(f"no page can be served at {place}: {error}") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,6 +24,8 @@ from drake_safety.learning.seeds import DEMONSTRATION
 if TYPE_CHECKING:
     from drake_safety.live.session import LiveSession
 
+_FIRST_PORT = 7000
+
 
 def play(
     scenario: ScenarioArgument,
@@ -35,15 +39,24 @@ def play(
     seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     port: Annotated[
-        int | None, typer.Option(help="Of the page; a free one from 7000 on by default.")
+        int | None,
+        typer.Option(
+            help="Of the page; the scene's is the next one. Free ones from 7000 on by default."
+        ),
     ] = None,
     host: HostOption = LOOPBACK,
 ) -> None:
-    """Run the robot in the browser, in real time, until Stop or Ctrl-C.
+    """Run the robot on a page in the browser, in real time, until Stop or Ctrl-C.
 
     Sliders and buttons throw a ball or move the target; keys walk a robot that follows commands,
     push it, and switch its guard. Γ, belief and verdict are shown.
     """
+    try:
+        from drake_safety.live.page import serve_page
+    except ImportError as error:
+        raise ValueError(
+            f"play: the package '{error.name}' is not installed: pip install 'drake_safety[live]'"
+        ) from error
     from drake_safety.live.commanded_session import LiveCommands
     from drake_safety.live.session import LiveGoals, LiveThrows
     from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals, require
@@ -63,7 +76,8 @@ def play(
         require(asked, HasBall, "play")
         options["ball"] = True
     print_shipped(folder)
-    meshcat = open_viewer(host, port)
+    page_port = _page_port(host, port)
+    meshcat = open_viewer(host, page_port + 1, has_rate=False)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session: LiveSession
     if is_commanded:
@@ -79,12 +93,12 @@ def play(
     else:
         threshold = loaded.parameters.recovery.threshold
         session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
-    console.print(f"live at {meshcat.web_url()}", highlight=False, soft_wrap=True)
-    console.print("controls: top right of the page; Stop or Ctrl-C ends", highlight=False)
-    try:
-        session.run()
-    except KeyboardInterrupt:
-        pass
+    address = meshcat.web_url().rpartition(":")[0]
+    with serve_page(session.panel, host=host, port=page_port, scene_port=meshcat.port()):
+        console.print(f"live at {address}:{page_port}", highlight=False, soft_wrap=True)
+        console.print("Stop, on the page, or Ctrl-C ends", highlight=False)
+        with contextlib.suppress(KeyboardInterrupt):
+            session.run()
     pace = session.pace
     if pace.simulated_s == 0.0:
         console.print("nothing was simulated", highlight=False)
@@ -93,4 +107,21 @@ def play(
         f"real-time factor {pace.realtime_factor:.2f} over {pace.simulated_s:.1f} s simulated; "
         f"this machine could run it at {pace.possible_factor:.2f}",
         highlight=False,
+    )
+
+
+def _page_port(host: str, port: int | None) -> int:
+    """The port of the page: it and the next one are free.
+
+    Raises:
+        ValueError: They are not.
+    """
+    asked = range(_FIRST_PORT, _FIRST_PORT + 200, 2) if port is None else [port]
+    for candidate in asked:
+        with contextlib.suppress(OSError, OverflowError):
+            for one in (candidate, candidate + 1):
+                socket.create_server((host, one)).close()
+            return candidate
+    raise ValueError(
+        f"no page can be served at {host}:{asked[0]}: this port or the next one is not free"
     )

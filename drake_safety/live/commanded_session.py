@@ -7,7 +7,6 @@ import math
 import numpy as np
 from pydrake.geometry import Meshcat
 
-from drake_safety.live.panel import INK_RGB, RECOVERY_RGB, SAFE_RGB, UNSAFE_RGB
 from drake_safety.live.session import TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import (
@@ -56,38 +55,37 @@ class LiveCommands(LiveSession):
         self._note, self._note_until_s = "", 0.0
         self._lies_until_s = math.inf
         for name, key, _, _ in self.KEYS:
-            self._add_button(name, key)
+            self.panel.add_button(name, key)
         for name, key in (
             (self.HALT, "KeyH"),
             (self.PUSH, "Space"),
             (self.GUARD, "KeyG"),
             (self.STAND, "KeyR"),
         ):
-            self._add_button(name, key)
+            self.panel.add_button(name, key)
         self._stand()
 
     def tick(self) -> bool:
         """Reacts to the keys, advances, and shows Γ, belief, command and verdict."""
         now = self.context.get_time()
-        if self._is_clicked(self.STAND) or now >= self._lies_until_s:
+        if self.panel.take_click(self.STAND) or now >= self._lies_until_s:
             self._stand()
         command = self.command.copy()
         for name, _, entry, sign in self.KEYS:
-            if self._is_clicked(name):
+            if self.panel.take_click(name):
                 command[entry] += sign * self._step[entry]
-        if self._is_clicked(self.HALT):
+        if self.panel.take_click(self.HALT):
             command[:] = 0.0
         command = np.clip(command, *self._goals.target_box)
         if not np.array_equal(command, self.command):
             self.command = command
             self._commanded.set_command(self.context, command)
-        if self._is_clicked(self.GUARD):
+        if self.panel.take_click(self.GUARD):
             self.is_guarded = not self.is_guarded
             self._commanded.set_guarded(self.context, self.is_guarded)
-        if self._is_clicked(self.PUSH):
+        if self.panel.take_click(self.PUSH):
             self._push()
         self._advance()
-        self._aim_camera()
         self._show_status()
         return True
 
@@ -116,18 +114,22 @@ class LiveCommands(LiveSession):
     def _show_status(self) -> None:
         now = self.context.get_time()
         note = self._note if now < self._note_until_s else self._words.value(self.command)
+        if not self.is_guarded:
+            note += "; guard off"
         if self.has_fallen:
             self._lies_until_s = min(self._lies_until_s, now + _LYING_S)
-            self.panel.show_text("fell", note, rgb=UNSAFE_RGB)
+            self.panel.show("fallen", note=note, tone="unsafe")
             return
+        state = "walking" if self.command.any() else "standing"
         is_changed = self.loop.HasOutputPort("guard_active") and self._eval("guard_active")[0] > 0
         if self.is_guarded and is_changed:
             passed = np.round(self._eval("desired_output"), 2)
-            self.panel.show_text(
-                f"guard: {self._words.value(passed)}", f"asked: {note}", rgb=RECOVERY_RGB
+            self.panel.show(
+                "guard: another command",
+                note=f"{self._words.value(passed)}; asked: {note}",
+                tone="recovery",
             )
         elif self.probability >= self.threshold:
-            first = "safe" if self.is_guarded else "safe, guard off"
-            self.panel.show_text(first, note, rgb=SAFE_RGB if self.is_guarded else INK_RGB)
+            self.panel.show(f"safe: {state}", note=note, tone="safe")
         else:
-            self._show_unsafe(note)
+            self.panel.show(f"unsafe: {state}", cause=self._cause(), note=note, tone="unsafe")

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
-from drake_safety.live.panel import INK_RGB, RECOVERY_RGB, SAFE_RGB, UNSAFE_RGB, LivePanel
+from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
@@ -24,13 +24,16 @@ from drake_safety.simulation.rollouts import episode_rng
 TICK_S = 0.04
 """Simulated time per tick [s]."""
 STOP = "Stop"
-PROBABILITY = "Γ, shown"
-"""The slider that shows Γ as a number; moving it has no effect."""
 
 _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _LYING_S = 1.5  # From a fall to the reset.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
 _BREAK_S = 0.02  # Real time between ticks while nothing moves.
+_DISTANCE = 1.55  # From the camera to the robot, by the robot's size.
+_FOLLOWED = 0.2  # Share of the way to the robot by which the camera follows in a tick.
+_WORLD, _OWN = "/drake", ("/Grid", "/Axes")  # Of Meshcat's scene; its own are hidden.
+_GROUND, _GRID = f"{_WORLD}/visualizer/ground", f"{_WORLD}/grid"
+_CELL_M, _NUM_CELLS = 0.5, 7  # Of the grid: size, and number from its middle.
 
 
 @dataclass
@@ -59,7 +62,7 @@ class Pace:
 
 
 class LiveSession(ABC):
-    """A closed loop with Γ in Meshcat that reacts to buttons and sliders.
+    """A closed loop with Γ in Meshcat that reacts to the controls of its panel.
 
     Args:
         loop: A closed loop built with this Meshcat and with an assessment.
@@ -73,6 +76,7 @@ class LiveSession(ABC):
     Attributes:
         pace: Simulated and real time so far.
         probability: Γ as shown.
+        panel: What a page shows, and its controls.
     """
 
     probability_port = "normalized_safety_probability"
@@ -88,8 +92,6 @@ class LiveSession(ABC):
         self.probability = math.nan
         self._seed = seed
         self._num_resets = 0
-        self._clicks: dict[str, int] = {}
-        self._ranges: dict[str, tuple[float, float]] = {}
         self._late_s = 0.0
         self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
@@ -98,9 +100,10 @@ class LiveSession(ABC):
         q = loop.kinematics.standing_positions()
         contacts = loop.kinematics.contact_positions(q)
         self._size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
-        self.panel = LivePanel(meshcat, loop.view, threshold=threshold, width_m=0.9 * self._size_m)
-        self._add_button(STOP, "Escape")
-        meshcat.AddSlider(PROBABILITY, 0.0, 1.0, 0.01, 0.0)
+        self._height_m = 0.7 * float(q[6])
+        self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
+        self.panel.add_button(STOP, "Escape")
+        self._aim_camera()
 
     @abstractmethod
     def tick(self) -> bool:
@@ -111,12 +114,18 @@ class LiveSession(ABC):
         """
 
     def run(self, *, is_paced: bool = True) -> None:
-        """Ticks until the button Stop is clicked.
+        """Ticks until the button Stop is clicked; however it ends, the panel says so.
 
         Args:
             is_paced: Whether to run in real time; False runs as fast as possible.
         """
-        while not self._is_clicked(STOP):
+        try:
+            self._run(is_paced)
+        finally:
+            self.panel.stop()
+
+    def _run(self, is_paced: bool) -> None:
+        while not self.panel.take_click(STOP):
             begin = time.perf_counter()
             was_simulated = self.tick()
             busy_s = time.perf_counter() - begin
@@ -133,26 +142,6 @@ class LiveSession(ABC):
             self.pace.busy_s += busy_s
             self.pace.elapsed_s += time.perf_counter() - begin
 
-    def _add_button(self, name: str, key: str = "") -> None:
-        self.meshcat.AddButton(name, key)
-        self._clicks[name] = 0
-
-    def _is_clicked(self, name: str) -> bool:
-        clicks = self.meshcat.GetButtonClicks(name)
-        is_new = clicks > self._clicks[name]
-        self._clicks[name] = clicks
-        return is_new
-
-    def _add_slider(self, name: str, low: float, high: float, step: float, value: float) -> None:
-        self.meshcat.AddSlider(name, low, high, step, value)
-        self._ranges[name] = (low, high)
-
-    def _slider(self, name: str) -> float:
-        """Value of a slider within its range, whatever a page sent."""
-        low, high = self._ranges[name]
-        value = float(self.meshcat.GetSliderValue(name))
-        return min(max(value, low), high) if math.isfinite(value) else low
-
     def _next_rng(self) -> np.random.Generator:
         self._num_resets += 1
         return episode_rng(self._seed, self._num_resets - 1)
@@ -161,32 +150,30 @@ class LiveSession(ABC):
         """Initializes the simulator after a reset, and redraws."""
         self._simulator.Initialize()
         self.panel.clear_history()
-        self._aim_camera()
+        self._target = self._base()[:2]
+        self._follow()
 
     def _advance(self) -> None:
         self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
         self._show_gamma(
             self._eval(self.probability_port)[0], self._eval("belief"), self.context.get_time()
         )
+        self._follow()
 
     def _show_gamma(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
         self.probability = float(probability)
-        self.panel.show_belief(belief)
-        shown = self.probability if math.isfinite(self.probability) else 0.0
-        self.meshcat.SetSliderValue(PROBABILITY, min(max(shown, 0.0), 1.0))
-        if time_s is not None:
-            self.panel.add(time_s, shown)
+        self.panel.show_gamma(self.probability, belief, time_s)
 
-    def _show_unsafe(self, note: str) -> None:
-        cause = likely_cause(
+    def _cause(self) -> str:
+        """The constraint that is most likely to be violated; "" for none."""
+        return likely_cause(
             self.loop.constraint_names,
             self._eval("cause_probability"),
             self._eval("predicted_margins"),
             self.assessment.parameters.margin_unit,
         )
-        self.panel.show_text(f"unsafe: {cause}" if cause else "unsafe", note, rgb=UNSAFE_RGB)
 
     def _eval(self, port: str) -> np.ndarray:
         return self.loop.GetOutputPort(port).Eval(self.context)
@@ -199,25 +186,38 @@ class LiveSession(ABC):
         """Whether the robot has fallen."""
         return bool(self._eval("margins")[self._fall_column] < 0)
 
-    def _rightwards(self) -> np.ndarray:
-        """Direction to the right in the camera's view, in the world, (3,)."""
-        azimuth = self.loop.view.azimuth_rad
-        return np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-
-    def _place_panel(self) -> None:
-        x, y, _ = self._base()
-        beside = np.array([x, y, 0.0]) + 1.1 * self._size_m * self._rightwards()
-        self.panel.place(beside + [0.0, 0.0, 0.1 * self._size_m])
-
     def _aim_camera(self) -> None:
         view = self.loop.view
-        target = self._base() * [1.0, 1.0, 0.9] + 0.5 * self._size_m * self._rightwards()
         level, up = math.cos(view.elevation_rad), math.sin(view.elevation_rad)
         away = np.array(
             [level * math.cos(view.azimuth_rad), level * math.sin(view.azimuth_rad), up]
         )
-        self.meshcat.SetCameraPose(target + 1.9 * self._size_m * away, target)
-        self._place_panel()
+        for path in _OWN:
+            self.meshcat.SetProperty(path, "visible", False)
+        self._draw_grid()
+        self.meshcat.SetCameraPose(_DISTANCE * self._size_m * away, np.zeros(3))
+
+    def _draw_grid(self) -> None:
+        """Draws a round grid a little above the ground, by which one sees the robot move."""
+        # In pieces: some browsers do not draw a line that begins behind the camera.
+        n = _NUM_CELLS
+        x, y = (part.ravel() for part in np.mgrid[-n : n + 1.0, -n : n + 0.0])
+        is_near = np.hypot(x, np.maximum(np.abs(y), np.abs(y + 1.0))) <= n
+        x, y, z = x[is_near], y[is_near], np.full(is_near.sum(), 0.004 / _CELL_M)
+        starts = np.hstack([[x, y, z], [y, x, z]])
+        ends = np.hstack([[x, y + 1.0, z], [y + 1.0, x, z]])
+        self.meshcat.SetLineSegments(
+            _GRID, _CELL_M * starts, _CELL_M * ends, 1.0, Rgba(0.65, 0.67, 0.7)
+        )
+
+    def _follow(self) -> None:
+        """Moves the world so that the robot stays in the picture, from wherever a viewer looks."""
+        self._target = self._target + _FOLLOWED * (self._base()[:2] - self._target)
+        self.meshcat.SetTransform(_WORLD, RigidTransform([*-self._target, -self._height_m]))
+        # The ground has no end: its disc and whole cells of its grid stay below the robot.
+        cells = _CELL_M * np.round(self._target / _CELL_M)
+        self.meshcat.SetTransform(_GROUND, RigidTransform([*self._target, 0.0]))
+        self.meshcat.SetTransform(_GRID, RigidTransform([*cells, 0.0]))
 
 
 class LiveThrows(LiveSession):
@@ -241,22 +241,21 @@ class LiveThrows(LiveSession):
 
         self._note, self._note_until_s = "", 0.0
         self._lies_until_s = math.inf
-        self._add_button(self.THROW, "Space")
-        self._add_button(self.STAND, "KeyR")
-        self._add_slider(self.MASS, 1.0, 5.0, 0.5, 3.0)
-        self._add_slider(self.SPEED, 1.0, 11.0, 0.5, 8.0)
-        self._add_slider(self.DIRECTION, -180.0, 180.0, 15.0, -75.0)
+        self.panel.add_button(self.THROW, "Space")
+        self.panel.add_button(self.STAND, "KeyR")
+        self.panel.add_slider(self.MASS, 1.0, 5.0, 0.5, 3.0)
+        self.panel.add_slider(self.SPEED, 1.0, 11.0, 0.5, 8.0)
+        self.panel.add_slider(self.DIRECTION, -180.0, 180.0, 15.0, -75.0)
         self._stand()
 
     def tick(self) -> bool:
         """Throws a ball if the button was clicked, advances, and shows Γ, belief and verdict."""
         now = self.context.get_time()
-        if self._is_clicked(self.STAND) or now >= self._lies_until_s:
+        if self.panel.take_click(self.STAND) or now >= self._lies_until_s:
             self._stand()
-        if self._is_clicked(self.THROW):
+        if self.panel.take_click(self.THROW):
             self._throw()
         self._advance()
-        self._place_panel()
         self._show_status()
         return True
 
@@ -266,7 +265,7 @@ class LiveThrows(LiveSession):
         self._begin()
 
     def _throw(self) -> None:
-        mass, speed, direction = map(self._slider, (self.MASS, self.SPEED, self.DIRECTION))
+        mass, speed, direction = map(self.panel.value, (self.MASS, self.SPEED, self.DIRECTION))
         throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
         try:
             self._thrown.throw_ball(self.context, throw, _FLIGHT_S)
@@ -280,13 +279,13 @@ class LiveThrows(LiveSession):
         note = self._note if now < self._note_until_s else "Space throws a ball"
         if self.has_fallen:
             self._lies_until_s = min(self._lies_until_s, now + _LYING_S)
-            self.panel.show_text("fell", note, rgb=UNSAFE_RGB)
+            self.panel.show("fallen", note=note, tone="unsafe")
         elif self._has_recovery and self._eval("recovery_active")[0] > 0:
-            self.panel.show_text("Γ fell: recovery steps", note, rgb=RECOVERY_RGB)
+            self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
         elif self.probability >= self.threshold:
-            self.panel.show_text("safe: balancing", note, rgb=SAFE_RGB)
+            self.panel.show("safe: balancing", note=note, tone="safe")
         else:
-            self._show_unsafe(note)
+            self.panel.show("unsafe: balancing", cause=self._cause(), note=note, tone="unsafe")
 
 
 class LiveGoals(LiveSession):
@@ -302,7 +301,7 @@ class LiveGoals(LiveSession):
 
     ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
     AXES = ("x [m]", "y [m]", "z [m]")
-    _TARGET, _NEAREST = "/target", "/nearest_accepted"
+    _TARGET, _NEAREST = f"{_WORLD}/target", f"{_WORLD}/nearest_accepted"
 
     def __init__(
         self,
@@ -327,21 +326,21 @@ class LiveGoals(LiveSession):
             (self.FORCE, ""),
             (self.STAND, "KeyR"),
         ):
-            self._add_button(name, key)
+            self.panel.add_button(name, key)
         for name, low, high, value in zip(self.AXES, *box.tolist(), start, strict=True):
-            self._add_slider(name, low, high, 0.01, value)
+            self.panel.add_slider(name, low, high, 0.01, value)
         radius_m = 0.03 * self._size_m
-        meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*INK_RGB, 0.8))
-        meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*SAFE_RGB, 0.8))
+        meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*COLOURS["plain"], 0.8))
+        meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*COLOURS["safe"], 0.8))
         self._goal = np.full(3, np.nan)
         self._stand()
 
     def tick(self) -> bool:
         """Assesses a target that was moved, starts a motion if requested, and shows the verdict."""
-        goal = np.array([self._slider(name) for name in self.AXES])
-        is_asked = self._is_clicked(self.ASK)
-        is_to_go, is_forced = self._is_clicked(self.GO), self._is_clicked(self.FORCE)
-        if self._is_clicked(self.STAND):
+        goal = np.array([self.panel.value(name) for name in self.AXES])
+        is_asked = self.panel.take_click(self.ASK)
+        is_to_go, is_forced = self.panel.take_click(self.GO), self.panel.take_click(self.FORCE)
+        if self.panel.take_click(self.STAND):
             self._stand()
         if is_asked or is_to_go or is_forced or not np.array_equal(goal, self._goal):
             verdict = self._assess(goal, is_thorough=is_asked or is_to_go)
@@ -392,41 +391,40 @@ class LiveGoals(LiveSession):
 
     def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
         if verdict.is_accepted:
-            self.panel.show_text(
-                f"accepted: Γ {verdict.safety_probability:.2f}", "Space goes there", rgb=SAFE_RGB
+            self.panel.show(
+                f"accepted: Γ {verdict.safety_probability:.2f}",
+                note="Space goes there",
+                tone="safe",
             )
             return
         first = f"refused: Γ {verdict.safety_probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
         cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))
-        second = f"expected: {cause}" if cause else verdict.reason
+        note = "" if cause else verdict.reason
         if is_thorough:
-            if self.nearest is None:
-                second += "; nothing near is accepted"
-            else:
+            found = "nothing near is accepted"
+            if self.nearest is not None:
                 distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
-                second += f"; accepted {100 * distance_m:.0f} cm away"
+                found = f"accepted {100 * distance_m:.0f} cm away"
                 self.meshcat.SetTransform(self._NEAREST, RigidTransform(self.nearest.goal))
                 self.meshcat.SetProperty(self._NEAREST, "visible", True)
-        self.panel.show_text(first, second, rgb=UNSAFE_RGB)
+            note = f"{note}; {found}" if note else found
+        self.panel.show(first, cause=cause, note=note, tone="unsafe")
 
     def _show_motion(self) -> None:
         margins = self._eval("margins")
         if self.has_fallen:
             self._end_s = min(self._end_s, self.context.get_time() + _LYING_S)
-            self.panel.show_text("fell", "R stands it up again", rgb=UNSAFE_RGB)
+            self.panel.show("fallen", note="R stands it up again", tone="unsafe")
         elif margins.min() < 0:
             name = self.loop.constraint_names[int(np.argmin(margins))]
-            self.panel.show_text(
-                f"left the safe set: {name}", "R stands it up again", rgb=UNSAFE_RGB
+            self.panel.show(
+                "left the safe set", cause=name, note="R stands it up again", tone="unsafe"
             )
-            return
-        else:
+        elif self.context.get_time() >= self._end_s - 1e-9:
             miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
-            if self.context.get_time() >= self._end_s - 1e-9:
-                self.panel.show_text("there", f"{100 * miss_m:.1f} cm off", rgb=RECOVERY_RGB)
-            else:
-                self.panel.show_text(
-                    "on the way", f"the {self._goals.hand} hand reaches", rgb=SAFE_RGB
-                )
+            self.panel.show("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")
+        else:
+            note = f"the {self._goals.hand} hand reaches"
+            self.panel.show("on the way", note=note, tone="safe")

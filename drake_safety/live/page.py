@@ -1,0 +1,197 @@
+"""The page of a live session: Meshcat's scene, and beside it Γ, belief, state and controls."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from typing import Any
+
+from nicegui import app, ui
+from nicegui.server import Server
+
+from drake_safety.live.panel import COLOURS, HISTORY_S, LivePanel
+
+_PERIOD_S = 0.1  # Between updates of a page.
+_FAREWELL_S = 1.0  # From the end of a session to that of its page, so that the page shows it.
+_WITHIN_S = 20.0  # For the server to start, and to stop.
+_BELIEF = {"safe": "safe", "unsafe": "unsafe", "unknown": "don't know"}
+_KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
+
+
+@contextlib.contextmanager
+def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> Iterator[None]:
+    """Serves the page in a thread; one page in a process.
+
+    Args:
+        panel: What is shown and controlled, by all viewers alike.
+        host: Address that serves the page.
+        port: Its port.
+        scene_port: Port of Meshcat, at the same address.
+
+    Raises:
+        ValueError: The server does not start.
+    """
+    options: dict[str, Any] = {
+        "root": lambda: build_page(panel, scene_port),
+        "title": panel.title,
+        "host": host,
+        "port": port,
+        "show": False,
+        "reload": False,
+        "tailwind": False,
+        "binding_refresh_interval": None,
+        "reconnect_timeout": 10.0,
+        "show_welcome_message": False,
+        "timeout_graceful_shutdown": 1,
+    }
+    thread = threading.Thread(target=ui.run, kwargs=options, name="page", daemon=True)
+    thread.start()
+    end = time.monotonic() + _WITHIN_S
+    while not (app.is_started and Server.instance.started):
+        if not thread.is_alive() or time.monotonic() > end:
+            raise ValueError(f"no page can be served at {host}:{port}")
+        time.sleep(0.02)
+    try:
+        yield
+    finally:
+        panel.stop()
+        time.sleep(_FAREWELL_S)
+        app.shutdown()
+        thread.join(_WITHIN_S)
+
+
+def build_page(panel: LivePanel, scene_port: int) -> None:
+    """Builds the page of a viewer.
+
+    Args:
+        panel: What is shown and controlled.
+        scene_port: Port of Meshcat, at the host that the viewer asked for the page.
+    """
+    here = files("drake_safety.live")
+    tones = " ".join(f"--{name}: {_css(name)};" for name in COLOURS)
+    ui.colors(primary=_css("safe"))
+    ui.add_css(f":root {{ {tones} }}\n{here.joinpath('page.css').read_text('utf-8')}")
+    ui.add_head_html(f"<script>{here.joinpath('page.js').read_text('utf-8')}</script>")
+    page_url = ui.context.client.request.base_url
+    scene_url = page_url.replace(port=scene_port, query="reconnect_ms=-1")
+    with ui.element().classes("scene"):
+        ui.element("iframe").props(f'src="{scene_url}" title="scene"')
+        with ui.element().classes("veil"):
+            ui.label("stopped").classes("told")
+            ui.label("disconnected").classes("lost")
+    with ui.element().classes("panel"):
+        ui.timer(_PERIOD_S, _build_readings(panel))
+        ui.timer(_PERIOD_S, _build_controls(panel))
+
+
+def _build_readings(panel: LivePanel) -> Callable[[], None]:
+    """Builds what is shown: text, Γ, belief and its curve; returns what shows the present ones."""
+    with ui.element().classes("status") as box:
+        with ui.element().classes("line"):
+            state = ui.label().classes("state told")
+            ui.label("disconnected").classes("state lost")
+            gamma = ui.label().classes("gamma told")
+        cause = ui.label().classes("told")
+        note = ui.label().classes("told")
+        ui.label("The server of this page does not answer.").classes("lost")
+    with ui.element().classes("bar"):
+        parts = [ui.element().style(f"background: var(--{key})") for key in _BELIEF]
+    with ui.element().classes("line"):
+        shares = [ui.label().classes("share").style(f"--colour: var(--{key})") for key in _BELIEF]
+    chart = ui.echart(_chart_options(panel.threshold)).classes("chart")
+    body = ui.query("body")  # Now: when the session ends, a browser may be too late to load it.
+
+    def update() -> None:
+        # What does not differ is not sent.
+        status = panel.status
+        state.set_text(status.state)
+        is_known = math.isfinite(panel.probability) and not panel.is_stopped
+        gamma.set_text(f"Γ {panel.probability:.2f}" if is_known else "")
+        cause.set_text(f"expected: {status.cause}" if status.cause else "")
+        note.set_text(status.note)
+        box.style(f"background: var(--{status.tone})")
+        for part, label, share, name in zip(
+            parts, shares, panel.belief, _BELIEF.values(), strict=True
+        ):
+            part.style(f"flex: {share:.2f}")
+            label.set_text(f"{name} {share:.0%}")
+        series, curve = chart.options["series"][0], panel.curve()
+        if curve != series["data"]:
+            series["data"] = curve
+            chart.update()
+        if panel.is_stopped:
+            body.classes("stopped")
+
+    update()
+    return update
+
+
+def _build_controls(panel: LivePanel) -> Callable[[], None]:
+    """Builds sliders and buttons, and returns what shows where other viewers moved the sliders."""
+    numbers = {}
+    with ui.element().classes("sliders"):
+        for name, slider in panel.sliders.items():
+            ui.label(name)
+            moved = ui.slider(min=slider.low, max=slider.high, step=slider.step)
+            moved.on_value_change(lambda event, name=name: panel.set_value(name, event.value))
+            numbers[name] = moved, ui.label().classes("number")
+    with ui.element().classes("buttons"):
+        # The first one, added by every session, ends it.
+        stop, *others = panel.buttons
+        for name in (*others, stop):
+            key = panel.buttons[name]
+            button = ui.button(name, on_click=lambda name=name: panel.click(name))
+            with button.props(f'no-caps unelevated data-key="{key}"'):
+                ui.label(_KEYS.get(key, key.removeprefix("Key"))).classes("key")
+
+    def update() -> None:
+        for name, (slider, number) in numbers.items():
+            slider.set_value(panel.value(name))
+            number.set_text(f"{panel.value(name):g}")
+
+    update()
+    return update
+
+
+def _chart_options(threshold: float) -> dict[str, Any]:
+    line = {"yAxis": threshold, "name": f"threshold {threshold:.2f}"}
+    return {
+        "animation": False,
+        "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
+        "title": {
+            "text": "Γ over time [s]",
+            "textStyle": {"fontSize": 13, "fontWeight": "normal"},
+            "left": 0,
+            "padding": 0,
+        },
+        "xAxis": {"type": "value", "min": -HISTORY_S, "max": 0, "splitLine": {"show": False}},
+        "yAxis": {"type": "value", "min": 0, "max": 1, "interval": 0.5},
+        "series": [
+            {
+                "type": "line",
+                "showSymbol": False,
+                "silent": True,
+                "lineStyle": {"color": _css("safe"), "width": 2.5},
+                "data": [],
+                "markLine": {
+                    "silent": True,
+                    "symbol": "none",
+                    "data": [line],
+                    "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
+                    "label": {
+                        "formatter": "{b}",
+                        "position": f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}",
+                        "color": _css("unsafe"),
+                    },
+                },
+            }
+        ],
+    }
+
+
+def _css(name: str) -> str:
+    return "#" + "".join(f"{round(255 * level):02x}" for level in COLOURS[name])

@@ -1,0 +1,182 @@
+"""The page of a live session: its model, two viewers of NiceGUI's own, and a session that ends."""
+
+import asyncio
+import math
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+
+from drake_safety.live.panel import HISTORY_S, LivePanel
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+WITHIN_S = 120
+
+
+@pytest.fixture
+def panel():
+    panel = LivePanel(title="a robot", threshold=0.3)
+    panel.add_button("Stop", "Escape")
+    panel.add_button("Throw", "Space")
+    panel.add_slider("mass [kg]", 1.0, 5.0, 0.5, 3.0)
+    panel.show("safe: balancing", note="a remark", tone="safe")
+    panel.show_gamma(0.75, np.array([0.7, 0.1, 0.2]), 0.0)
+    return panel
+
+
+def test_a_click_counts_once_whoever_clicked(panel):
+    panel.click("Throw")
+    panel.click("Throw")
+    assert not panel.take_click("Stop")
+    assert panel.take_click("Throw")
+    assert not panel.take_click("Throw")
+
+
+@pytest.mark.parametrize("sent", [-1.0, math.nan, math.inf, 1e308, None, "2", [2.0]])
+def test_what_a_page_sends_stays_within_the_range_of_its_slider(panel, sent):
+    panel.set_value("mass [kg]", sent)
+    assert 1.0 <= panel.value("mass [kg]") <= 5.0
+    panel.set_value("mass [kg]", 2)
+    assert panel.value("mass [kg]") == 2.0
+
+
+def test_the_curve_is_bounded_and_ends_now(panel):
+    for time_s in np.arange(1, 1000) * 0.04:
+        panel.show_gamma(1.5, np.full(3, np.nan), time_s)
+    curve = panel.curve()
+    assert curve[-1] == (0.0, 1.0)
+    assert -HISTORY_S <= curve[0][0] < -HISTORY_S + 0.05
+    assert len(curve) <= HISTORY_S / 0.04 + 2
+    assert panel.belief == (0.0, 0.0, 1.0)
+    panel.clear_history()
+    assert panel.curve() == []
+
+
+def test_a_session_that_ended_is_stopped(panel):
+    panel.stop()
+    assert panel.is_stopped
+    assert panel.status.state == "stopped"
+
+
+def test_two_viewers_see_and_control_the_same(panel, recwarn):
+    testing = pytest.importorskip("nicegui.testing")
+    from nicegui import ui
+
+    from drake_safety.live.page import build_page
+
+    async def view():
+        async with testing.user_simulation(lambda: build_page(panel, 7001)) as first:
+            second = testing.User(first.http_client)
+            for user in (first, second):
+                await user.open("/")
+                for text in ("safe: balancing", "Γ 0.75", "a remark", "unsafe 10%"):
+                    await user.should_see(text)
+            first.find(kind=ui.slider).elements.pop().set_value(4.0)
+            await second.should_see("4")
+            second.find("Throw").click()
+            await asyncio.sleep(0.1)
+            assert panel.take_click("Throw")
+            panel.stop()
+            for user in (first, second):
+                await user.should_see("The simulation has ended.")
+                await user.should_not_see("Γ 0.75")
+
+    asyncio.run(view())
+
+
+def free_port():
+    """A port that is free, as is the next one."""
+    for port in range(7400, 7600, 2):
+        try:
+            for one in (port, port + 1):
+                socket.create_server(("127.0.0.1", one)).close()
+        except OSError:
+            continue
+        return port
+    raise OSError("no free port")
+
+
+@pytest.fixture
+def playing():
+    """A command that plays, and the address of its page."""
+    pytest.importorskip("nicegui")
+    port = free_port()
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from drake_safety.cli import main; main()"
+    )
+    line = [sys.executable, "-u", "-c", code, "play", "laikago_balancing", "--port", str(port)]
+    # NiceGUI serves otherwise in a test.
+    environment = {key: text for key, text in os.environ.items() if "PYTEST" not in key}
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=environment)
+    told = ""
+    while "live at" not in told:
+        read = process.stdout.readline()
+        assert read, told
+        told += read
+    yield process, re.search(r"http://\S+", told[told.index("live at") :])[0]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
+    process, address = playing
+    with urllib.request.urlopen(address, timeout=WITHIN_S) as answer:
+        page = answer.read().decode()
+    assert "laikago_balancing" in page
+    hosts = set(re.findall(r"(?:src|href|url)[=(]\W{0,2}(https?://[^/\"'\\]+)", page))
+    assert hosts <= {address, f"{address[:-4]}{int(address[-4:]) + 1}"}
+    process.send_signal(number)
+    told, _ = process.communicate(timeout=WITHIN_S)
+    assert process.returncode == 0
+    assert "real-time factor" in told
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=f"no browser on the path: none of {NAMES}")
+@pytest.mark.parametrize(
+    ("number", "state"), [(signal.SIGTERM, "stopped"), (signal.SIGKILL, "disconnected")]
+)
+def test_a_browser_shows_a_throw_and_the_end(playing, number, state):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    process, address = playing
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        pages = [
+            browser.new_page(viewport={"width": width, "height": 844}) for width in (1280, 390)
+        ]
+        for page in pages:
+            page.set_default_timeout(1000 * WITHIN_S)
+            # The scene costs a browser without a graphics card all of the processor.
+            page.route("**/*reconnect_ms*", lambda route: route.abort())
+            page.goto(address)
+            page.locator(".chart canvas").wait_for()
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            scene, panel = (page.locator(name).bounding_box() for name in (".scene", ".panel"))
+            assert scene["y"] + scene["height"] <= panel["y"] + 1 or (
+                scene["x"] + scene["width"] <= panel["x"] + 1
+            )
+        told, end = False, time.monotonic() + WITHIN_S
+        while not told and time.monotonic() < end:
+            pages[0].keyboard.press("Space")  # Without effect until the page is connected.
+            pages[0].wait_for_timeout(500)
+            told = all(page.get_by_text("ball of 3 kg at 8 m/s").is_visible() for page in pages)
+        assert told
+        process.send_signal(number)
+        for page in pages:
+            page.locator(f".status :text-is('{state}')").locator("visible=true").wait_for()
+            time.sleep(1.0)
+            assert page.locator(".state:visible").inner_text() == state
+        browser.close()
