@@ -136,7 +136,7 @@ def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
     move(goals, NEAR)
     assert not goals.tick()
     assert goals.verdict.is_accepted
-    assert goals.panel.status.state == f"accepted: Γ {goals.verdict.safety_probability:.2f}"
+    assert goals.panel.status.state == f"accepted: Γ {goals.verdict.calibrated:.2f}"
     move(goals, FAR)
     assert not goals.tick()
     assert not goals.verdict.is_accepted

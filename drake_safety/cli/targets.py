@@ -135,12 +135,12 @@ def print_verdict(
     if verdict.reason:
         lines["verdict"] = f"{verdict.verdict}: {verdict.reason}"
     else:
-        sign = "<" if verdict.safety_probability < verdict.threshold else "≥"
+        sign = "<" if verdict.calibrated < verdict.threshold else "≥"
         lines["verdict"] = (
-            f"{verdict.verdict}: {GAMMA[CALIBRATED]} {verdict.safety_probability:.3f} {sign} "
+            f"{verdict.verdict}: {GAMMA[CALIBRATED]} {verdict.calibrated:.3f} {sign} "
             f"threshold {verdict.threshold:.3f}"
         )
-    if np.isfinite(verdict.safety_probability):
+    if np.isfinite(verdict.calibrated):
         safe, unsafe, unknown = verdict.belief.tolist()
         known = safe + unsafe
         lines["belief"] = (
@@ -150,7 +150,7 @@ def print_verdict(
         )
     if not verdict.is_accepted:
         lines |= _refusal(loop, words, verdict, nearest)
-    if nearest is not None or np.isfinite(verdict.safety_probability):
+    if nearest is not None or np.isfinite(verdict.calibrated):
         lines["threshold"] = f"{verdict.threshold:.3f} of {GAMMA[CALIBRATED]}, {origin}"
     for name, text in lines.items():
         console.print(f"{name:<16}  {text}", highlight=False, soft_wrap=True)
@@ -177,6 +177,6 @@ def _refusal(
     else:
         lines["nearest accepted"] = (
             f"{words.value(nearest.goal)}, {words.distance(nearest.goal - verdict.goal)} away, "
-            f"{GAMMA[CALIBRATED]} {nearest.safety_probability:.3f}"
+            f"{GAMMA[CALIBRATED]} {nearest.calibrated:.3f}"
         )
     return lines

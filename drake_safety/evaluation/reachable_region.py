@@ -35,7 +35,7 @@ class ReachableRegion:
     Attributes:
         x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
-        safety_probability: Calibrated Γ there, (n_z, n_y); NaN for "don't know".
+        calibrated: Calibrated Γ there, (n_z, n_y); NaN for "don't know".
         threshold: Lowest calibrated Γ of an accepted target.
         is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
             (n_z, n_y); empty for a task without a hand.
@@ -49,7 +49,7 @@ class ReachableRegion:
     x_m: float
     y_m: np.ndarray
     z_m: np.ndarray
-    safety_probability: np.ndarray
+    calibrated: np.ndarray
     threshold: float
     is_reachable: dict[str, np.ndarray]
     obstacle_y_m: np.ndarray
@@ -67,7 +67,7 @@ class ReachableRegion:
             of a grid are not a random sample: the intervals only indicate their number.
         """
         is_safe = self.outcomes == SAFE
-        verdicts = {"sharpened": self.safety_probability >= self.threshold, **self.is_reachable}
+        verdicts = {"sharpened": self.calibrated >= self.threshold, **self.is_reachable}
         estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
@@ -146,7 +146,7 @@ def reachable_region(
         x_m=x_m,
         y_m=fine[0],
         z_m=fine[1],
-        safety_probability=np.concatenate(probability).reshape(shape),
+        calibrated=np.concatenate(probability).reshape(shape),
         threshold=threshold,
         is_reachable={name: np.concatenate(one).reshape(shape) for name, one in reachable.items()},
         obstacle_y_m=edge[0],

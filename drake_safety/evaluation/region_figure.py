@@ -60,7 +60,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 alpha=0.28,
             )
             handles.append(Patch(color=INK, alpha=0.28, label="inside an obstacle"))
-        is_unknown = np.isnan(region.safety_probability)
+        is_unknown = np.isnan(region.calibrated)
         if is_unknown.any():
             axes.contourf(
                 region.y_m,
@@ -77,7 +77,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
         # A white edge separates the line from the areas below.
         for colour, width in (("white", 5.0), (UNSAFE_COLOUR, 2.4)):
             axes.contour(
-                *_closed(region.y_m, region.z_m, np.nan_to_num(region.safety_probability)),
+                *_closed(region.y_m, region.z_m, np.nan_to_num(region.calibrated)),
                 levels=[region.threshold],
                 colors=[colour],
                 linewidths=width,

@@ -102,7 +102,7 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         parts = [ui.element().style(f"background: var(--{key})") for key in _BELIEF]
     with ui.element().classes("line"):
         shares = [ui.label().classes("share").style(f"--colour: var(--{key})") for key in _BELIEF]
-    chart = ui.echart(_chart_options(panel.threshold)).classes("chart")
+    chart = ui.echart(_chart_options(panel.quantity, panel.threshold)).classes("chart")
     body = ui.query("body")  # Now: when the session ends, a browser may be too late to load it.
 
     def update() -> None:
@@ -157,13 +157,13 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
     return update
 
 
-def _chart_options(threshold: float) -> dict[str, Any]:
+def _chart_options(quantity: str, threshold: float) -> dict[str, Any]:
     line = {"yAxis": threshold, "name": f"threshold {threshold:.2f}"}
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
         "title": {
-            "text": "Γ over time [s]",
+            "text": f"{quantity} over time [s]",
             "textStyle": {"fontSize": 13, "fontWeight": "normal"},
             "left": 0,
             "padding": 0,

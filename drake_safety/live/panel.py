@@ -63,7 +63,8 @@ class LivePanel:
 
     Args:
         title: Title of the page.
-        threshold: Γ at which the threshold line is drawn.
+        quantity: What messages call the Γ shown.
+        threshold: Its value at which the threshold line is drawn.
 
     Attributes:
         status: The text shown.
@@ -74,8 +75,9 @@ class LivePanel:
         is_stopped: Whether the session has ended.
     """
 
-    def __init__(self, *, title: str, threshold: float):
+    def __init__(self, *, title: str, quantity: str, threshold: float):
         self.title = title
+        self.quantity = quantity
         self.threshold = threshold
         self.status = Status()
         self.probability = math.nan

@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
+from drake_safety.learning.quantities import gamma_of_port
 from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
@@ -101,7 +102,11 @@ class LiveSession(ABC):
         contacts = loop.kinematics.contact_positions(q)
         self._size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
         self._height_m = 0.7 * float(q[6])
-        self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
+        self.panel = LivePanel(
+            title=loop.scenario.name,
+            quantity=gamma_of_port(self.probability_port),
+            threshold=threshold,
+        )
         self.panel.add_button(STOP, "Escape")
         self._aim_camera()
 
@@ -234,9 +239,9 @@ class LiveThrows(LiveSession):
     MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
 
     def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
-        super().__init__(loop, meshcat, threshold=threshold, seed=seed)
         self._thrown = require(loop, HasBall)
         self.probability_port = self._thrown.trigger_port
+        super().__init__(loop, meshcat, threshold=threshold, seed=seed)
         self._has_recovery = loop.HasOutputPort("recovery_active")
 
         self._note, self._note_until_s = "", 0.0
@@ -301,6 +306,7 @@ class LiveGoals(LiveSession):
 
     ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
     AXES = ("x [m]", "y [m]", "z [m]")
+    probability_port = "calibrated_safety_probability"
     _TARGET, _NEAREST = f"{_WORLD}/target", f"{_WORLD}/nearest_accepted"
 
     def __init__(
@@ -373,7 +379,7 @@ class LiveGoals(LiveSession):
                 rng=np.random.default_rng(self._seed),
                 num_candidates=_NUM_CANDIDATES,
             )
-        self._show_gamma(verdict.safety_probability, verdict.belief)
+        self._show_gamma(verdict.calibrated, verdict.belief)
         self._show_verdict(verdict, is_thorough=is_thorough)
         return verdict
 
@@ -392,12 +398,12 @@ class LiveGoals(LiveSession):
     def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
         if verdict.is_accepted:
             self.panel.show(
-                f"accepted: Γ {verdict.safety_probability:.2f}",
+                f"accepted: Γ {verdict.calibrated:.2f}",
                 note="Space goes there",
                 tone="safe",
             )
             return
-        first = f"refused: Γ {verdict.safety_probability:.2f}"
+        first = f"refused: Γ {verdict.calibrated:.2f}"
         if verdict.reason:
             first = "refused: don't know"
         cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))

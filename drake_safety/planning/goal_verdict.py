@@ -26,7 +26,7 @@ class GoalVerdict:
         goal: The goal in the world, (3,) [m].
         verdict: "safe", "unsafe" or "don't know".
         belief: (safe, unsafe, don't know), (3,); its first entry is literal Γ.
-        safety_probability: Calibrated Γ; NaN where it was not evaluated, because the goal is
+        calibrated: Calibrated Γ; NaN where it was not evaluated, because the goal is
             outside the region sampled in training.
         threshold: Lowest calibrated Γ of a safe goal.
         constraint_names: The n_c constraints, the possible causes.
@@ -40,7 +40,7 @@ class GoalVerdict:
     goal: np.ndarray
     verdict: str
     belief: np.ndarray
-    safety_probability: float
+    calibrated: float
     threshold: float
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
@@ -79,7 +79,7 @@ class GoalVerdict:
             "reason": self.reason,
             "belief": dict(zip(("safe", "unsafe", "unknown"), self.belief.tolist(), strict=True)),
             "quantity": CALIBRATED,
-            "safety_probability": _finite(self.safety_probability),
+            "calibrated": _finite(self.calibrated),
             "threshold": self.threshold,
             "cause": self.cause or None,
             "cause_probability": dict(by_name),
@@ -126,7 +126,7 @@ def assess_goal(
         goal=goal,
         verdict=UNKNOWN,
         belief=np.array(EMPTY, dtype=float),
-        safety_probability=math.nan,
+        calibrated=math.nan,
         threshold=threshold,
         constraint_names=names,
         cause_probability=np.zeros(len(names)),
@@ -188,7 +188,7 @@ def assess_goals(
                 goal=np.array(goal, dtype=float),
                 verdict=verdict,
                 belief=prediction.belief[i],
-                safety_probability=probability,
+                calibrated=probability,
                 threshold=threshold,
                 constraint_names=tuple(loop.constraint_names),
                 cause_probability=prediction.cause_probability[i],

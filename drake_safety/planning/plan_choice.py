@@ -22,18 +22,18 @@ class PlanChoice:
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        safety_probability: Calibrated Γ of each candidate, (M,).
+        calibrated: Calibrated Γ of each candidate, (M,).
         threshold: Lowest calibrated Γ of an accepted plan.
     """
 
     index: int
-    safety_probability: np.ndarray
+    calibrated: np.ndarray
     threshold: float
 
     @property
     def is_accepted(self) -> bool:
         """Whether calibrated Γ of the chosen plan reaches the threshold."""
-        return bool(self.safety_probability[self.index] >= self.threshold)
+        return bool(self.calibrated[self.index] >= self.threshold)
 
 
 def plan_inputs(
@@ -91,4 +91,4 @@ def choose_plan(
     prediction = assessment.predict(state, preview, features if assessment.uses_features else None)
     best = int(np.argmax(prediction.calibrated))  # The first of equals: the present plan, if any.
     offering.set_plan(context, plans[best])
-    return PlanChoice(index=best, safety_probability=prediction.calibrated, threshold=threshold)
+    return PlanChoice(index=best, calibrated=prediction.calibrated, threshold=threshold)
