@@ -182,9 +182,8 @@ def test_a_base_whose_shape_is_a_mesh_collides_as_its_box(tmp_path):
 
 @pytest.fixture
 def bare(tmp_path):
-    """A URDF two of whose links collide by meshes that Drake does not read."""
+    """A URDF two of whose links collide by meshes that do not exist."""
     shape = '<collision><geometry><mesh filename="femur.stl"/></geometry></collision></link>'
-    stl(tmp_path / "femur.stl", [[0, 0, 0], [0.1, 0.02, 0.02], [0.1, 0.0, 0.0]])
 
     def changed(text):
         for name in ("femur_0", "femur_1"):
