@@ -1,4 +1,4 @@
-"""`new` fits shapes to collision meshes that Drake does not read: a robot that stands on its feet."""
+"""`new` fits shapes to collision meshes that Drake does not read: the robot stands on its feet."""
 
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -85,9 +85,9 @@ def test_where_a_primitive_would_touch_the_hull_is_taken_and_what_still_does_is_
     survey = Survey(written.files[0])
     survey.set_joints(written.posture)
     assert survey.overlaps() == set()
-    assert "collisions of the overlapping links" in (
-        written.folder / "README.md"
-    ).read_text().lower()
+    assert (
+        "collisions of the overlapping links" in (written.folder / "README.md").read_text().lower()
+    )
 
 
 def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of,
 
 _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
@@ -105,6 +106,18 @@ def _mend_inertias(copy: UrdfCopy) -> None:
             copy.notes.append(
                 f"link '{link.get('name')}' has an impossible inertia; its products of inertia are "
                 "set to zero"
+            )
+        elif 0 < principal[0] and principal[2] > (1 + 1e-6) * (principal[0] + principal[1]):
+            # The moments of any body satisfy the triangle inequality.
+            values, axes = np.linalg.eigh(moments)
+            values[2] = 0.999 * (values[0] + values[1])  # Digits are rounded.
+            changed = axes @ np.diag(values) @ axes.T
+            rows, columns = np.triu_indices(3)
+            for key, value in zip(_MOMENTS, changed[rows, columns], strict=True):
+                inertia.set(key, f"{value:.9g}")
+            copy.notes.append(
+                f"link '{link.get('name')}' has an impossible inertia; its largest moment is "
+                "reduced to the sum of the others"
             )
 
 

@@ -7,7 +7,8 @@ from pydrake.math import RotationMatrix
 
 from drake_safety.robots.urdf_survey import Limb, Survey
 
-_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Hip height / leg length.
+# Hip height / leg length.
+_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4, 0.95)
 _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
 _TOLERANCE_M = 1e-3
 _CENTRAL = 0.5  # Share of the feet's polygon, from its centre, in which the centre of mass is.
