@@ -72,6 +72,7 @@ class CartPole(ClosedLoop):
     """The whole task."""
 
     Parameters = CartPoleParameters
+    angular_constraints = ("tilt",)
 
     def __init__(self, scenario, variation="nominal", *, assessment=None, meshcat=None):
         super().__init__(scenario, variation, assessment)

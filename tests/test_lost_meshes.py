@@ -3,6 +3,7 @@
 import sys
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
@@ -10,6 +11,8 @@ from typer.testing import CliRunner
 from drake_safety.cli import app
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.robots.urdf_survey import Survey
+from drake_safety.simulation.rollouts import run_episode
+from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import write_hexapod
 
@@ -113,3 +116,19 @@ def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path, is_l
         assert "capsules" in text or picture.stat().st_size > 10_000
     else:
         assert "--picture draws a legged robot" in str(result.exception or result.output)
+
+
+def test_mujoco_takes_the_fitted_hulls_too(tmp_path):
+    pytest.importorskip("mujoco")
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    tip = trimesh.creation.cone(radius=0.02, height=0.1)
+    tip.apply_translation([0.02, 0.0, 0.0])
+    urdf = shaped(tmp_path, femur_0=trimesh.util.concatenate([ball, tip]))
+    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
+    assert written.fitted == {"hull": 1}
+    file = written.files[-1]
+    text = file.read_text()
+    file.write_text(text.replace("  nominal:", "  in_mujoco: {engine: mujoco}\n  nominal:", 1))
+    loop = load_scenario(file).make_loop("in_mujoco", ball=False)
+    episode = run_episode(loop, 0, seed=0)
+    assert np.isfinite(episode.margins).all()

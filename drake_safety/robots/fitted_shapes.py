@@ -78,7 +78,7 @@ def fitted_shape(
         X_LS=RigidTransform(),
         sizes={},
         excess=small.volume / hull.volume - 1,
-        obj=small.export(file_type="obj", include_normals=False, header=None),
+        obj=str(small.export(file_type="obj", include_normals=False, header=None)),
     )
 
 
