@@ -20,12 +20,12 @@ class GlidingParameters:
     speed_m_s: float = 2.0
     """Largest speed at the start."""
     failure: str = ""
-    """How the simulation fails beyond x = 0.5: "raise", "nan", "inf", "bug" or not at all."""
+    """How it fails beyond x = 0.5: "raise", "nan", "inf", "1e13", "bug" or not at all."""
     fails_at_start: bool = False
     """Whether it fails before the first row already."""
 
     def __post_init__(self) -> None:
-        if self.failure not in ("", "raise", "nan", "inf", "bug"):
+        if self.failure not in ("", "raise", "nan", "inf", "1e13", "bug"):
             raise ValueError(f"gliding: unknown failure '{self.failure}'")
 
 

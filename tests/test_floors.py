@@ -40,7 +40,7 @@ EXTRAS = {
     "logs": "drake_safety/logs/",
     "mujoco": "drake_safety/plants/mujoco",
     "report": "drake_safety/evaluation/report/page",
-    "robots": "drake_safety/robots/mesh_cache",
+    "robots": "drake_safety/robots/",
     "walking": "drake_safety/control/policy_network.py",
 }
 ONLY_IN = {

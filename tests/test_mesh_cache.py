@@ -6,7 +6,14 @@ import sys
 import numpy as np
 import pytest
 
-from drake_safety.robots.mesh_cache import cache_folder, has_own_colours, is_shown, shown_mesh
+from drake_safety.robots.mesh_cache import (
+    cache_folder,
+    has_own_colours,
+    is_shown,
+    mesh_box,
+    mesh_points,
+    shown_mesh,
+)
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -40,6 +47,27 @@ def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert cache_folder() == tmp_path / ".cache" / "drake_safety"
+
+
+@pytest.mark.parametrize(
+    ("asset", "extents"),
+    [
+        ("<up_axis>Z_UP</up_axis>", [1.0, 2.0, 4.0]),
+        ("<up_axis>Y_UP</up_axis>", [1.0, 4.0, 2.0]),
+        ("", [1.0, 4.0, 2.0]),  # COLLADA's default is y.
+        ('<unit meter="0.01"/><up_axis>Z_UP</up_axis>', [0.01, 0.02, 0.04]),
+    ],
+)
+def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
+    path = tmp_path / "tower.dae"
+    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
+    text = path.read_text()
+    own = "<up_axis>Y_UP</up_axis>"
+    assert own in text
+    path.write_text(text.replace(own, asset))
+    low, high = mesh_box(path)
+    assert high - low == pytest.approx(extents)
+    assert np.ptp(mesh_points(path), axis=0) == pytest.approx(extents)
 
 
 def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):

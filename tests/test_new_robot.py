@@ -37,6 +37,14 @@ def problems(scenario, **options):
     return {f.item: f for f in check_scenario(scenario, **options) if not f.is_ok}
 
 
+def stated_values(remedy):
+    """The entries that a remedy says to write."""
+    entries = re.search(
+        r"(?:write|such as|try under 'start':) (.*?)(?: \[rad| \[N|; if|$)", remedy
+    )[1]
+    return yaml.safe_load("{" + entries + "}")
+
+
 def test_what_new_writes_passes_its_check_as_it_is(spider):
     assert problems(spider.folder / "balancing.yaml", num_episodes=4) == {}
 
@@ -182,9 +190,8 @@ def test_a_base_whose_shape_is_a_mesh_collides_as_its_box(tmp_path):
 
 @pytest.fixture
 def bare(tmp_path):
-    """A URDF two of whose links collide by meshes that Drake does not read."""
+    """A URDF two of whose links collide by meshes that do not exist."""
     shape = '<collision><geometry><mesh filename="femur.stl"/></geometry></collision></link>'
-    stl(tmp_path / "femur.stl", [[0, 0, 0], [0.1, 0.02, 0.02], [0.1, 0.0, 0.0]])
 
     def changed(text):
         for name in ("femur_0", "femur_1"):
@@ -292,7 +299,7 @@ def test_starts_without_danger_are_told_to_be_widened(own):
     scenario = yaml.safe_load((own / "balancing.yaml").read_text())
     calm = {
         "base_offset_m": [0.0, 0.0],
-        "velocity_std_m_s": [0.0, 0.0, 0.0],
+        "velocity_std_m_s": [0.01, 0.01, 0.01],
         "target_offset_m": [0.0, 0.0],
         "tilt_rad": 0.0,
         "angular_velocity_std_rad_s": 0.0,
@@ -303,6 +310,7 @@ def test_starts_without_danger_are_told_to_be_widened(own):
     found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
     assert found.message.startswith("0 % of 2 episodes")
     assert "widen the ranges" in found.remedy
+    assert stated_values(found.remedy) == {"velocity_std_m_s": [0.015, 0.015, 0.015]}
 
 
 def test_a_scenario_that_is_no_yaml_or_does_not_exist_is_a_finding(tmp_path):
@@ -334,3 +342,30 @@ def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_mend_it(own)
     edited(own / "robot.yaml", base="trunk")
     result = CliRunner().invoke(app, ["check", str(own / "balancing.yaml"), "--episodes", "0"])
     assert result.exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "item", "key"),
+    [
+        ({"posture": {"knee_0": 9.0, "lift_0": -0.4}}, "joint stops", "posture"),
+        ({"effort_limits": {}}, "motors", "effort_limits"),
+        (
+            {"joint_gains": {".*": {"stiffness": 0.05, "damping": 0.05}}},
+            "stands for 1 s",
+            "joint_gains",
+        ),
+    ],
+)
+def test_the_values_of_a_remedy_are_keys_of_robot_yaml_and_mend_it(own, change, item, key):
+    edited(own / "robot.yaml", **change)
+    found = problems(own / "balancing.yaml")[item]
+    assert f"'{key}'" in found.remedy
+    values = stated_values(found.remedy)
+    robot = yaml.safe_load((own / "robot.yaml").read_text())
+    for _ in range(12):  # Gains are doubled at each check.
+        edited(own / "robot.yaml", **{key: robot[key] | values})
+        left = problems(own / "balancing.yaml").get(item)
+        if left is None:
+            return
+        values = stated_values(left.remedy)
+    raise AssertionError(left.message)

@@ -178,7 +178,7 @@ def test_a_row_is_read_before_the_step_that_begins_at_it_whatever_the_rounding()
         assert simulator.get_context().get_discrete_state_vector()[0] == 40 * row
 
 
-@pytest.mark.parametrize("failure", ["raise", "nan", "inf"])
+@pytest.mark.parametrize("failure", ["raise", "nan", "inf", "1e13"])
 def test_a_diverged_simulation_is_recorded_as_such_and_the_run_goes_on(failure):
     episodes = run_episodes(gliding(failure=failure), 20, num_workers=1)
     sound = run_episodes(gliding(), 20, num_workers=1)
@@ -189,7 +189,7 @@ def test_a_diverged_simulation_is_recorded_as_such_and_the_run_goes_on(failure):
         assert not episode.is_safe
         assert 0 <= episode.first_step < len(episode.time_s)
         for name in ARRAYS:
-            assert np.isfinite(getattr(episode, name)).all()
+            assert (np.abs(getattr(episode, name)) < 1e12).all()
     for episode, other in zip(episodes, sound, strict=True):
         reached = (other.true_state[:, 0] > 0.5).any()
         assert (episode.cause == DIVERGED) == reached

@@ -150,6 +150,44 @@ def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
     assert [record.getMessage() for record in caplog.records] == []
 
 
+def test_inertias_beyond_the_triangle_inequality_are_mended_and_drake_takes_them(tmp_path, caplog):
+    odd = '<inertia ixx="0.001" iyy="0.001" izz="0.007" ixy="0.0005" ixz="0" iyz="0"/>'
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
+    assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
+    copy.write(tmp_path / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    assert [record.getMessage() for record in caplog.records] == []
+
+
+def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path, caplog):
+    motor = (
+        "<transmission><type>{}</type>"
+        '<joint name="{}"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>'
+        '<actuator name="m_{}"><mechanicalReduction>160</mechanicalReduction></actuator>'
+        "</transmission>"
+    )
+    joint = '<joint name="{}" type="{}"><parent link="a"/><child link="{}"/>{}</joint>'
+    limit = '<limit effort="5" velocity="2" lower="-1" upper="1"/>'
+    copy = simulatable_copy(
+        written(
+            tmp_path,
+            *(LINK.format(name, GOOD, "") for name in "abc"),
+            joint.format("j", "revolute", "b", limit),
+            joint.format("k", "fixed", "c", ""),
+            motor.format("transmission_interface/SimpleTransmission", "j", "j"),
+            motor.format("transmission_interface/SimpleTransmission", "k", "k"),
+            motor.format("transmission_interface/DifferentialTransmission", "j", "d"),
+        )
+    )
+    assert [one.get("name") for one in copy.root.iter("actuator")] == ["m_j"]
+    copy.write(tmp_path / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    assert plant.num_actuators() == 1
+    assert [record.getMessage() for record in caplog.records] == []
+
+
 def test_a_material_of_two_colours_becomes_two(tmp_path):
     black = '<material name="black"><color rgba="0 0 0 {}"/></material>'
     box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'

@@ -1,5 +1,7 @@
 """Survey and standing posture: legs, arms and feet are found, and the robot can stand on them."""
 
+import xml.etree.ElementTree as ElementTree
+
 import numpy as np
 import pytest
 import yaml
@@ -72,6 +74,36 @@ def test_the_posture_of_a_robot_of_the_package_is_near_the_published_one():
     for name, value in posture.items():
         published = {"hip": 0.0, "thigh": 0.67, "calf": -1.3}[name.split("_")[1]]
         assert value == pytest.approx(published, abs=0.2)
+
+
+def test_a_joint_that_cannot_be_at_zero_is_off_its_stop(tmp_path):
+    write_porter(tmp_path)
+    urdf = tmp_path / "porter.urdf"
+    root = ElementTree.parse(urdf).getroot()
+    stops = root.find("joint[@name='left_elbow']/limit")
+    stops.set("lower", "0.3")
+    stops.set("upper", "1.9")
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    survey = Survey(urdf)
+    assert survey.posture()["left_elbow"] == pytest.approx(0.35)
+    assert solve_standing_posture(survey, survey.legs())["left_elbow"] == pytest.approx(0.35)
+
+
+def test_feet_are_put_under_a_centre_of_mass_that_is_not_over_them(tmp_path):
+    write_biped(tmp_path)
+    urdf = tmp_path / "biped.urdf"
+    survey = Survey(urdf)
+    root = ElementTree.parse(urdf).getroot()
+    origin = root.find(f"link[@name='{survey.base}']/inertial/origin")
+    x, y, z = map(float, origin.get("xyz").split())
+    origin.set("xyz", f"{x + 0.15} {y} {z}")
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    survey = Survey(urdf)
+    legs = survey.legs()
+    solve_standing_posture(survey, legs)
+    points = np.concatenate([survey.positions(leg) for leg in legs])
+    assert points[:, 0].min() < survey.center_of_mass()[0] < points[:, 0].max()
+    assert np.ptp(points[:, 2]) < 2e-3
 
 
 def test_feet_can_be_named_and_a_wrong_name_is_answered_with_those_that_exist(tmp_path):

@@ -106,12 +106,22 @@ def new(
     )
     for path in files:
         print_path("wrote", path)
+    if written.fitted:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(written.fitted.items()))
+        console.print(
+            f"fitted {sum(written.fitted.values())} shapes in place of collision meshes that Drake "
+            f"does not read: {kinds}. Look at them: drake-safety check {written.files[-1]} "
+            "--picture FILE",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
     for what in written.left_out:
         console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     if written.bare:
         console.print(
             f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
-            "missing or no OBJ, glTF or VTK: everything passes through "
+            "missing or cannot be read: everything passes through "
             f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
             style="bold red",
             highlight=False,
@@ -132,6 +142,13 @@ def check(
         bool, typer.Option("--quick", help="Leave these episodes out, as by --episodes 0.")
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="Draw the standing robot beside its collision shapes, as FILE.png and FILE.svg.",
+            dir_okay=False,
+        ),
+    ] = None,
     import_: Annotated[
         bool,
         typer.Option(
@@ -147,6 +164,8 @@ def check(
     """
     from drake_safety.simulation.scenario_check import check_scenario
 
+    if picture is not None and not import_:
+        raise ValueError("check: --picture needs the task, which --no-import does not import")
     num_problems = 0
     with open_stages() as stages:
         for finding in check_scenario(
@@ -162,6 +181,8 @@ def check(
             if finding.remedy:
                 text.append(f"\n         mend: {finding.remedy}")
             console.print(text, highlight=False, soft_wrap=True)
+    if picture is not None:
+        _draw(scenario, picture)
     if num_problems:
         console.print(f"{num_problems} problems", style="red", highlight=False)
         raise typer.Exit(1)
@@ -174,3 +195,23 @@ def check(
         console.print("ready: drake-safety train", scenario, "--out FOLDER", highlight=False)
     else:
         console.print("its files are right; its code was not run", highlight=False)
+
+
+def _draw(scenario: str, picture: Path) -> None:
+    """Draws a robot beside its collision shapes.
+
+    Raises:
+        ValueError: The scenario has no legged robot, or its diagram cannot be built.
+    """
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.robot_figure import robot_figure
+    from drake_safety.simulation.legged_loop import LeggedLoop
+    from drake_safety.simulation.scenario import load_scenario
+
+    loop = load_scenario(scenario).make_loop()
+    if not isinstance(loop, LeggedLoop):
+        raise ValueError(
+            f"check: --picture draws a legged robot; task '{type(loop).__name__}' has none"
+        )
+    for path in save(robot_figure(loop), picture):
+        print_path("picture", path)

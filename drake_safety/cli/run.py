@@ -17,6 +17,7 @@ from drake_safety.cli.console import (
     cause_words,
     print_shipped,
 )
+from drake_safety.cli.free_run import run_episode_alone
 from drake_safety.cli.run_settings import (
     LOG_PERIOD_S,
     Recording,
@@ -87,7 +88,8 @@ def run(
     duration: Annotated[
         float | None,
         typer.Option(
-            help="Seconds to simulate; by default 5, or with a target one more than an episode.",
+            help="Seconds to simulate; by default 5 with balls, one more than an episode with a "
+            "target, and otherwise an episode.",
             min=0.1,
         ),
     ] = None,
@@ -149,8 +151,12 @@ def run(
             f"run: task '{type(loop).__name__}' needs a {words.goal}: pass --{words.goal} "
             f"{' '.join(words.axes)}, or one of the names {list(loop.named_targets)}"
         )
-    require(loop, HasBall, "run")
-    _run_with_balls(settings)
+    if isinstance(loop, HasBall):
+        _run_with_balls(settings)
+        return
+    if settings.pushes:
+        require(loop, HasBall, "run: --push")
+    run_episode_alone(settings, goal_threshold(learned.path, settings.assessment))
 
 
 def _run_with_balls(settings: RunSettings) -> None:

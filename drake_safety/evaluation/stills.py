@@ -25,6 +25,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import CameraInfo
 
 from drake_safety.models import load_robot
@@ -96,7 +97,7 @@ class StillCamera:
             RigidTransform(),
         )
         self._camera = ColorRenderCamera(core)
-        scene_graph = _scene_graph(loop)
+        scene_graph = scene_graph_of(loop)
         scene_graph.AddRenderer(
             scene_graph.GetMyMutableContextFromRoot(self._context),
             _RENDERER,
@@ -129,6 +130,11 @@ class StillCamera:
         rows, columns = pixels.shape[0] // _SUPERSAMPLING, pixels.shape[1] // _SUPERSAMPLING
         blocks = pixels.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    @property
+    def context(self) -> Context:
+        """The root Context that is rendered."""
+        return self._context
 
     def _pose(self, positions: np.ndarray) -> None:
         positions = np.asarray(positions, dtype=float)
@@ -288,7 +294,12 @@ def render_stills(
     return [(float(time_s[row]), camera.render(positions[row])) for row in rows]
 
 
-def _scene_graph(loop: LeggedLoop) -> SceneGraph:
+def scene_graph_of(loop: LeggedLoop) -> SceneGraph:
+    """Returns the SceneGraph of a closed loop.
+
+    Raises:
+        ValueError: It has none.
+    """
     for system in loop.GetSystems():
         if isinstance(system, SceneGraph):
             return system

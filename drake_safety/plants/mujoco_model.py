@@ -11,6 +11,7 @@ import numpy as np
 from pydrake.geometry import (
     Box,
     Capsule,
+    Convex,
     Cylinder,
     Ellipsoid,
     GeometryId,
@@ -35,6 +36,7 @@ _SHAPES = {
     Capsule: ("mjGEOM_CAPSULE", lambda shape: [shape.radius(), 0.5 * shape.length(), 0.0]),
     Cylinder: ("mjGEOM_CYLINDER", lambda shape: [shape.radius(), 0.5 * shape.length(), 0.0]),
     Ellipsoid: ("mjGEOM_ELLIPSOID", lambda shape: [shape.a(), shape.b(), shape.c()]),
+    Convex: ("mjGEOM_MESH", lambda _: np.zeros(3)),
     HalfSpace: ("mjGEOM_PLANE", lambda _: [0.0, 0.0, 1.0]),
 }
 """MuJoCo's type and sizes of Drake's shapes."""
@@ -196,6 +198,11 @@ def _add_geometries(
                 quat=X_BG.rotation().ToQuaternion().wxyz(),
             )
             geom.friction[0] = friction
+            if isinstance(shape, Convex):
+                hull = inspector.GetConvexHull(geometry)
+                corners = [hull.vertex(i) for i in range(hull.num_vertices())]
+                geom.meshname = f"hull {inspector.GetName(geometry)}"
+                spec.add_mesh(name=geom.meshname, uservert=np.concatenate(corners))
     for (one, ours), (other, theirs) in itertools.combinations(touchable, 2):
         filtered = [inspector.CollisionFiltered(a, b) for a in ours for b in theirs]
         pair = names[one.index()], names[other.index()]

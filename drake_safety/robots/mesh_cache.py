@@ -23,7 +23,9 @@ CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
 """Environment variable with the cache's folder."""
 _TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
 _GREY = [0.6, 0.6, 0.6, 1.0]
-_VERSION = b"3"  # Version of the conversion, part of the cache's keys.
+_UP_AXIS = re.compile(r"<up_axis>\s*(\w+)")  # In a COLLADA file.
+_X_ZY = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # From y up to z up.
+_VERSION = b"4"  # Version of the conversion, part of the cache's keys.
 
 
 def cache_folder() -> Path:
@@ -119,6 +121,19 @@ def mesh_box(path: Path) -> np.ndarray:
     return np.array(_scene(path).bounds, dtype=float)
 
 
+def mesh_points(path: Path) -> np.ndarray:
+    """Returns the vertices of a mesh, (n, 3), in the mesh's units.
+
+    Args:
+        path: The mesh.
+
+    Raises:
+        MissingExtraError: The packages that read it are not installed.
+        ValueError: The file cannot be read, or is empty.
+    """
+    return np.array(_scene(path).to_mesh().vertices, dtype=float)
+
+
 def _scene(path: Path) -> trimesh.Scene:
     try:
         import trimesh
@@ -127,7 +142,7 @@ def _scene(path: Path) -> trimesh.Scene:
             import collada  # noqa: F401  # trimesh reads this format through it.
     except ImportError as error:
         raise MissingExtraError(
-            f"mesh '{path}': Drake does not render {path.suffix} files, and '{error.name}', which "
+            f"mesh '{path}': Drake does not read {path.suffix} files, and '{error.name}', which "
             "converts them, is not installed: pip install 'drake_safety[robots]'"
         ) from error
     try:
@@ -136,7 +151,18 @@ def _scene(path: Path) -> trimesh.Scene:
         raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
     if scene.bounds is None:
         raise ValueError(f"mesh '{path}' is empty, or has no surface that trimesh can read")
+    if path.suffix.lower() == ".dae":
+        # COLLADA states its unit and its vertical axis; trimesh applies neither.
+        if scene.units not in (None, "meters"):
+            scene = scene.convert_units("meters")
+        if _up_axis(path) == "Y_UP":
+            scene.apply_transform(_X_ZY)
     return scene
+
+
+def _up_axis(path: Path) -> str:
+    found = _UP_AXIS.search(path.read_text("utf-8", "replace"))
+    return found.group(1) if found else "Y_UP"  # COLLADA's default.
 
 
 def _to_gltf(path: Path, rgba: str) -> bytes:
@@ -152,9 +178,7 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
                 )
             )
     # In glTF the y axis points up; Drake rotates it back to z.
-    X_YZ = np.eye(4)
-    X_YZ[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-    scene.apply_transform(X_YZ)
+    scene.apply_transform(_X_ZY.T)
     (content,) = trimesh.exchange.gltf.export_gltf(
         scene, merge_buffers=True, embed_buffers=True
     ).values()

@@ -6,12 +6,14 @@ import math
 import re
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from drake_safety.robots.lost_meshes import replace_lost_meshes
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
@@ -34,6 +36,7 @@ class NewRobot:
         files: The files in it.
         asked: Values that the URDF lacks and the user must supply.
         left_out: Visuals of the URDF that the copy lacks, with the reasons.
+        fitted: Number of shapes by kind that replace collision meshes.
         bare: Links whose collision meshes the copy lacks, and that have no other shape.
         sizes: Sizes of the standing robot.
         joints: Its joints, in the order of its positions.
@@ -44,6 +47,7 @@ class NewRobot:
     files: list[Path]
     asked: list[str]
     left_out: list[str]
+    fitted: dict[str, int]
     bare: list[str]
     sizes: Sizes
     joints: list[str]
@@ -111,6 +115,7 @@ def write_robot(
         files=files,
         asked=found.asked,
         left_out=found.copy.left_out,
+        fitted=dict(Counter(one.kind for shapes in found.copy.fitted.values() for one in shapes)),
         bare=found.copy.bare_links(),
         sizes=found.sizes,
         joints=[joint.name() for joint in found.survey.joints],
@@ -146,15 +151,16 @@ def _survey(
         copy.fix_joints(idle)
         copy.write(scratch)
         survey = Survey(scratch)
+    posture = solve_standing_posture(survey, legs)
+    survey = replace_lost_meshes(copy, survey, legs, posture, scratch)
     # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
     if is_base_bare and any([copy.restore_boxes(link) for link in survey.welded(survey.base)]):
         is_base_bare = False
         copy.write(scratch)
         survey = Survey(scratch)
-    posture = solve_standing_posture(survey, legs)
-    overlaps = survey.overlaps()
-    copy.ignore_collisions(overlaps)
+        survey.set_joints(posture)
+    copy.ignore_collisions(survey.overlaps())
     found = _Findings(
         name=name,
         copy=copy,

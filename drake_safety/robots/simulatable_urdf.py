@@ -12,10 +12,11 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
 from drake_safety.robots.model_files import MissingExtraError, model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
+from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
@@ -38,6 +39,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
         for element in [part for part in joint if part.tag in _IGNORED]:
             joint.remove(element)
     copy.free_fixed_joints()
+    _drop_transmissions(copy)
     _drop_friction(copy)
     _mend_inertias(copy)
     _tell_materials_apart(copy)
@@ -50,6 +52,21 @@ def simulatable_copy(path: Path) -> UrdfCopy:
                 visual = ET.SubElement(link, "visual")
                 visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
     return copy
+
+
+def _drop_transmissions(copy: UrdfCopy) -> None:
+    """Removes transmissions that Drake ignores with a warning, and their reductions."""
+    fixed = {joint.get("name") for joint in copy.root.findall("joint[@type='fixed']")}
+    for transmission in copy.root.findall("transmission"):
+        kind, joint = transmission.find("type"), transmission.find("joint")
+        name = "" if kind is None or kind.text is None else kind.text.strip()
+        is_simple = name.rpartition("/")[2] == "SimpleTransmission"
+        if not is_simple or (joint is not None and joint.get("name") in fixed):
+            copy.root.remove(transmission)
+            continue
+        for actuator in transmission.findall("actuator"):
+            for reduction in actuator.findall("mechanicalReduction"):
+                actuator.remove(reduction)
 
 
 def _drop_friction(copy: UrdfCopy) -> None:
@@ -89,6 +106,18 @@ def _mend_inertias(copy: UrdfCopy) -> None:
             copy.notes.append(
                 f"link '{link.get('name')}' has an impossible inertia; its products of inertia are "
                 "set to zero"
+            )
+        elif 0 < principal[0] and principal[2] > (1 + 1e-6) * (principal[0] + principal[1]):
+            # The moments of any body satisfy the triangle inequality.
+            values, axes = np.linalg.eigh(moments)
+            values[2] = 0.999 * (values[0] + values[1])  # Digits are rounded.
+            changed = axes @ np.diag(values) @ axes.T
+            rows, columns = np.triu_indices(3)
+            for key, value in zip(_MOMENTS, changed[rows, columns], strict=True):
+                inertia.set(key, f"{value:.9g}")
+            copy.notes.append(
+                f"link '{link.get('name')}' has an impossible inertia; its largest moment is "
+                "reduced to the sum of the others"
             )
 
 
@@ -176,12 +205,10 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
                 mesh.set("filename", _gather(copy, file, file.name))
                 continue
             link.remove(shape)
-            copy.lost_collisions.add(link.get("name", ""))
             lost.append(url if file is None else file.name)
-            box = None if file is None else _box(file)
-            if box is not None:
-                boxes = copy.lost_shapes.setdefault(link.get("name", ""), [])
-                boxes.append(_box_in_link(box, shape, mesh))
+            copy.lost_meshes.setdefault(link.get("name", ""), []).append(
+                _lost_mesh(file, shape, mesh)
+            )
     if lost:
         copy.notes.append(
             f"collision meshes that Drake cannot read, or that do not exist, are left out: "
@@ -203,13 +230,15 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _box_in_link(box: np.ndarray, shape: ET.Element, mesh: ET.Element) -> np.ndarray:
-    """Bounding box in the link's frame of a mesh's box, (2, 3) [m]."""
-    scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
+def _lost_mesh(file: Path | None, shape: ET.Element, mesh: ET.Element) -> LostMesh:
+    scale = np.array([float(value) for value in mesh.get("scale", "1 1 1").split()])
     origin = origin_of(shape)
     X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
-    corners = X_LM @ np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1)
-    return np.array([corners.min(axis=1), corners.max(axis=1)])
+    box = None if file is None else _box(file)
+    if box is not None:
+        corners = X_LM @ np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1)
+        box = np.array([corners.min(axis=1), corners.max(axis=1)])
+    return LostMesh(file=file, scale=scale, X_LM=X_LM, box=box)
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:

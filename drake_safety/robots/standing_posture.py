@@ -7,9 +7,12 @@ from pydrake.math import RotationMatrix
 
 from drake_safety.robots.urdf_survey import Limb, Survey
 
-_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4)  # Hip height / leg length.
+# Hip height / leg length.
+_SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4, 0.95)
 _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
 _TOLERANCE_M = 1e-3
+_CENTRAL = 0.5  # Share of the feet's polygon, from its centre, in which the centre of mass is.
+_NUM_SHIFTS = 3  # Of the feet under the centre of mass.
 _STOP_RAD = 0.05  # Distance of the posture from joint stops.
 _NUM_GUESSES = 10
 _ENOUGH = 5  # Number of solutions to choose from.
@@ -23,20 +26,40 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     the straight leg, and level if it has more than one contact point. The height of the hips is
     four fifths of a leg's length, or the nearest feasible share. Legs that spread at zero, as a
     spider's, keep half of their spread. Of several solutions for a leg, the one with small angles
-    and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used.
+    and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used. If the
+    centre of mass is then not amid the feet, all feet are moved under it.
 
     Args:
         survey: The robot.
         legs: Its legs.
 
     Returns:
-        Positions of the legs' joints by name [rad].
+        Positions of all joints by name [rad]; those of no leg are as near to zero as their stops
+        allow.
 
     Raises:
         ValueError: No posture is within the joints' stops.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
+    posture = _solved(survey, solvers)
+    for _ in range(_NUM_SHIFTS):
+        points = np.concatenate([survey.positions(leg) for leg in legs])[:, :2]
+        low, high = points.min(axis=0), points.max(axis=0)
+        offset = survey.center_of_mass()[:2] - (low + high) / 2
+        if np.all(np.abs(offset) <= _CENTRAL * (high - low) / 2 + _TOLERANCE_M):
+            break
+        for solver in solvers:
+            solver.target = solver.target + offset
+        try:
+            posture = _solved(survey, solvers)
+        except ValueError:  # The feet do not reach so far.
+            break
+    survey.set_joints(posture)
+    return posture
+
+
+def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
     is_spread = any(solver.is_spread for solver in solvers)
     reach: dict[str, float] = {}
     for share in _SPREAD_SHARES if is_spread else _SHARES:
@@ -50,7 +73,7 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
             solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
         else:
             survey.set_joints(solved)
-            return {name: round(value, 4) for name, value in solved.items()}
+            return {name: round(value, 4) for name, value in survey.posture().items()}
     raise ValueError(
         f"no standing posture found: the feet {list(reach)} cannot reach the ground under their "
         "hips within their joints' stops. Are these all feet (--feet)?"

@@ -11,11 +11,31 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
 
+from drake_safety.robots.fitted_shapes import FittedShape
 from drake_safety.robots.mesh_cache import has_own_colours, is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
 _DRAKE = "http://drake.mit.edu"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostMesh:
+    """A removed collision mesh.
+
+    Attributes:
+        file: The mesh; None if it does not exist.
+        scale: Factors on its coordinates, (3,).
+        X_LM: Its pose in the link's frame.
+        box: Box around it: lowest and highest corner in the link's frame, (2, 3) [m]; None if it
+            is not known.
+    """
+
+    file: Path | None
+    scale: np.ndarray
+    X_LM: RigidTransform
+    box: np.ndarray | None = None
 
 
 @dataclass(kw_only=True)
@@ -27,21 +47,22 @@ class UrdfCopy:
         root: The root element, which is edited.
         notes: Descriptions of the changes, one sentence each.
         left_out: Notes about visuals that were removed.
-        lost_shapes: Boxes around removed collision meshes by link: lowest and highest corner in the
-            link's frame, (2, 3) [m] each.
-        lost_collisions: Links with removed collision meshes, boxes or none known.
+        lost_meshes: Removed collision meshes by link.
+        fitted: Shapes in place of these meshes, by link.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
+        hulls: Convex hulls of the copy: name relative to the copy -> OBJ.
     """
 
     source: Path
     root: ET.Element
     notes: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_shapes: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    lost_collisions: set[str] = field(default_factory=set)
+    lost_meshes: dict[str, list[LostMesh]] = field(default_factory=dict)
+    fitted: dict[str, list[FittedShape]] = field(default_factory=dict)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
+    hulls: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._as_read = self.text()
@@ -59,12 +80,20 @@ class UrdfCopy:
         """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
 
+    @property
+    def lost_shapes(self) -> dict[str, list[np.ndarray]]:
+        """Boxes around removed collision meshes by link, (2, 3) [m] each."""
+        return {
+            link: [mesh.box for mesh in meshes if mesh.box is not None]
+            for link, meshes in self.lost_meshes.items()
+        }
+
     def bare_links(self) -> list[str]:
         """Returns the links whose collision meshes were removed and that have no other shape."""
         return [
             link.get("name", "")
             for link in self.root.findall("link")
-            if link.get("name") in self.lost_collisions and link.find("collision") is None
+            if link.get("name") in self.lost_meshes and link.find("collision") is None
         ]
 
     def effort_limits(self) -> dict[str, float]:
@@ -236,6 +265,31 @@ class UrdfCopy:
             )
         return bool(boxes)
 
+    def set_fitted(self, link_name: str, shapes: list[FittedShape]) -> None:
+        """Sets the shapes that replace a link's removed collision meshes; earlier ones are removed.
+
+        Args:
+            link_name: The link.
+            shapes: The shapes.
+        """
+        self.fitted[link_name] = shapes
+        link = self.link(link_name)
+        for collision in link.findall("collision"):
+            if collision.get("name", "").startswith(f"{link_name}_fitted_"):
+                link.remove(collision)
+        for index, shape in enumerate(shapes):
+            name = f"{link_name}_fitted_{index}"
+            geometry = _add_geometry(link, name, shape.X_LS)
+            if shape.kind == "hull":
+                file = f"meshes/{name}.obj"
+                self.hulls[file] = shape.obj
+                mesh = ET.SubElement(geometry, "mesh", filename=file)
+                ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
+                continue
+            sizes = {key: _numbers(np.atleast_1d(value)) for key, value in shape.sizes.items()}
+            tag = f"{{{_DRAKE}}}capsule" if shape.kind == "capsule" else shape.kind
+            ET.SubElement(geometry, tag, sizes)
+
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Filters collisions between pairs of links.
 
@@ -262,6 +316,10 @@ class UrdfCopy:
         tree = ET.ElementTree(self.root)
         ET.indent(tree)
         tree.write(path, encoding="utf-8", xml_declaration=True)
+        for name, text in self.hulls.items():
+            target = path.parent / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
         for name, mesh in self.meshes.items():
             target = path.parent / name
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -343,9 +401,14 @@ def _numbers(values: np.ndarray) -> str:
 def _add_collision(
     link: ET.Element, name: str, center: np.ndarray, shape: str, **sizes: str
 ) -> None:
+    ET.SubElement(_add_geometry(link, name, RigidTransform(center)), shape, sizes)
+
+
+def _add_geometry(link: ET.Element, name: str, X_LS: RigidTransform) -> ET.Element:
     collision = ET.SubElement(link, "collision", name=name)
-    ET.SubElement(collision, "origin", xyz=_numbers(center), rpy="0 0 0")
-    ET.SubElement(ET.SubElement(collision, "geometry"), shape, sizes)
+    turn = RollPitchYaw(X_LS.rotation()).vector()
+    ET.SubElement(collision, "origin", xyz=_numbers(X_LS.translation()), rpy=_numbers(turn))
+    return ET.SubElement(collision, "geometry")
 
 
 def origin_of(element: ET.Element) -> list[float]:

@@ -17,6 +17,7 @@ from drake_safety.robots.model_files import package_parser
 
 _CORNER_RADIUS_M = 0.005  # Radius of spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
+_STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 
 
@@ -94,7 +95,7 @@ class Survey:
         self._index = {joint.name(): joint.position_start() for joint in self.joints}
         self._neutral = plant.GetPositions(self.context)
         for name, (low, high) in self.limits.items():
-            self._neutral[self._index[name]] = min(max(0.0, low), high)
+            self._neutral[self._index[name]] = _near_zero(low, high)
         self._above = {joint.child_body().name(): joint for joint in joints}
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
@@ -105,6 +106,15 @@ class Survey:
         for name, value in values.items():
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
+
+    def posture(self) -> dict[str, float]:
+        """Returns the present joint positions by name [rad]."""
+        q = self.plant.GetPositions(self.context)
+        return {name: float(q[index]) for name, index in self._index.items()}
+
+    def center_of_mass(self) -> np.ndarray:
+        """Returns the centre of mass in the base's frame, (3,) [m]."""
+        return self.plant.CalcCenterOfMassPositionInWorld(self.context, [self.instance])
 
     def chain(self, body: str) -> list[str]:
         """Returns the joints that move a body, starting at the base."""
@@ -260,7 +270,9 @@ class Survey:
         if not shapes:
             return Limb(name=body, body=body, joints=joints)
         lows = [float(points[:, 2].min()) - radius for _, points, radius, _ in shapes]
-        name, points, radius, is_sphere = shapes[int(np.argmin(lows))]
+        # A sphere of the URDF's rather than what is hardly lower, such as the shank at its height.
+        is_own = [_LEVEL_M if sphere else 0.0 for _, _, _, sphere in shapes]
+        name, points, radius, is_sphere = shapes[int(np.argmin(np.subtract(lows, is_own)))]
         if is_sphere:
             points = np.concatenate(
                 [
@@ -313,12 +325,21 @@ class Survey:
         return found
 
 
+def _near_zero(low: float, high: float) -> float:
+    """The position nearest to zero that is not beyond a stop, nor at one unless zero is."""
+    if low <= 0.0 <= high:
+        return 0.0
+    room = min(_STOP_RAD, 0.1 * (high - low))
+    return low + room if low > 0.0 else high - room
+
+
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
     """Spheres that replace a box: at its corners, or one below a small box."""
-    if np.sort(half)[:2].max() < 0.035 and np.linalg.norm(half) < 0.12:
+    down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]
+    axis = int(np.argmax(np.abs(down)))
+    # A sole that is longer is flat.
+    if np.delete(half, axis).max() < 0.035 and np.linalg.norm(half) < 0.12:
         radius = float(np.sort(half)[0])
-        down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]
-        axis = int(np.argmax(np.abs(down)))
         point = np.zeros(3)
         point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
         return (X_WG @ point)[None], radius

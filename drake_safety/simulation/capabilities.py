@@ -342,7 +342,7 @@ def remove_visuals(loop: object, context: Context) -> None:
 
 def angular_constraints(loop: object) -> tuple[str, ...]:
     """Constraints of a loop whose margins are angles [rad]; the others are lengths [m]."""
-    return loop.angular_constraints if isinstance(loop, PlannedLoop) else ()
+    return tuple(getattr(loop, "angular_constraints", ()))
 
 
 def monitor_period_s(loop: ClosedLoop) -> float:

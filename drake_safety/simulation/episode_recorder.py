@@ -21,6 +21,8 @@ from drake_safety.learning.segments import (
     EpisodeError,
 )
 
+LARGEST = 1e12
+"""Any quantity in SI units is smaller; a larger one means that the simulation diverged."""
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -165,11 +167,11 @@ def record_episode(
     arrays.setdefault("true_state", arrays["state"])
     arrays.setdefault("desired_output", arrays["desired_preview"][:, : arrays["output"].shape[1]])
     arrays.setdefault("features", np.empty((len(arrays["time_s"]), 0)))
-    is_finite = np.all([np.isfinite(arrays[name]).all(axis=1) for name in RECORDED], axis=0)
+    is_finite = np.all([(np.abs(arrays[name]) < LARGEST).all(axis=1) for name in RECORDED], axis=0)
     if is_diverged or not is_finite.all():
         num_rows = len(is_finite) if is_finite.all() else int(np.argmin(is_finite))
         if num_rows == 0:
-            wrong = [name for name in RECORDED if not np.isfinite(arrays[name][0]).all()]
+            wrong = [name for name in RECORDED if not (np.abs(arrays[name][0]) < LARGEST).all()]
             raise EpisodeError(f"{who}: ports {wrong} are not finite at the start")
         cause = DIVERGED
         arrays = {name: rows[:num_rows] for name, rows in arrays.items()}

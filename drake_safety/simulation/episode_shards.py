@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.learning.segments import DIVERGED, Episode, EpisodesInfo
+from drake_safety.simulation.episode_recorder import LARGEST
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 _FAILURES = "num_controller_failures"
-_LARGEST = 1e12  # Of any quantity in SI units.
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 
 
@@ -94,10 +94,10 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
             raise ValueError(f"{shard}: the time of episode {episode[first]} does not increase")
         if arrays["cause"][first] != DIVERGED:
             for name in ("time_s", *widths):
-                if not (np.abs(arrays[name][rows]) < _LARGEST).all():
+                if not (np.abs(arrays[name][rows]) < LARGEST).all():
                     raise ValueError(
                         f"{shard}: {name} of episode {episode[first]} holds values that are not "
-                        f"finite numbers below {_LARGEST:g}"
+                        f"finite numbers below {LARGEST:g}"
                     )
         result.append(
             Episode(

@@ -23,6 +23,12 @@ from drake_safety.simulation.capabilities import HasBall, HasOwnFiles
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.remedies import (
+    effort_limits,
+    scaled_gains,
+    scaled_start,
+    within_stops,
+)
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
@@ -177,7 +183,11 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
     beyond = (kinematics.posture < low) | (kinematics.posture > high)
     if beyond.any():
         names = [name for name, wrong in zip(kinematics.joint_names, beyond, strict=True) if wrong]
-        yield failed("joint stops", f"the posture is beyond those of {names}", "change 'posture'")
+        yield failed(
+            "joint stops",
+            f"the posture is beyond those of {names}",
+            within_stops(kinematics, names),
+        )
     p_WC = kinematics.contact_positions(q)
     heights = p_WC[:, 2] - kinematics.foot_radii
     if np.ptp(heights) > _LEVEL_M:
@@ -233,7 +243,7 @@ def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
         yield failed(
             "motors",
             f"joints {without} have none",
-            "give them an effort limit [N·m] under 'effort_limits' in robot.yaml",
+            effort_limits(kinematics, without),
         )
     else:
         yield passed("motors", f"one on each of {len(limits)} joints")
@@ -242,7 +252,7 @@ def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
         yield failed(
             "effort limits",
             f"the motors of joints {unlimited} have none, so that no load is too heavy",
-            "give them one [N·m] under 'effort_limits' in robot.yaml",
+            effort_limits(kinematics, unlimited),
         )
     if robot.joint_gains:
         loose = [
@@ -362,8 +372,10 @@ def _stands(loop: LeggedLoop) -> Iterator[Finding]:
         yield failed(
             "safe while it stands",
             f"the standing posture violates {wrong}",
-            "scale 'safe_set' to the robot: its heights [m] must include the standing height "
-            f"{kinematics.standing_height:.3f}",
+            "for 'height' widen 'height_m' under 'safe_set', such as "
+            f"[{0.71 * kinematics.standing_height:.3g}, {1.18 * kinematics.standing_height:.3g}] "
+            f"[m], which must include the standing height {kinematics.standing_height:.3f}; for "
+            "others change 'posture'",
         )
     else:
         yield passed("safe while it stands", "the posture is in the safe set")
@@ -382,8 +394,8 @@ def _stands(loop: LeggedLoop) -> Iterator[Finding]:
         yield failed(
             _STANDS,
             message,
-            "raise 'joint_gains' [N·m/rad] if it sinks, lower them if it trembles; look for shapes "
-            "that overlap",
+            f"if it sinks, raise {scaled_gains(loop.robot.joint_gains, 2.0)}; if it trembles, "
+            "halve them; look for shapes that overlap by `check --picture FILE`",
         )
     else:
         yield passed(_STANDS, message)
@@ -392,7 +404,7 @@ def _stands(loop: LeggedLoop) -> Iterator[Finding]:
 def _episodes(
     loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress
 ) -> Iterator[Finding]:
-    episodes = []
+    episodes, parameters = [], loop.scenario.parameters
     for index in range(num_episodes):
         report("episodes", index, num_episodes)
         episodes.append(run_episode(loop, index, seed=seed))
@@ -407,7 +419,7 @@ def _episodes(
         yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
-            "narrow the ranges under 'start', or widen 'safe_set'",
+            "narrow the ranges under 'start', or widen 'safe_set'" + scaled_start(parameters, 0.5),
         )
     if causes.pop(DIVERGED, 0):
         yield failed(
@@ -425,6 +437,8 @@ def _episodes(
             "share of unsafe episodes",
             message,
             "widen the ranges of start and plan, or narrow 'safe_set': Γ learns from both kinds"
+            + scaled_start(parameters, 1.5)
             if share < low
-            else "narrow the ranges of start and plan, or widen 'safe_set': Γ learns from both",
+            else "narrow the ranges of start and plan, or widen 'safe_set': Γ learns from both"
+            + scaled_start(parameters, 0.5),
         )

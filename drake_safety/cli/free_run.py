@@ -1,0 +1,101 @@
+"""``drake-safety run`` for a task without goals and balls: an episode with Γ."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.cli.console import cause_words
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, events_table
+from drake_safety.learning.quantities import CALIBRATED, GAMMA, PORTS
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from drake_safety.cli.training_folder import GoalThreshold
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.simulation.closed_loop import ClosedLoop
+    from drake_safety.simulation.free_motion import FreeMotion
+
+_GAMMA = PORTS[CALIBRATED]
+_PORTS = (_GAMMA, "belief", "cause_probability", "predicted_margins")
+
+
+def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
+    """Simulates an episode of any task, and writes recording, timeline and events.
+
+    Args:
+        settings: Settings of the run.
+        rule: Thresholds on Γ.
+
+    Raises:
+        ValueError: The task exports a port of the assessor under another name, or not at all.
+    """
+    from drake_safety.evaluation.timeline_figure import timeline_figure
+    from drake_safety.simulation.capabilities import angular_constraints
+    from drake_safety.simulation.free_motion import run_free
+
+    if settings.is_animated:
+        raise ValueError(
+            "run: --animation needs a task with a robot on legs; see recording.html for others"
+        )
+    recording = Recording(settings)
+    loop = settings.make_loop(recording.viewer)
+    recording.start()
+    duration_s = settings.duration_s
+    motion = run_free(
+        loop,
+        seed=settings.seed,
+        duration_s=settings.scenario.episode_duration_s if duration_s is None else duration_s,
+        log_period_s=LOG_PERIOD_S,
+        ports=_PORTS,
+        realtime_rate=settings.realtime_rate,
+    )
+    gamma = motion.extra[_GAMMA][:, 0]
+    row = _first_below(gamma, rule.threshold)
+    timeline = timeline_figure(
+        motion.time_s,
+        gamma,
+        rule.threshold,
+        quantity=GAMMA[CALIBRATED],
+        trigger_times_s=[] if row is None else [float(motion.time_s[row])],
+        trigger_label="Γ falls",
+        leave_time_s=motion.leave_time_s,
+        belief=motion.extra["belief"],
+        margins=motion.margins,
+        constraint_names=loop.constraint_names,
+        angular_constraints=angular_constraints(loop),
+    )
+    recording.save(
+        {"timeline": timeline},
+        _table_of_events(loop, settings.assessment, motion, row),
+        f"{rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.remark}",
+    )
+
+
+def _first_below(gamma: np.ndarray, threshold: float) -> int | None:
+    """First row with Γ below the threshold; None for never."""
+    is_below = ~(gamma >= threshold)
+    return int(np.argmax(is_below)) if is_below.any() else None
+
+
+def _table_of_events(
+    loop: ClosedLoop, assessment: SafetyAssessment, motion: FreeMotion, row: int | None
+) -> Table:
+    events = [(0.0, "the episode starts")]
+    if row is not None:
+        expected = cause_words(
+            loop,
+            assessment,
+            motion.extra["cause_probability"][row],
+            motion.extra["predicted_margins"][row],
+        )
+        told = f"Γ below the threshold; expected violation: {expected}"
+        events.append((float(motion.time_s[row]), told))
+    if motion.cause:
+        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+    end = motion.failure and f"the simulation failed: {motion.failure}"
+    inside = "the end, inside the safe set throughout"
+    events.append((float(motion.time_s[-1]), end or ("the end" if motion.cause else inside)))
+    return events_table(events, motion.time_s, motion.extra[_GAMMA][:, 0], GAMMA[CALIBRATED])

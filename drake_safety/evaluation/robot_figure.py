@@ -1,0 +1,119 @@
+"""A standing robot beside its collision shapes, to see whether they fit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryInstance,
+    Mesh,
+    PerceptionProperties,
+    Rgba,
+    Role,
+    Shape,
+    Sphere,
+)
+from pydrake.systems.framework import Context
+
+from drake_safety.evaluation.figure_style import (
+    FALSE_ALARM_COLOUR,
+    RECOVERY_COLOUR,
+    SAFE_COLOUR,
+    SERIES_COLOURS,
+    UNSAFE_COLOUR,
+    drawing_style,
+    new_figure,
+)
+from drake_safety.evaluation.stills import StillCamera, scene_graph_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from drake_safety.simulation.legged_loop import LeggedLoop
+
+_COLOURS: dict[type[Shape], tuple[str, str]] = {
+    Box: ("boxes", SAFE_COLOUR),
+    Capsule: ("capsules", RECOVERY_COLOUR),
+    Cylinder: ("cylinders", SERIES_COLOURS[3]),
+    Sphere: ("spheres", UNSAFE_COLOUR),
+    Ellipsoid: ("ellipsoids", SERIES_COLOURS[5]),
+    Convex: ("convex hulls", FALSE_ALARM_COLOUR),
+}
+_SIZE = (900, 1000)  # Of a still [pixels].
+_VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
+
+
+def robot_figure(loop: LeggedLoop) -> Figure:
+    """Draws a robot in its standing posture: as it looks, and as it collides.
+
+    Args:
+        loop: A closed loop with a legged robot.
+    """
+    context = loop.CreateDefaultContext()
+    loop.reset_to(context, None, loop.standing_start())
+    positions = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
+    width, height = _SIZE
+    look = StillCamera(loop, positions, width=width, height=height).render(positions)
+    camera = StillCamera(loop, positions, width=width, height=height)
+    kinds = show_shapes(loop, camera.context)
+    shapes = camera.render(positions)
+    both = np.round(_VISUAL_SHARE * look + (1 - _VISUAL_SHARE) * shapes).astype(np.uint8)
+    with drawing_style():
+        fig = new_figure(9.0, 5.6)
+        panels = fig.subplots(1, 2)
+        titles = f"{loop.robot.name}, standing", f"{sum(kinds.values())} collision shapes"
+        for axes, image, title in zip(panels, (look, both), titles, strict=True):
+            axes.imshow(image)
+            axes.set_title(title)
+            axes.set_axis_off()
+        for name, colour in _COLOURS.values():
+            if name in kinds:
+                panels[1].scatter([], [], c=colour, marker="s", label=f"{name}: {kinds[name]}")
+        panels[1].legend(
+            loc="upper left", framealpha=0.8, frameon=True, edgecolor="none", handletextpad=0.2
+        )
+    return fig
+
+
+def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
+    """Shows a robot's collision shapes in place of its visuals, coloured by kind.
+
+    Args:
+        loop: A closed loop with a legged robot.
+        context: Its root Context, which changes.
+
+    Returns:
+        Number of shapes by kind.
+    """
+    from matplotlib.colors import to_rgb
+
+    plant, scene_graph = loop.plant, scene_graph_of(loop)
+    source = plant.get_source_id()
+    scene_context = scene_graph.GetMyMutableContextFromRoot(context)
+    inspector = scene_graph.get_query_output_port().Eval(scene_context).inspector()
+    kinds: dict[str, int] = {}
+    for index in plant.GetBodyIndices(loop.robot_instance):
+        frame = plant.GetBodyFrameIdOrThrow(index)
+        for visual in inspector.GetGeometries(frame, Role.kPerception):
+            scene_graph.RemoveRole(scene_context, source, visual, Role.kPerception)
+        for shape_id in inspector.GetGeometries(frame, Role.kProximity):
+            shape = inspector.GetShape(shape_id)
+            if isinstance(shape, Mesh):
+                # Drake's contacts are those of its convex hull.
+                shape = Convex(shape.source(), shape.scale3())
+            name, colour = _COLOURS[type(shape)]
+            kinds[name] = kinds.get(name, 0) + 1
+            shown = GeometryInstance(
+                inspector.GetPoseInFrame(shape_id), shape, f"shown {inspector.GetName(shape_id)}"
+            )
+            properties = PerceptionProperties()
+            properties.AddProperty("phong", "diffuse", Rgba(*to_rgb(colour)))
+            shown.set_perception_properties(properties)
+            scene_graph.RegisterGeometry(scene_context, source, frame, shown)
+    return kinds
