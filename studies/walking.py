@@ -83,7 +83,7 @@ class _Motions:
             indices,
             seed=_SEEDS[seeds],
             duration_s=duration_s,
-            folder=self.folder / f"{scenario.simulation_hash(plant)[:12]}-{name}",
+            folder=self.folder / f"{scenario.simulation_hash(plant)[:12]}-{_SEEDS[seeds]}-{name}",
             variation=plant,
             assessment=self.assessment if options else None,
             options=options,
