@@ -159,7 +159,7 @@ class GuardParameters:
     """The command guard."""
 
     threshold: float = 0.9
-    """Lowest calibrated Γ of a command that is passed on; set after a look at Go2's figures."""
+    """Lowest calibrated Γ of a command that is passed on; set after a look at figures."""
     period_s: float = 0.1
     """Time between two decisions [s]."""
 

@@ -83,7 +83,7 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(monkeypatch, capsys,
     shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
     assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
     assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
-    for name in ("default plan", "chosen by Γ", "best in hindsight", "is not calibrated"):
+    for name in ("default plan", "chosen by Γ", "best in hindsight", "promises nothing"):
         assert name in printed
     # The motions are kept with the assessment: a second study simulates nothing.
     monkeypatch.setattr(planning_study, "run_episode", None)
