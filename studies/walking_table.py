@@ -113,7 +113,9 @@ def _plan_lines(results: Results) -> list[str]:
         lines.append(
             f"\nΓ's threshold promises that {100 * promised.value:g} % of the unsafe ones are "
             f"missed: {_percent(missed)} are. The others' thresholds come from "
-            f"{results.entries.get('calibration_episodes')} other profiles."
+            f"{results.entries.get('calibration_episodes')} other profiles, and promise "
+            f"{100 * (1 - found['plans.promised_unsafe_recall'].value):.1f} %: recalls are not at "
+            "the same promise, AUCs have none."
         )
     return [*lines, ""]
 
