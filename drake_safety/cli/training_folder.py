@@ -217,9 +217,9 @@ def check_fresh(
     scenario_hash = scenario.simulation_hash()
     if trained.scenario_hash != scenario_hash:
         raise ValueError(
-            f"scenario '{trained.scenario}' was learned from with hash "
-            f"{trained.scenario_hash[:12]}, but '{scenario.name}' now has hash "
-            f"{scenario_hash[:12]}: train again"
+            f"the assessment was trained on scenario '{trained.scenario}' with hash "
+            f"{trained.scenario_hash[:12]}; '{scenario.name}' now has hash {scenario_hash[:12]}, "
+            "as its file, its robot or its task has changed: train again"
         )
     assessment.check_unused(*seeds)
 

@@ -64,7 +64,8 @@ def inputs(
         except (TypeError, ValueError) as error:
             raise ValueError(f"{who}: {name} must be an array of numbers: {error}") from error
         if part.shape[-1:] != (width,):
-            expected = (*part.shape[:-1], width)
+            rows = parts[0].shape[:-1] if parts else part.shape[:1] if part.ndim > 1 else ()
+            expected = (*rows, width)
             raise ValueError(f"{who}: {name} has the shape {part.shape}, expected {expected}")
         if parts and part.shape[:-1] != parts[0].shape[:-1]:
             expected = (*parts[0].shape[:-1], width)

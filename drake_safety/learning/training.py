@@ -71,7 +71,8 @@ def segments_for(
     if num_targeted <= num_neighbours:
         raise ValueError(
             f"SafetyAssessment: perplexity {parameters.perplexity} needs more than "
-            f"{num_neighbours} segments, the {len(episodes)} episodes give {num_targeted}"
+            f"{num_neighbours} segments, the {len(episodes)} episodes give {num_targeted}: record "
+            "more episodes, or lower the perplexity"
         )
     _logger.info(
         "training on %d segments of %d episodes (%d unsafe, %d diverged), %d of them in t-SNE",
