@@ -419,7 +419,9 @@ def _episodes(
         yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
-            "narrow the ranges under 'start', or widen 'safe_set'" + scaled_start(parameters, 0.5),
+            "narrow the ranges under 'start', or widen 'safe_set'" + scaled_start(parameters, 0.5)
+            if hasattr(parameters, "start")
+            else "narrow what the task's `reset` draws, or widen its safe set",
         )
     if causes.pop(DIVERGED, 0):
         yield failed(
