@@ -13,7 +13,12 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy_files import load_policy, read_policy_file, with_policy
+from drake_safety.control.policy_files import (
+    load_policy,
+    missing_entries,
+    read_policy_file,
+    with_policy,
+)
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.diagrams.walking_recovery import RecoveryBranches
@@ -24,10 +29,9 @@ from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import LoopScenario
-from drake_safety.simulation.contract import Finding
+from drake_safety.simulation.contract import Finding, failed, passed
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.policy_check import policy_findings
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.policy_controller import PolicyController
@@ -202,7 +206,7 @@ class Walking(LeggedLoop):
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
         """Findings about the policy: what its files lack, and how to mend it."""
-        return policy_findings(policy_file(scenario), kinematics)
+        return _policy_findings(policy_file(scenario), kinematics)
 
     @property
     def target_box(self) -> np.ndarray:
@@ -367,3 +371,29 @@ def policy_file(scenario: LoopScenario, name: str | None = None) -> Path:
     """
     folder = Path(load_robot(scenario.robot).source_dir)
     return folder / (scenario.parameters.policy if name is None else name)
+
+
+def _policy_findings(path: Path, kinematics: RobotKinematics) -> Iterator[Finding]:
+    """Checks that a policy's files say all that a robot needs, and fit it.
+
+    An error in the files is a finding, never an exception.
+
+    Args:
+        path: The policy file.
+        kinematics: The robot.
+
+    Yields:
+        One finding for each entry that is missing, or one for all.
+    """
+    try:
+        missing = list(missing_entries(path, kinematics.joint_names))
+        for what, remedy in missing:
+            yield failed("policy", what, remedy)
+        if not missing:
+            policy = load_policy(path, kinematics)
+            yield passed(
+                "policy",
+                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
+            )
+    except ValueError as error:
+        yield failed("policy", str(error), f"correct what the message names, or {path.name}")

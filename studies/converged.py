@@ -34,7 +34,7 @@ from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, ev
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
-from drake_safety.learning.quantities import LITERAL, NORMALIZED
+from drake_safety.learning.prediction import LITERAL, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair

@@ -35,7 +35,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
-from drake_safety.learning.quantities import CALIBRATED, GAMMA, NORMALIZED
+from drake_safety.learning.prediction import CALIBRATED, GAMMA, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.quantities import CALIBRATED, GAMMA
+from drake_safety.learning.prediction import CALIBRATED, GAMMA
 from drake_safety.learning.seeds import CALIBRATION
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.quantities import CALIBRATED
+from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import fresh_episodes_folder
-from drake_safety.learning.quantities import CALIBRATED
+from drake_safety.learning.prediction import CALIBRATED
 
 if TYPE_CHECKING:
     from drake_safety.simulation.watched_motion import WatchedMotion

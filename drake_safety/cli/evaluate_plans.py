@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.cli.findings import Findings, Judged
-from drake_safety.learning.quantities import CALIBRATED
+from drake_safety.learning.prediction import CALIBRATED
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.plan_study import PlanRule, Plans, PlanStudy

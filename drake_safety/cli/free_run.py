@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from drake_safety.cli.console import cause_words
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, events_table
-from drake_safety.learning.quantities import CALIBRATED, GAMMA, PORTS
+from drake_safety.cli.run_settings import (
+    LOG_PERIOD_S,
+    Recording,
+    RunSettings,
+    events_table,
+    first_below,
+)
+from drake_safety.learning.prediction import CALIBRATED, GAMMA, PORTS
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,7 +57,7 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
         realtime_rate=settings.realtime_rate,
     )
     gamma = motion.extra[_GAMMA][:, 0]
-    row = _first_below(gamma, rule.threshold)
+    row = first_below(gamma, rule.threshold)
     timeline = timeline_figure(
         motion.time_s,
         gamma,
@@ -70,14 +74,8 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
     recording.save(
         {"timeline": timeline},
         _table_of_events(loop, settings.assessment, motion, row),
-        f"{rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.remark}",
+        f"{rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.origin}",
     )
-
-
-def _first_below(gamma: np.ndarray, threshold: float) -> int | None:
-    """First row with Γ below the threshold; None for never."""
-    is_below = ~(gamma >= threshold)
-    return int(np.argmax(is_below)) if is_below.any() else None
 
 
 def _table_of_events(

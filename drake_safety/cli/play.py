@@ -57,7 +57,7 @@ def play(
         raise ValueError(
             f"play: the package '{error.name}' is not installed: pip install 'drake_safety[live]'"
         ) from error
-    from drake_safety.learning.quantities import CALIBRATED, GAMMA
+    from drake_safety.learning.prediction import CALIBRATED, GAMMA
     from drake_safety.live.commanded_session import LiveCommands
     from drake_safety.live.session import LiveGoals, LiveThrows
     from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals, require
@@ -86,7 +86,7 @@ def play(
         session = LiveCommands(loop, meshcat, threshold=threshold, seed=seed)
     elif has_goals:
         rule = goal_threshold(folder.path, gamma)
-        told = f"threshold {rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.remark}"
+        told = f"threshold {rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.origin}"
         console.print(told, highlight=False, soft_wrap=True)
         session = LiveGoals(
             loop, meshcat, threshold=rule.threshold, unsafe_below=rule.unsafe_below, seed=seed

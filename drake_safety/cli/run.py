@@ -27,7 +27,7 @@ from drake_safety.cli.run_settings import (
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
-from drake_safety.learning.quantities import LITERAL, NORMALIZED, PORTS, gamma_of_port
+from drake_safety.learning.prediction import LITERAL, NORMALIZED, PORTS, gamma_of_port
 from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from drake_safety.cli.console import (
     LOOPBACK,
     command_line,
@@ -19,7 +21,6 @@ from drake_safety.cli.console import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
     from rich.table import Table
@@ -161,6 +162,12 @@ class Recording:
         print_path("animation", path)
 
 
+def first_below(gamma: np.ndarray, threshold: float) -> int | None:
+    """First row in which Γ is below a threshold or unknown; None for never."""
+    is_below = ~(gamma >= threshold)
+    return int(np.argmax(is_below)) if is_below.any() else None
+
+
 def events_table(
     events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray, quantity: str
 ) -> Table:
@@ -170,7 +177,7 @@ def events_table(
         events: Times [s] and descriptions.
         time_s: Instants of the log [s], (N,).
         gamma: Γ, (N,).
-        quantity: Which Γ, as in `quantities.GAMMA`.
+        quantity: Which Γ, as in `prediction.GAMMA`.
     """
     table = new_table("time [s]", "event", quantity)
     for instant, event in sorted(events, key=lambda one: one[0]):

@@ -13,9 +13,10 @@ from drake_safety.cli.run_settings import (
     Recording,
     RunSettings,
     events_table,
+    first_below,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
-from drake_safety.learning.quantities import CALIBRATED, GAMMA, PORTS
+from drake_safety.learning.prediction import CALIBRATED, GAMMA, PORTS
 from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def run_to_target(
         loop, settings.assessment, goal, threshold=threshold, unsafe_below=rule.unsafe_below
     )
     nearest = None if verdict.is_accepted else nearest_accepted(loop, settings.assessment, verdict)
-    print_verdict(loop, verdict, nearest, rule.remark)
+    print_verdict(loop, verdict, nearest, rule.origin)
     if not (verdict.is_accepted or is_forced):
         console.print("refused: nothing moved; --force goes there", highlight=False)
         return False
@@ -145,8 +146,8 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
     """First row with calibrated Γ below the threshold, if it was above at the start, or None."""
-    is_below = ~(motion.extra[PORTS[CALIBRATED]][:, 0] >= threshold)
-    return int(np.argmax(is_below)) if is_below.any() and not is_below[0] else None
+    # Row 0 is no alarm: it was below from the start.
+    return first_below(motion.extra[PORTS[CALIBRATED]][:, 0], threshold) or None
 
 
 def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figure:

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from drake_safety.cli.console import console
-from drake_safety.learning.quantities import CALIBRATED, GAMMA, LITERAL, NORMALIZED
+from drake_safety.learning.prediction import CALIBRATED, GAMMA, LITERAL, NORMALIZED
 from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:

@@ -38,12 +38,12 @@ class GoalThreshold(NamedTuple):
         threshold: Lowest calibrated Γ of an accepted goal.
         unsafe_below: Calibrated Γ below which a goal is unsafe; in between the verdict is "don't
             know".
-        remark: Where they come from.
+        origin: Where they come from.
     """
 
     threshold: float
     unsafe_below: float
-    remark: str
+    origin: str
 
 
 MODES = ("sharpened", "paper")

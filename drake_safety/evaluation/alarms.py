@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.quantities import CALIBRATED, LITERAL, NORMALIZED
+from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUBLISHED = {"": NORMALIZED, "_literal": LITERAL, "_calibrated": CALIBRATED}

@@ -19,8 +19,8 @@ from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
+from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.progress import shown
-from drake_safety.learning.quantities import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.capabilities import HasBall, judging_options

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SAFE_COLOUR = "#2b6cb0"
@@ -100,6 +101,26 @@ def new_figure(width: float, height: float) -> Figure:
     fig = Figure(figsize=(width, height), layout="constrained")
     fig.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr, call-arg]
     return fig
+
+
+def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
+    """Writes a threshold beside its line, outside the axes.
+
+    Args:
+        axes: The axes, whose y axis has the threshold's quantity.
+        threshold: The threshold.
+        colour: Colour of the text.
+    """
+    axes.annotate(
+        f"threshold {threshold:.3g}",
+        (1.0, threshold),
+        xycoords=("axes fraction", "data"),
+        xytext=(6, 0),
+        textcoords="offset points",
+        va="center",
+        color=colour,
+        fontsize=9,
+    )
 
 
 def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.evaluation.embedding_figure import draw_safety
-from drake_safety.evaluation.figure_style import INK, drawing_style, new_figure
+from drake_safety.evaluation.figure_style import (
+    INK,
+    drawing_style,
+    label_threshold,
+    new_figure,
+)
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
-from drake_safety.learning.quantities import GAMMA, NORMALIZED
+from drake_safety.learning.prediction import GAMMA, NORMALIZED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +45,7 @@ def path_figure(
         gamma: Γ, (N,).
         threshold: Threshold on Γ of triggers.
         events: Times of named events [s]; they are marked and numbered in both panels.
-        quantity: Which Γ, as in `quantities.GAMMA`.
+        quantity: Which Γ, as in `prediction.GAMMA`.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     is_empty = cells[:, UNCERTAINTY] >= 1.0
@@ -58,15 +63,7 @@ def path_figure(
         left.set(title="Path through the embedding space", xlabel="hatched: don't know")
         right.plot(time_s, gamma, color=INK, linewidth=1.4)
         right.axhline(threshold, color=INK, linewidth=0.8, linestyle="--")
-        right.annotate(
-            f"threshold {threshold:.3g}",
-            (1.0, threshold),
-            xycoords=("axes fraction", "data"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-        )
+        label_threshold(right, threshold, INK)
         right.set(title=f"{quantity} over time", xlabel="time [s]", ylim=(-0.04, 1.2))
         ordered = sorted(events.items(), key=lambda event: event[1])
         for number, (_, at_s) in enumerate(ordered, start=1):

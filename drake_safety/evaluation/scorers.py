@@ -52,7 +52,7 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
         name: Its key in tables.
         assessment: A fitted assessment.
         published: "literal", "normalized" or "calibrated", see
-            :mod:`drake_safety.learning.quantities`.
+            :mod:`drake_safety.learning.prediction`.
     """
 
     def probability(

@@ -20,6 +20,7 @@ from drake_safety.evaluation.figure_style import (
     UNKNOWN_COLOUR,
     UNSAFE_COLOUR,
     drawing_style,
+    label_threshold,
     new_figure,
     spoken,
 )
@@ -68,7 +69,7 @@ def timeline_figure(
         time_s: Instants [s], (N,).
         gamma: Γ, held until the next instant, (N,).
         threshold: Threshold on Γ of triggers or alarms.
-        quantity: Which Γ, as in `quantities.GAMMA`.
+        quantity: Which Γ, as in `prediction.GAMMA`.
         throws: Balls, marked at the time of impact.
         pushes: Pushes, marked for their duration.
         trigger_times_s: Times of triggers or alarms [s].
@@ -173,16 +174,7 @@ def _lay_out(
 
 def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: float) -> None:
     axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
-    axes.annotate(
-        f"threshold {threshold:.3g}",
-        (1.0, threshold),
-        xycoords=("axes fraction", "data"),
-        xytext=(6, 0),
-        textcoords="offset points",
-        va="center",
-        color=UNSAFE_COLOUR,
-        fontsize=9,
-    )
+    label_threshold(axes, threshold, UNSAFE_COLOUR)
     axes.step(time_s, gamma, where="post", color=SAFE_COLOUR, linewidth=2.0)
     axes.set_yticks([0.0, 0.5, 1.0])
 

@@ -11,6 +11,9 @@ from drake_safety.learning.assessment_parameters import AdaptationParameters, As
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
+from drake_safety.learning.prediction import BaseLogit
+from drake_safety.learning.segments import Segments
+from drake_safety.learning.trained_maps import EmbeddingOutput
 
 _KEPT_IN_CELL = 500
 
@@ -57,6 +60,40 @@ class TrainingScores:
     multiplicity: np.ndarray | None = None
     count: np.ndarray | None = None
 
+    @classmethod
+    def of(
+        cls,
+        segments: Segments,
+        output: EmbeddingOutput,
+        base_logit: BaseLogit | None,
+        target: np.ndarray | None = None,
+    ) -> TrainingScores:
+        """Those of training segments, in the precision in which files store them.
+
+        Args:
+            segments: The training segments.
+            output: What the maps give for them.
+            base_logit: The base logit; None for maps without heads.
+            target: Their points in t-SNE, (N, 2); None if they are not used.
+        """
+        heads = nearest = None
+        if base_logit is not None:
+            margins = output.margins.mean(axis=0)
+            heads = _single(base_logit.heads(output))
+            nearest = (
+                margins.argmin(axis=1)
+                if margins.shape[1]
+                else np.zeros(len(segments), dtype=np.int64)
+            )
+        return cls(
+            points=output.embedding.astype(np.float32),
+            score=_single(segments.score),
+            cause=segments.cause,
+            heads=heads,
+            nearest=nearest,
+            target=None if target is None else target.astype(np.float32),
+        )
+
     @property
     def times(self) -> np.ndarray:
         """Number of segments that each stands for, (N,)."""
@@ -100,10 +137,37 @@ class TrainingScores:
             heads=rows(self.heads),
             nearest=rows(self.nearest),
             target=rows(self.target),
-            # As files store it.
-            multiplicity=(1.0 / probability[kept]).astype(np.float32).astype(float),
+            multiplicity=_single(1.0 / probability[kept]),
             count=count,
         )
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    """Rounds values to single precision, in which files store one number for every segment."""
+    return values.astype(np.float32).astype(float)
+
+
+METHODS = ("recalibration", "paper")
+
+
+def chosen_method(method: str | None, *, has_heads: bool, who: str) -> str:
+    """The method of an adaptation.
+
+    Args:
+        method: One of `METHODS`; None for the first that the maps allow.
+        has_heads: Whether the maps have heads, which "recalibration" needs.
+        who: The assessment, for messages.
+
+    Raises:
+        ValueError: Unknown method, or maps without heads for "recalibration".
+    """
+    method = method or METHODS[0 if has_heads else 1]
+    if method not in METHODS or (method == "recalibration" and not has_heads):
+        raise ValueError(
+            f"{who}: cannot adapt by '{method}'; the methods are {list(METHODS)}, and "
+            "'recalibration' needs maps with heads"
+        )
+    return method
 
 
 def prior_beliefs(

@@ -26,12 +26,7 @@ from drake_safety.learning.feedback import (
 )
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.innovation import Innovation
-from drake_safety.learning.inputs import (
-    input_names,
-    inputs,
-    plan_columns,
-    used_states,
-)
+from drake_safety.learning.inputs import input_names, inputs, plan_columns, used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
 from drake_safety.learning.progress import shown
@@ -48,8 +43,6 @@ __all__ = [
     "Assessments",
     "SafetyAssessment",
 ]
-
-ADAPTATION_METHODS = ("recalibration", "paper")
 
 
 class SafetyAssessment:
@@ -165,23 +158,9 @@ class SafetyAssessment:
             progress("innovation", 1.0)
         output = self.embedding_.evaluate(x)
         self.base_logit_: BaseLogit | None = base_logit
-        heads = nearest = None
-        if base_logit is not None:
-            margins = output.margins.mean(axis=0)
-            heads = assessment_file.single(base_logit.heads(output))
-            nearest = (
-                margins.argmin(axis=1)
-                if margins.shape[1]
-                else np.zeros(len(segments), dtype=np.int64)
-            )
         is_placed = not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
-        self.training_ = TrainingScores(
-            points=output.embedding.astype(np.float32),
-            score=assessment_file.single(segments.score),
-            cause=segments.cause,
-            heads=heads,
-            nearest=nearest,
-            target=target.astype(np.float32) if is_placed else None,
+        self.training_ = TrainingScores.of(
+            segments, output, base_logit, target if is_placed else None
         ).thinned(self.grid_, parameters.seed)
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
@@ -224,13 +203,8 @@ class SafetyAssessment:
                 feedback of another scenario.
         """
         self._check_fitted()
-        has_heads = self.base_logit_ is not None
-        method = method or ("recalibration" if has_heads else "paper")
-        if method not in ADAPTATION_METHODS or (method == "recalibration" and not has_heads):
-            raise ValueError(
-                f"SafetyAssessment of '{self.info_.scenario}': cannot adapt by '{method}'; the "
-                f"methods are {list(ADAPTATION_METHODS)}, and 'recalibration' needs maps with heads"
-            )
+        who = f"SafetyAssessment of '{self.info_.scenario}'"
+        method = adaptation.chosen_method(method, has_heads=self.base_logit_ is not None, who=who)
         check_feedback(feedback, self.info_)
         drawn = used_episodes(feedback)
         self.check_unused(*{one.seed for one in drawn}, purpose="adaptation")
@@ -238,42 +212,33 @@ class SafetyAssessment:
         x = self.inputs_of(segments.state, segments.desired_preview, segments.features)
         points = self.embedding_.embed(x)
         adapted = copy.copy(self)
+        rows = [self._rows(one) for one in feedback]
         adapted.novelty_ = self.novelty_.with_feedback(
-            self._feedback_inputs(feedback), self.parameters.novelty_rate
+            np.concatenate(rows), self.parameters.novelty_rate
         )
-        adapted.innovation_ = self.innovation_.with_feedback(
-            [self._rows(one) for one in feedback], adapted.novelty_
-        )
+        adapted.innovation_ = self.innovation_.with_feedback(rows, adapted.novelty_)
         adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
         adapted.used_ = [*(one for one in self.used_ if one.purpose != "adaptation"), *drawn]
-        arguments = (self.grid_, self.parameters, self.num_causes)
         adapted.correction_ = Correction.none(self.embedding_, self.grid_)
         if method == "paper":
             adapted.beliefs_ = adaptation.paper_beliefs(
-                self.training_, segments, points, *arguments
+                self.training_, segments, points, self.grid_, self.parameters, self.num_causes
             )
         elif self.base_logit_ is not None:
-            adapted.correction_ = recalibration.fitted_correction(
+            adapted.correction_, adapted.beliefs_ = recalibration.recalibrated(
                 feedback,
                 segments,
+                x,
                 points,
                 inputs=self.inputs_of,
                 embedding=self.embedding_,
                 base_logit=self.base_logit_,
+                training=self.training_,
                 grid=self.grid_,
-                parameters=self.parameters.adaptation,
-            )
-            residual = adapted.correction_.residual(self.embedding_, x)
-            adapted.beliefs_ = recalibration.recalibrated_beliefs(
-                self.training_,
-                self.base_logit_,
-                adapted.correction_,
-                segments,
-                points,
-                recalibration.cell_means(residual, points, self.grid_),
-                *arguments,
+                parameters=self.parameters,
+                num_causes=self.num_causes,
             )
         adapted.adaptation_ = Adaptation(
             method=method,
@@ -326,10 +291,6 @@ class SafetyAssessment:
             discount=parameters.discount,
             plain=not parameters.is_sharpened,
         )
-
-    def _feedback_inputs(self, feedback: Sequence[FeedbackSet]) -> np.ndarray:
-        """Returns the inputs of all rows of the actual robot, (N, n_x)."""
-        return np.concatenate([self._rows(one) for one in feedback])
 
     def _rows(self, motion: Episode | FeedbackSet) -> np.ndarray:
         return self.inputs_of(motion.state, motion.desired_preview, motion.features)

@@ -347,11 +347,6 @@ def _novelty(
     return Novelty(training=training, feedback=feedback, limits=limits, plan=plan)
 
 
-def single(values: np.ndarray) -> np.ndarray:
-    """Rounds values to single precision, in which files store one number for every segment."""
-    return values.astype(np.float32).astype(float)
-
-
 def file_hash(path: Path) -> str:
     """Returns the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:

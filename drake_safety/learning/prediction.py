@@ -16,6 +16,26 @@ LOGIT_LIMIT = 8.0
 SHIFT_LIMIT = 100.0
 """Largest shift of the base logit, which keeps exp from overflowing."""
 
+LITERAL, NORMALIZED, CALIBRATED = "literal", "normalized", "calibrated"
+"""Fields of an assessment's result."""
+GAMMA = {LITERAL: "literal Γ", NORMALIZED: "normalised Γ", CALIBRATED: "calibrated Γ"}
+"""What messages, tables and figures call a field."""
+PORTS = {
+    LITERAL: "safety_probability",
+    NORMALIZED: "normalized_safety_probability",
+    CALIBRATED: "calibrated_safety_probability",
+}
+"""Output port of :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` for a field."""
+
+
+def gamma_of_port(port: str) -> str:
+    """What messages call the quantity of an output port.
+
+    Args:
+        port: One of `PORTS`.
+    """
+    return next(GAMMA[name] for name, its_port in PORTS.items() if its_port == port)
+
 
 @dataclass(kw_only=True, eq=False)
 class Assessments:

@@ -191,6 +191,51 @@ def fitted_correction(
     return Correction(change=change, hidden=hidden, hidden_range=hidden_range, guard=guard)
 
 
+def recalibrated(
+    feedback: Sequence[FeedbackSet],
+    segments: FeedbackSegments,
+    x: np.ndarray,
+    points: np.ndarray,
+    *,
+    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    embedding: Embedding,
+    base_logit: BaseLogit,
+    training: TrainingScores,
+    grid: Grid,
+    parameters: AssessmentParameters,
+    num_causes: int,
+) -> tuple[Correction, np.ndarray]:
+    """Corrects the base logit by feedback, and the beliefs, (K, R*R, 3 + n_c), with it.
+
+    Args:
+        feedback: See `fitted_correction`, as what follows up to `base_logit`.
+        segments: See there.
+        x: Inputs of the segments, (N, n_x).
+        points: See there.
+        inputs: See there.
+        embedding: See there.
+        base_logit: See there.
+        training: See `recalibrated_beliefs`, as the others.
+        grid: See there.
+        parameters: See there.
+        num_causes: See there.
+    """
+    correction = fitted_correction(
+        feedback,
+        segments,
+        points,
+        inputs=inputs,
+        embedding=embedding,
+        base_logit=base_logit,
+        grid=grid,
+        parameters=parameters.adaptation,
+    )
+    residual = correction.residual(embedding, x)
+    return correction, recalibrated_beliefs(
+        training, base_logit, correction, segments, points, residual, grid, parameters, num_causes
+    )
+
+
 def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
     """Averages values (M,) in every map's cells, (K, R*R); 0 in cells without points.
 
@@ -248,7 +293,7 @@ def recalibrated_beliefs(
         correction: The correction of the base logit.
         feedback: Segments of all feedback so far.
         points: Psi(x) of the feedback, (K, M, 2).
-        residual: Mean contribution of the hidden layer in every map's cells, (K, R*R).
+        residual: Contribution of the hidden layer at the feedback, (M,).
         grid: The grid.
         parameters: The assessment's parameters.
         num_causes: n_c.
@@ -263,7 +308,8 @@ def recalibrated_beliefs(
         belief_masses.fuse_cells, num_cells=grid.num_cells, min_count=parameters.min_count
     )
     fused = []
-    members = zip(training.points, points, residual, correction.guard, strict=True)
+    means = cell_means(residual, points, grid)
+    members = zip(training.points, points, means, correction.guard, strict=True)
     for training_points, actual_points, added, guard in members:
         cells = grid.locate(training_points)
         inside = cells >= 0

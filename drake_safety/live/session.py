@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
-from drake_safety.learning.quantities import gamma_of_port
+from drake_safety.learning.prediction import gamma_of_port
 from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal

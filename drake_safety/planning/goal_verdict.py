@@ -12,8 +12,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
-from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.quantities import CALIBRATED
+from drake_safety.learning.prediction import CALIBRATED, is_unknown
 from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 

@@ -108,19 +108,6 @@ def _write(target: Path, content: bytes) -> None:
         raise
 
 
-def mesh_box(path: Path) -> np.ndarray:
-    """Returns lowest and highest corner of a mesh's bounding box, (2, 3), in the mesh's units.
-
-    Args:
-        path: The mesh.
-
-    Raises:
-        MissingExtraError: The packages that read it are not installed.
-        ValueError: The file cannot be read, or is empty.
-    """
-    return np.array(_scene(path).bounds, dtype=float)
-
-
 def mesh_points(path: Path) -> np.ndarray:
     """Returns the vertices of a mesh, (n, 3), in the mesh's units.
 

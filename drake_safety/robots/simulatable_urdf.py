@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_box, shown_mesh
+from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_points, shown_mesh
 from drake_safety.robots.model_files import MissingExtraError, model_file
 from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of, read_urdf
 
@@ -266,7 +266,8 @@ def _box(file: Path) -> np.ndarray | None:
     box = _stl_box(file)
     if box is None:
         with contextlib.suppress(ValueError):
-            box = mesh_box(file)
+            points = mesh_points(file)
+            box = np.array([points.min(axis=0), points.max(axis=0)])
     return box
 
 

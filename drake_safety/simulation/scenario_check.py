@@ -419,9 +419,7 @@ def _episodes(
         yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
-            "narrow the ranges under 'start', or widen 'safe_set'" + scaled_start(parameters, 0.5)
-            if hasattr(parameters, "start")
-            else "narrow what the task's `reset` draws, or widen its safe set",
+            "narrow the starts, or widen the safe set" + scaled_start(parameters, 0.5),
         )
     if causes.pop(DIVERGED, 0):
         yield failed(
@@ -438,9 +436,9 @@ def _episodes(
         yield failed(
             "share of unsafe episodes",
             message,
-            "widen the ranges of start and plan, or narrow 'safe_set': Γ learns from both kinds"
+            "widen the starts and plans, or narrow the safe set: Γ learns from both kinds"
             + scaled_start(parameters, 1.5)
             if share < low
-            else "narrow the ranges of start and plan, or widen 'safe_set': Γ learns from both"
+            else "narrow the starts and plans, or widen the safe set: Γ learns from both kinds"
             + scaled_start(parameters, 0.5),
         )
