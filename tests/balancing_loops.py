@@ -3,9 +3,11 @@
 import functools
 from pathlib import Path
 
+import numpy as np
 import yaml
+from pydrake.systems.analysis import Simulator
 
-from drake_safety.simulation.scenario import parse_scenario
+from drake_safety.simulation.scenario import load_scenario, parse_scenario
 from legged_robots import robot_kinematics, robot_model
 
 PACKAGED = "laikago"
@@ -47,3 +49,17 @@ def scenario_of(robot, **changes):
 @functools.cache
 def standing_loop(robot=PACKAGED, variation="nominal", **options):
     return scenario_of(robot).make_loop(variation, **options)
+
+
+@functools.cache
+def packaged_loop(variation="nominal", **options):
+    return load_scenario("laikago_balancing").make_loop(variation, **options)
+
+
+def started(loop, seed=0):
+    """A simulator at the start of an episode, and its context."""
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset(context, np.random.default_rng(seed))
+    simulator.Initialize()
+    return simulator, context

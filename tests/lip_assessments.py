@@ -1,7 +1,9 @@
 """What is learned of the stand-in data quickly, and feedback that contradicts it as one likes."""
 
 import dataclasses
+import functools
 
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.feedback import feedback_sets
 from drake_safety.learning.segments import Episodes
 from lip_episodes import make_episodes
@@ -15,6 +17,15 @@ QUICK = {
     "score_weight": 0.1,
 }
 NUM_PAIRS = 40
+
+
+@functools.cache
+def quick_episodes():
+    return make_episodes(260, noise=0.002)
+
+
+def quick_assessment(mode):
+    return SafetyAssessment(AssessmentParameters(mode=mode, **QUICK)).fit(quick_episodes())
 
 
 def inputs(segments, rows=slice(None)):

@@ -1,27 +1,21 @@
-import dataclasses
-import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from safetensors import safe_open
 from threadpoolctl import threadpool_limits
 
-from drake_safety.learning import assessment_file
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
-from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
-from drake_safety.learning.calibration import calibrate
 from drake_safety.learning.segments import split
 from drake_safety.learning.training import segments_for
-from lip_assessments import QUICK, inputs
+from lip_assessments import QUICK, inputs, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
 
 
 @pytest.fixture(scope="module")
 def episodes():
-    return make_episodes(260, noise=0.002)
+    return quick_episodes()
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +24,8 @@ def held_out():
 
 
 @pytest.fixture(scope="module", params=["sharpened", "paper"])
-def assessment(request, episodes):
-    parameters = AssessmentParameters(mode=request.param, **QUICK)
-    return SafetyAssessment(parameters).fit(episodes)
+def assessment(request):
+    return quick_assessment(request.param)
 
 
 def area_under_curve(score, is_positive):
@@ -146,176 +139,6 @@ def test_predicted_margins_and_causes_name_what_will_be_violated(assessment, hel
     is_clear = held_out.is_unsafe & (result.belief[:, 1] > 0.4)
     named = result.cause_probability.argmax(axis=1)
     assert (named == held_out.cause)[is_clear].mean() > 0.9
-
-
-def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    loaded = SafetyAssessment.load(path)
-    assert loaded.parameters == assessment.parameters
-    assert loaded.info_ == assessment.info_
-    before, after = (a.predict(*inputs(held_out)) for a in (assessment, loaded))
-    for field in dataclasses.fields(before):
-        np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
-    np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_calibration_is_kept_with_the_assessment(assessment, tmp_path):
-    score = np.linspace(0, 1, 200)
-    found = calibrate(score, score > 0.4, kind="plan", miss_rate=0.05, confidence=0.9)
-    path = tmp_path / "gamma.safetensors"
-    assert assessment.calibrations_ == {}
-    assessment.calibrations_ = {"plan": found}
-    assessment.save(path)
-    assessment.calibrations_ = {}
-    assert SafetyAssessment.load(path).calibrations_ == {"plan": found}
-    assessment.save(path)
-    assert SafetyAssessment.load(path).calibrations_ == {}
-
-
-def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_path, monkeypatch):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    content = path.read_bytes()
-
-    def full_disk(descriptor):
-        raise OSError("no space left")
-
-    monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(OSError, match="no space"):
-        assessment.save(path)
-    assert path.read_bytes() == content
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_path):
-    from safetensors.numpy import load_file, save_file
-
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    content = path.read_bytes()
-    for size in (0, 5, 200, len(content) // 2, len(content) - 1):
-        (tmp_path / "short").write_bytes(content[:size])
-        with pytest.raises(ValueError, match="not a safety assessment or truncated"):
-            SafetyAssessment.load(tmp_path / "short")
-    save_file({"x": np.zeros(3)}, tmp_path / "foreign")
-    with pytest.raises(ValueError, match="is not a safety assessment: its metadata has the entr"):
-        SafetyAssessment.load(tmp_path / "foreign")
-    metadata = {"schema": SCHEMA, "schema_version": "8"}
-    save_file(load_file(path), tmp_path / "old", metadata)
-    with pytest.raises(ValueError, match=f"schema version 8, this version reads {SCHEMA_VERSION}"):
-        SafetyAssessment.load(tmp_path / "old")
-    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 9}'})
-    with pytest.raises(ValueError, match="damaged safety assessment: it has no 'sha256'"):
-        SafetyAssessment.load(tmp_path / "hollow")
-    for text in ("", "[]", "{}", "[" * 100_000):
-        save_file(load_file(path), tmp_path / "torn", {SCHEMA: text})
-        with pytest.raises(ValueError, match="torn' is a damaged safety assessment"):
-            SafetyAssessment.load(tmp_path / "torn")
-
-
-def test_every_flipped_bit_is_noticed(assessment, tmp_path):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    header = int(content[:8].view(np.uint64)[0])
-    rng = np.random.default_rng(0)
-    # Half of them in names, shapes and metadata, half in numbers.
-    places = np.concatenate(
-        [rng.integers(8, 8 + header, 150), rng.integers(8 + header, len(content), 150)]
-    )
-    for place in places:
-        damaged = content.copy()
-        damaged[place] ^= np.uint8(1 << rng.integers(8))
-        path.write_bytes(damaged.tobytes())
-        with pytest.raises(ValueError, match=r"assessment\.safetensors"):
-            SafetyAssessment.load(path)
-
-
-def forged(path, change):
-    """Writes the file again after `change(entries, tensors)`, with the digest that fits."""
-    from safetensors.numpy import load_file, save_file
-
-    with safe_open(path, framework="numpy") as file:
-        entries = json.loads(file.metadata()[SCHEMA])
-    tensors = load_file(path)
-    del entries["sha256"]
-    change(entries, tensors)
-    entries["sha256"] = assessment_file._digest(entries, tensors)
-    save_file(tensors, path, {SCHEMA: json.dumps(entries)})
-
-
-def set_entry(name, value):
-    *keys, last = name.split(".")
-
-    def change(entries, tensors):
-        for key in keys:
-            entries = entries[int(key) if key.isdigit() else key]
-        entries[last] = value
-
-    return change
-
-
-def scale_beliefs(factor):
-    def change(entries, tensors):
-        tensors["beliefs"] = tensors["beliefs"] * factor
-
-    return change
-
-
-def rename_tensor(name, new):
-    def change(entries, tensors):
-        tensors[new] = tensors.pop(name)
-
-    return change
-
-
-@pytest.mark.parametrize("assessment", ["sharpened"], indirect=True)
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (scale_beliefs(5.0), "its beliefs are not masses that sum to 1"),
-        (scale_beliefs(np.nan), "its beliefs has entries that are not finite numbers"),
-        (
-            rename_tensor("embedding.trunk.1.bias", "embedding.Mrunk.1.bias"),
-            r"unexpected \['Mrunk.1",
-        ),
-        (rename_tensor("embedding.safety.0.bias", "spare"), "safety.0.bias"),
-        (rename_tensor("training_nearest", "spare"), r"the unknown tensors \['spare'\]"),
-        (set_entry("numbers.base_logit.offset", "a"), r"its base_logit.offset is 'a', expected"),
-        (set_entry("numbers.base_logit.offset", np.nan), "its base_logit.offset is nan"),
-        (set_entry("numbers.novelty_limits", [1.0, 1.0, -1.0]), "expected 3 positive numbers"),
-        (set_entry("parameters.resolution", "3"), "its parameters.resolution is '3'"),
-        (set_entry("parameters.paper.stride", 1.5), "its paper.stride is 1.5"),
-        (set_entry("info.state_names", [1, 2]), r"its info.state_names is \[1, 2\]"),
-        (set_entry("info.surplus", 1), "its info has no field 'surplus'"),
-        (set_entry("parameters", 3), "damaged"),
-        (set_entry("numbers", None), "damaged"),
-    ],
-)
-def test_a_forged_file_is_refused(assessment, tmp_path, change, message):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    forged(path, lambda entries, tensors: None)
-    SafetyAssessment.load(path)
-    forged(path, change)
-    with pytest.raises(ValueError, match=message) as caught:
-        SafetyAssessment.load(path)
-    assert f"'{path}' is a damaged safety assessment" in str(caught.value)
-
-
-def test_the_same_assessment_gives_the_same_bytes(assessment, tmp_path):
-    paths = [tmp_path / f"{i}.safetensors" for i in range(5)]
-    for path in paths:
-        assessment.save(path)
-    SafetyAssessment.load(paths[0]).save(paths[-1])
-    assert len({path.read_bytes() for path in paths}) == 1
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors"):
-        SafetyAssessment.load(tmp_path / "nowhere.safetensors")
 
 
 def test_the_same_seed_learns_the_same_assessment(episodes):

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +10,19 @@ import yaml
 from pydrake.geometry import Role
 from pydrake.systems.analysis import Simulator
 
-from balancing_loops import PACKAGED, scenario_of, standing_loop
+from balancing_loops import PACKAGED, packaged_loop, scenario_of, standing_loop, started
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
-from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.scenario import parse_scenario
-from drake_safety.simulation.throws import run_throw
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
 
 
 @functools.cache
 def episode_of(robot=PACKAGED, variation="nominal"):
     return run_episode(standing_loop(robot, variation))
-
-
-def started(loop, seed=0):
-    """A simulator at the start of an episode, and its context."""
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(seed))
-    simulator.Initialize()
-    return simulator, context
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -204,11 +192,6 @@ def test_the_state_is_that_of_the_plant():
     np.testing.assert_array_equal(loop.GetOutputPort("output").Eval(context), x[4:7])
 
 
-@functools.cache
-def packaged_loop(variation="nominal", **options):
-    return load_scenario("laikago_balancing").make_loop(variation, **options)
-
-
 PORTS = ("state", "true_state", "desired_output", "features", "margins")
 
 
@@ -315,117 +298,6 @@ def test_a_ball_that_waits_far_away_changes_nothing():
     alone = episode_of()
     with_ball = run_episode(standing_loop(variation="nominal", ball=True))
     np.testing.assert_allclose(with_ball.true_state, alone.true_state, atol=1e-6)
-
-
-@functools.cache
-def recovery_log(name, threshold_falls_at_s=0.2, duration_s=1.8):
-    """Heights of the feet, and who was in charge, around a recovery of a standing robot."""
-    loop = standing_loop(name, recovery=True)
-    probability = loop.GetInputPort("safety_probability")
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(0))
-    probability.FixValue(context, [1.0])
-    simulator.Initialize()
-    rows = []
-    for step in range(round(duration_s / 0.01) + 1):
-        time = 0.01 * step
-        simulator.AdvanceTo(time)
-        is_low = abs(time - threshold_falls_at_s) < 0.011
-        probability.FixValue(context, [0.0 if is_low else 1.0])
-        x = loop.GetOutputPort("plant_state").Eval(context)
-        p_WC = loop.kinematics.contact_positions(x[: loop.kinematics.num_positions])
-        active = loop.GetOutputPort("recovery_active").Eval(context)[0]
-        margins = loop.GetOutputPort("margins").Eval(context)
-        rows.append((time, active, p_WC[:, 2] - loop.kinematics.foot_radii, margins))
-    return loop, [np.array(column) for column in zip(*rows, strict=True)]
-
-
-def test_a_low_probability_makes_the_robot_step_and_hand_over_again():
-    _, (time, active, clearance, margins) = recovery_log(PACKAGED)
-    assert not active[time < 0.2].any()
-    start, end = time[active > 0][[0, -1]]
-    assert start <= 0.2 + 0.021
-    assert end < time[-1]
-    assert np.all(active[(time >= start) & (time <= end)] > 0)
-    assert clearance[time < 0.2].max() < 0.005
-    assert np.all(clearance[active > 0].max(axis=0) > 0.01)  # Every foot swung.
-    assert margins[-1].min() > 0
-    assert clearance[-1].max() < 0.005
-
-
-@pytest.mark.slow
-def test_recovery_saves_a_robot_that_would_have_fallen():
-    throw = Throw(mass_kg=4.0, speed_m_s=8.0, direction_rad=math.pi / 2, time_s=0.3)
-    lowest = {}
-    for recovery in (False, True):
-        loop = packaged_loop("actual", ball=True, recovery=recovery)
-        simulator = Simulator(loop)
-        context = simulator.get_mutable_context()
-        loop.reset_calm(context, np.random.default_rng(0))
-        if recovery:
-            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
-        simulator.AdvanceTo(0.2)
-        loop.throw_ball(context, throw, 0.1)
-        simulator.AdvanceTo(0.32)
-        if recovery:
-            loop.GetInputPort("safety_probability").FixValue(context, [0.0])
-            simulator.AdvanceTo(0.34)
-            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
-        fall = loop.constraint_names.index(loop.fall_name)
-        margins = []
-        for time in np.arange(0.35, 3.0, 0.05):
-            simulator.AdvanceTo(time)
-            margins.append(loop.GetOutputPort("margins").Eval(context)[fall])
-        lowest[recovery] = min(margins)
-    assert lowest[False] < 0
-    assert lowest[True] > 0
-
-
-def test_during_recovery_features_and_preview_tell_of_the_same_plan():
-    loop = packaged_loop(recovery=True)
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(0))
-    loop.GetInputPort("safety_probability").FixValue(context, [0.0])
-    observer = loop._assessor_observer
-    safe_set = BalanceSafeSet(loop.kinematics, loop.scenario.parameters.safe_set)
-    num_active = 0
-    for time in np.arange(0.05, 0.6, 0.05):
-        simulator.AdvanceTo(time)
-        num_active += loop.GetOutputPort("recovery_active").Eval(context)[0]
-        x = observer.GetOutputPort("measured_plant_state").Eval(
-            observer.GetMyContextFromRoot(context)
-        )
-        # The recovery's plan is a set point that is held.
-        preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
-        q, v = np.split(x, [loop.kinematics.num_positions])
-        features = loop.GetOutputPort("features").Eval(context)
-        expected = safe_set.features(q, v, preview)
-        np.testing.assert_allclose(features[: len(expected)], expected, atol=1e-12)
-    assert num_active == 11
-
-
-def test_recovery_from_the_demonstrations_strong_ball_is_short_and_holds_the_heading():
-    loop = packaged_loop("actual", ball=True, recovery=True)
-    throw = loop.scenario.parameters.demonstration[1]
-    log = run_throw(
-        loop,
-        0,
-        seed=0,
-        throws=[replace(throw, time_s=0.5)],
-        trigger_time_s=0.52,
-        duration_s=2.6,
-    )
-    assert not log.has_fallen
-    ((start_s, end_s),) = log.recovery_intervals_s
-    step = loop.scenario.parameters.recovery.step
-    assert end_s - start_s < 13 * step.step_duration_s + step.return_duration_s
-    w, x, y, z = log.plant_state[:, :4].T
-    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
-    turned = yaw - yaw[log.time_s < 0.5][-1]
-    assert np.abs(turned).max() < np.radians(30)
-    assert abs(turned[-1]) < np.radians(15)
 
 
 def test_plans_to_choose_from_end_over_the_same_point_as_high_and_as_late_as_training_draws():
