@@ -309,7 +309,7 @@ def test_starts_without_danger_are_told_to_be_widened(own):
     edited(own / "balancing.yaml", **scenario)
     found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
     assert found.message.startswith("0 % of 2 episodes")
-    assert "widen the ranges" in found.remedy
+    assert "widen the starts and plans" in found.remedy
     assert stated_values(found.remedy) == {"velocity_std_m_s": [0.015, 0.015, 0.015]}
 
 
