@@ -33,7 +33,7 @@ from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.trained_maps import INPUT_LIMIT
-from drake_safety.learning.training import check_preview, learned_maps, segments_for
+from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for
 
 __all__ = [
     "MODES",
@@ -138,6 +138,8 @@ class SafetyAssessment:
         self.embedding_, base_logit, target = learned_maps(
             segments, has_target, x, self.grid_, parameters, progress
         )
+        if parameters.is_sharpened:
+            self.embedding_ = self.embedding_.clipping(known_range(x))
         every = split(episodes, stride=1, discount=1.0, shortest=1)
         self.novelty_ = Novelty.fit(
             # With noise in either mode, as on a robot.

@@ -35,6 +35,7 @@ SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 9
 
 _MAPS, _CORRECTION = "embedding.", "correction."
+_INPUT_RANGE = "input_range"
 _INNOVATION = "innovation."
 _NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
@@ -71,6 +72,8 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     embedding, correction = learned["embedding_"], learned["correction_"]
     tensors = {f"{_MAPS}{name}": w for name, w in embedding.weights.items()}
     tensors |= {f"{_CORRECTION}{name}": value for name, value in asdict(correction).items()}
+    if np.isfinite(embedding.input_range).all():
+        tensors[_INPUT_RANGE] = embedding.input_range
     tensors["correction.guard"] = correction.guard.astype(np.uint8)
     tensors["beliefs"] = learned["beliefs_"]
     novelty = learned["novelty_"]
@@ -236,7 +239,10 @@ def _learned(
     info, numbers = _typed(EpisodesInfo, entries["info"], "info"), entries["numbers"]
     grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
     weights = {k.removeprefix(_MAPS): v for k, v in tensors.items() if k.startswith(_MAPS)}
-    embedding = Embedding(weights, num_margins=numbers["num_margins"])
+    # Files from before the range was stored have none: their maps extrapolate.
+    embedding = Embedding(
+        weights, num_margins=numbers["num_margins"], input_range=tensors.get(_INPUT_RANGE)
+    )
     expected_inputs = num_inputs(info, parameters)
     if embedding.num_inputs != expected_inputs:
         raise ValueError(
@@ -302,7 +308,7 @@ def _learned(
 
 def _check_names(tensors: Mapping[str, np.ndarray], learned: Mapping[str, Any]) -> None:
     """Checks that all tensors belong to what was learned."""
-    known = {"beliefs", *(f"training_{name}" for name in _TRAINING)}
+    known = {"beliefs", _INPUT_RANGE, *(f"training_{name}" for name in _TRAINING)}
     known |= {f"{_MAPS}{name}" for name in learned["embedding_"].weights}
     known |= {f"{_CORRECTION}{field.name}" for field in fields(Correction)}
     known |= {f"{_INNOVATION}{name}" for name in learned["innovation_"].arrays()}

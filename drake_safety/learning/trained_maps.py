@@ -34,15 +34,26 @@ class Embedding:
     The arrays `weights` are "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
     "output.weight" (K, width, 2 + n_c) whose first two columns give y and the others the margins;
     with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
-    (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
+    (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them. They are copied to
+    single precision.
+
+    Args:
+        weights: The arrays.
+        num_margins: n_c, the number of predicted margins.
+        input_range: Least and largest value of each column, to which inputs are clipped, (2, n_x);
+            None for no clipping.
+
+    Raises:
+        ValueError: Weights are missing or shapes are inconsistent.
     """
 
-    def __init__(self, weights: Mapping[str, np.ndarray], *, num_margins: int):
-        """Copies the weights to single precision.
-
-        Raises:
-            ValueError: Weights are missing or their shapes are inconsistent.
-        """
+    def __init__(
+        self,
+        weights: Mapping[str, np.ndarray],
+        *,
+        num_margins: int,
+        input_range: np.ndarray | None = None,
+    ):
         self.weights = {
             name: np.ascontiguousarray(w, dtype=np.float32) for name, w in weights.items()
         }
@@ -75,6 +86,16 @@ class Embedding:
             )
         if self.has_safety_head:
             self._safety_layers = [self._layer(f"safety.{i}") for i in range(2)]
+        self.input_range = np.full((2, self.num_inputs), np.inf, dtype=np.float32)
+        self.input_range[0] = -np.inf
+        if input_range is not None:
+            if np.shape(input_range) != self.input_range.shape:
+                raise ValueError(
+                    f"Embedding: the range of inputs has the shape {np.shape(input_range)}, "
+                    f"expected {self.input_range.shape}"
+                )
+            self.input_range[:] = input_range
+        self.input_range.setflags(write=False)
 
     def _layer(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Weights (K, in, out) and biases (K, 1, out)."""
@@ -86,10 +107,16 @@ class Embedding:
         return self.has_safety_head or self.num_margins > 0
 
     def is_same(self, other: Embedding) -> bool:
-        """Whether the weights are identical."""
-        return self.weights.keys() == other.weights.keys() and all(
-            np.array_equal(w, other.weights[name]) for name, w in self.weights.items()
+        """Whether weights and input range are identical."""
+        return (
+            self.weights.keys() == other.weights.keys()
+            and all(np.array_equal(w, other.weights[name]) for name, w in self.weights.items())
+            and np.array_equal(self.input_range, other.input_range)
         )
+
+    def clipping(self, input_range: np.ndarray) -> Embedding:
+        """Returns the same maps, with inputs clipped to a range of each column, (2, n_x)."""
+        return Embedding(self.weights, num_margins=self.num_margins, input_range=input_range)
 
     def scaled(self, factors: np.ndarray) -> Embedding:
         """Returns maps with y scaled by one factor each, (K,), and the same safety logits."""
@@ -98,7 +125,7 @@ class Embedding:
             weights[name][..., :2] *= factors.reshape(-1, *[1] * (weights[name].ndim - 1))
         if self.has_safety_head:
             weights["safety.0.weight"] /= factors[:, None, None]
-        return Embedding(weights, num_margins=self.num_margins)
+        return Embedding(weights, num_margins=self.num_margins, input_range=self.input_range)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN."""
@@ -133,15 +160,19 @@ class Embedding:
     def logit_gradient(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mean safety logit at x (N, n_x) and its gradient: (N,) and (N, n_x).
 
+        The gradient is zero along a column that is clipped.
+
         Raises:
             ValueError: The maps have no safety head.
         """
         if not self.has_safety_head:
             raise ValueError("Embedding.logit_gradient: the maps have no safety head")
         w = self.weights
+        x = np.asarray(x, dtype=float)
+        clipped = np.clip(x, *self.input_range)
         logit, gradient = np.zeros(len(x)), np.zeros(np.shape(x))
         for k in range(self.num_members):
-            z = np.asarray(x, dtype=float)
+            z = clipped
             is_active = []
             for i in range(self.num_layers):
                 z = z @ w[f"trunk.{i}.weight"][k] + w[f"trunk.{i}.bias"][k]
@@ -155,7 +186,7 @@ class Embedding:
             back = back @ w["safety.0.weight"][k].T @ w["output.weight"][k][:, :2].T
             for i in reversed(range(self.num_layers)):
                 back = (back * is_active[i]) @ w[f"trunk.{i}.weight"][k].T
-            gradient += back
+            gradient += back * (clipped == x)
         return logit / self.num_members, gradient / self.num_members
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
@@ -164,7 +195,7 @@ class Embedding:
             raise ValueError(
                 f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})"
             )
-        return x
+        return np.clip(x, *self.input_range)
 
     def _hidden(self, x: np.ndarray) -> np.ndarray:
         for weight, bias in self._layers[:-1]:

@@ -25,6 +25,8 @@ _NUM_NEIGHBOURS = 15
 """Nearest neighbours of a segment in the loss of parametric t-SNE, as in its publication."""
 _INSIDE_SHARE = 0.995
 """Quantile of the inputs whose outputs are scaled to the extent of t-SNE's points."""
+_CLIPPED_SHARE = 1e-3
+"""Share of the training inputs that is clipped at either end of a column of x."""
 _logger = logging.getLogger("drake_safety")
 
 StageProgress = Callable[[str, float], None]
@@ -168,6 +170,18 @@ def learned_maps(
         tried.evaluate(x[is_held_out]), segments.take(is_held_out), parameters
     )
     return embedding, base_logit, data.target
+
+
+def known_range(x: np.ndarray) -> np.ndarray:
+    """Returns the range of each column to which the maps' inputs are clipped, (2, n_x).
+
+    Departure: a map of rectifiers extrapolates linearly, off the grid or into cells of others; of a
+    clipped input it knows at least the other columns, as a decision tree does.
+
+    Args:
+        x: Training inputs, (N, n_x).
+    """
+    return np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
 
 
 def _part(progress: Callable[[float], None] | None, half: int) -> Callable[[float], None] | None:
