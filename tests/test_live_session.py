@@ -197,17 +197,17 @@ def test_play_without_a_library_for_pages_says_how_to_install_it(monkeypatch, ca
 
 
 def test_the_robot_stays_in_the_middle_of_the_picture(throws, monkeypatch):
-    moved = {}
+    moved, camera, context = {}, throws._camera, throws.context
     spy = SimpleNamespace(SetTransform=lambda path, X: moved.update({path: X.translation()}))
-    monkeypatch.setattr(throws, "meshcat", spy)
-    throws._target = throws._target + [1.3, -0.7]  # As after a step.
-    before = throws._base()
-    throws._follow()
-    assert np.linalg.norm((before + moved["/drake"])[:2]) > 1
+    monkeypatch.setattr(camera, "meshcat", spy)
+    camera._target = camera._target + [1.3, -0.7]  # As after a step.
+    base = throws.loop.GetOutputPort("plant_state").Eval(context)[4:6]
+    camera.follow(context)
+    assert np.linalg.norm(base + moved["/drake"][:2]) > 1
     for _ in range(20):
-        throws._follow()
-    assert before[:2] + moved["/drake"][:2] == pytest.approx([0, 0], abs=0.02)
-    assert np.abs(moved["/drake/grid"][:2] - before[:2]).max() <= 0.3
+        camera.follow(context)
+    assert base + moved["/drake"][:2] == pytest.approx([0, 0], abs=0.02)
+    assert np.abs(moved["/drake/grid"][:2] - base).max() <= 0.3
 
 
 def test_only_this_machine_reaches_a_page_unless_it_is_asked_for(capsys):

@@ -96,6 +96,18 @@ def open_viewer(host: str, port: int | None = None, *, has_rate: bool = True) ->
         raise ValueError(f"no page can be served at {place}: {error}") from error
 
 
+def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:
+    """Prints a warning if a task has drawn nothing; only what was published counts as drawn.
+
+    Args:
+        meshcat: The Meshcat server.
+        task: The task, as the scenario names it.
+    """
+    if not meshcat.HasPath("/drake"):
+        told = f"warning: task '{task}' draws nothing in Meshcat (nothing is under /drake)"
+        console.print(told, style="yellow", highlight=False, soft_wrap=True)
+
+
 def new_table(*columns: str, title: str | None = None) -> Table:
     """A table whose cells fold if they do not fit, so that no number is truncated."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)

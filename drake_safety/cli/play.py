@@ -1,4 +1,4 @@
-"""``drake-safety play``: throw balls, move targets or walk, with Γ beside the robot."""
+"""``drake-safety play``: throw balls, move targets, walk or watch, with Γ beside the scene."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from drake_safety.cli.console import (
     console,
     open_viewer,
     print_shipped,
+    warn_of_empty_scene,
 )
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
@@ -46,10 +47,11 @@ def play(
     ] = None,
     host: HostOption = LOOPBACK,
 ) -> None:
-    """Run the robot on a page in the browser, in real time, until Stop or Ctrl-C.
+    """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.
 
     Sliders and buttons throw a ball or move the target; keys walk a robot that follows commands,
-    push it, and switch its guard. Γ, belief and verdict are shown.
+    push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
+    verdict are shown.
     """
     try:
         from drake_safety.live.page import serve_page
@@ -59,8 +61,9 @@ def play(
         ) from error
     from drake_safety.learning.prediction import CALIBRATED, GAMMA
     from drake_safety.live.commanded_session import LiveCommands
+    from drake_safety.live.free_session import LiveEpisodes
     from drake_safety.live.session import LiveGoals, LiveThrows
-    from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals, require
+    from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -71,10 +74,10 @@ def play(
     # Check the capabilities of the task before a browser is opened.
     asked = loaded.make_loop(variation, assessment=gamma, **options)
     has_goals, is_commanded = isinstance(asked, HasGoals), isinstance(asked, FollowsCommands)
+    has_ball = isinstance(asked, HasBall) and not has_goals
     if is_commanded:
         options["guard"] = True
-    elif not has_goals:
-        require(asked, HasBall, "play")
+    elif has_ball:
         options["ball"] = True
     print_shipped(folder)
     page_port = _page_port(host, port)
@@ -84,16 +87,20 @@ def play(
     if is_commanded:
         threshold = loaded.parameters.guard.threshold
         session = LiveCommands(loop, meshcat, threshold=threshold, seed=seed)
-    elif has_goals:
+    elif has_ball:
+        threshold = loaded.parameters.recovery.threshold
+        session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
+    else:
         rule = goal_threshold(folder.path, gamma)
         told = f"threshold {rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.origin}"
         console.print(told, highlight=False, soft_wrap=True)
-        session = LiveGoals(
-            loop, meshcat, threshold=rule.threshold, unsafe_below=rule.unsafe_below, seed=seed
-        )
-    else:
-        threshold = loaded.parameters.recovery.threshold
-        session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
+        if has_goals:
+            session = LiveGoals(
+                loop, meshcat, threshold=rule.threshold, unsafe_below=rule.unsafe_below, seed=seed
+            )
+        else:
+            session = LiveEpisodes(loop, meshcat, threshold=rule.threshold, seed=seed)
+    warn_of_empty_scene(meshcat, loaded.task)
     address = meshcat.web_url().rpartition(":")[0]
     with serve_page(session.panel, host=host, port=page_port, scene_port=meshcat.port()):
         console.print(f"live at {address}:{page_port}", highlight=False, soft_wrap=True)

@@ -18,6 +18,7 @@ from drake_safety.cli.console import (
     open_viewer,
     print_path,
     versions,
+    warn_of_empty_scene,
 )
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ class Recording:
         """
         from drake_safety.evaluation.figure_style import save
 
+        warn_of_empty_scene(self.viewer, self._settings.scenario.task)
         self.viewer.StopRecording()
         self.viewer.PublishRecording()
         folder = self._settings.folder

@@ -7,8 +7,7 @@ import math
 import numpy as np
 from pydrake.geometry import Meshcat
 
-from drake_safety.live.session import TICK_S, LiveSession
-from drake_safety.plants.pushes import Push
+from drake_safety.live.session import LiveSession
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     FollowsCommands,
@@ -16,7 +15,7 @@ from drake_safety.simulation.capabilities import (
     goal_words,
     require,
 )
-from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop
 
 _LYING_S = 1.5  # From a fall to the reset.
 _NUM_STEPS = 8  # Key presses from zero to the farthest command of training.
@@ -44,7 +43,7 @@ class LiveCommands(LiveSession):
     HALT, PUSH, GUARD, STAND = "Halt", "Push", "Guard on/off", "Stand up again"
     probability_port = "calibrated_safety_probability"
 
-    def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
         self._commanded = require(loop, FollowsCommands)
         self._goals, self._pushed = require(loop, HasGoals), require(loop, CanBePushed)
@@ -84,7 +83,8 @@ class LiveCommands(LiveSession):
             self.is_guarded = not self.is_guarded
             self._commanded.set_guarded(self.context, self.is_guarded)
         if self.panel.take_click(self.PUSH):
-            self._push()
+            self._note = self._push(self._pushed)
+            self._note_until_s = now + 2.0
         self._advance()
         self._show_status()
         return True
@@ -95,21 +95,6 @@ class LiveCommands(LiveSession):
         self._goals.reset_standing(self.context, self.command, self._next_rng())
         self._commanded.set_guarded(self.context, self.is_guarded)
         self._begin()
-
-    def _push(self) -> None:
-        push = self._pushed.sample_push(self._next_rng())
-        start_s = self.context.get_time() + 0.5 * TICK_S
-        self._pushed.set_push(
-            self.context,
-            Push(
-                body=push.body,
-                force_n=push.force_n,
-                time_s=start_s,
-                duration_s=push.duration_s,
-            ),
-        )
-        self._note = f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s"
-        self._note_until_s = start_s + 2.0
 
     def _show_status(self) -> None:
         now = self.context.get_time()

@@ -1,11 +1,11 @@
-"""Interactive sessions with a robot in Meshcat, in real time."""
+"""Interactive sessions with a simulation in Meshcat, in real time."""
 
 from __future__ import annotations
 
 import math
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba, Sphere
@@ -14,27 +14,34 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
 from drake_safety.learning.prediction import gamma_of_port
+from drake_safety.live.following_camera import WORLD, FollowingCamera
 from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.capabilities import HasBall, HasGoals, angular_constraints, require
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    HasBall,
+    HasGoals,
+    angular_constraints,
+    require,
+)
+from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
 TICK_S = 0.04
 """Simulated time per tick [s]."""
+BREAK_S = 0.02
+"""Real time between ticks while nothing is simulated [s]."""
 STOP = "Stop"
 
+_PORTS = ("belief", "cause_probability", "predicted_margins")
 _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _LYING_S = 1.5  # From a fall to the reset.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
-_BREAK_S = 0.02  # Real time between ticks while nothing moves.
-_DISTANCE = 1.55  # From the camera to the robot, by the robot's size.
-_FOLLOWED = 0.2  # Share of the way to the robot by which the camera follows in a tick.
-_WORLD, _OWN = "/drake", ("/Grid", "/Axes")  # Of Meshcat's scene; its own are hidden.
-_GROUND, _GRID = f"{_WORLD}/visualizer/ground", f"{_WORLD}/grid"
-_CELL_M, _NUM_CELLS = 0.5, 7  # Of the grid: size, and number from its middle.
+_SIZE_M = 1.0  # Of a plant without legs, for markers.
 
 
 @dataclass
@@ -72,7 +79,7 @@ class LiveSession(ABC):
         seed: Seed of starts and noise.
 
     Raises:
-        ValueError: The loop was built without an assessment.
+        ValueError: The loop was built without an assessment, or lacks a port of the assessor.
 
     Attributes:
         pace: Simulated and real time so far.
@@ -82,9 +89,10 @@ class LiveSession(ABC):
 
     probability_port = "normalized_safety_probability"
 
-    def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         if loop.assessment is None:
             raise ValueError("live session: the loop was built without an assessment")
+        require_ports(loop, (self.probability_port, *_PORTS), "live session: ")
         self.loop = loop
         self.assessment = loop.assessment
         self.meshcat = meshcat
@@ -94,21 +102,17 @@ class LiveSession(ABC):
         self._seed = seed
         self._num_resets = 0
         self._late_s = 0.0
-        self._simulator = Simulator(loop)
-        self.context = self._simulator.get_mutable_context()
-        self._fall_column = loop.constraint_names.index(loop.fall_name)
-        # Size of the robot: twice the height of its base, or the extent of its feet.
-        q = loop.kinematics.standing_positions()
-        contacts = loop.kinematics.contact_positions(q)
-        self._size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
-        self._height_m = 0.7 * float(q[6])
+        self._renew_context()
+        self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
+        self._fall_column = None
+        if isinstance(loop, CanFall):
+            self._fall_column = loop.constraint_names.index(loop.fall_name)
         self.panel = LivePanel(
             title=loop.scenario.name,
             quantity=gamma_of_port(self.probability_port),
             threshold=threshold,
         )
         self.panel.add_button(STOP, "Escape")
-        self._aim_camera()
 
     @abstractmethod
     def tick(self) -> bool:
@@ -135,7 +139,7 @@ class LiveSession(ABC):
             was_simulated = self.tick()
             busy_s = time.perf_counter() - begin
             if not was_simulated:
-                time.sleep(_BREAK_S)
+                time.sleep(BREAK_S)
                 self._late_s = 0.0
                 continue
             if is_paced:
@@ -151,19 +155,25 @@ class LiveSession(ABC):
         self._num_resets += 1
         return episode_rng(self._seed, self._num_resets - 1)
 
+    def _renew_context(self) -> None:
+        """Replaces the Context by the default one."""
+        self._simulator = Simulator(self.loop)
+        self.context = self._simulator.get_mutable_context()
+
     def _begin(self) -> None:
         """Initializes the simulator after a reset, and redraws."""
         self._simulator.Initialize()
         self.panel.clear_history()
-        self._target = self._base()[:2]
-        self._follow()
+        if self._camera is not None:
+            self._camera.begin(self.context)
 
     def _advance(self) -> None:
         self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
         self._show_gamma(
             self._eval(self.probability_port)[0], self._eval("belief"), self.context.get_time()
         )
-        self._follow()
+        if self._camera is not None:
+            self._camera.follow(self.context)
 
     def _show_gamma(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
@@ -183,46 +193,18 @@ class LiveSession(ABC):
     def _eval(self, port: str) -> np.ndarray:
         return self.loop.GetOutputPort(port).Eval(self.context)
 
-    def _base(self) -> np.ndarray:
-        return self._eval("plant_state")[4:7]
+    def _push(self, pushed: CanBePushed) -> str:
+        """Begins a random push, and returns what it is."""
+        push = pushed.sample_push(self._next_rng())
+        start_s = self.context.get_time() + 0.5 * TICK_S
+        pushed.set_push(self.context, replace(push, time_s=start_s))
+        return f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s"
 
     @property
     def has_fallen(self) -> bool:
-        """Whether the robot has fallen."""
-        return bool(self._eval("margins")[self._fall_column] < 0)
-
-    def _aim_camera(self) -> None:
-        view = self.loop.view
-        level, up = math.cos(view.elevation_rad), math.sin(view.elevation_rad)
-        away = np.array(
-            [level * math.cos(view.azimuth_rad), level * math.sin(view.azimuth_rad), up]
-        )
-        for path in _OWN:
-            self.meshcat.SetProperty(path, "visible", False)
-        self._draw_grid()
-        self.meshcat.SetCameraPose(_DISTANCE * self._size_m * away, np.zeros(3))
-
-    def _draw_grid(self) -> None:
-        """Draws a round grid a little above the ground, by which one sees the robot move."""
-        # In pieces: some browsers do not draw a line that begins behind the camera.
-        n = _NUM_CELLS
-        x, y = (part.ravel() for part in np.mgrid[-n : n + 1.0, -n : n + 0.0])
-        is_near = np.hypot(x, np.maximum(np.abs(y), np.abs(y + 1.0))) <= n
-        x, y, z = x[is_near], y[is_near], np.full(is_near.sum(), 0.004 / _CELL_M)
-        starts = np.hstack([[x, y, z], [y, x, z]])
-        ends = np.hstack([[x, y + 1.0, z], [y + 1.0, x, z]])
-        self.meshcat.SetLineSegments(
-            _GRID, _CELL_M * starts, _CELL_M * ends, 1.0, Rgba(0.65, 0.67, 0.7)
-        )
-
-    def _follow(self) -> None:
-        """Moves the world so that the robot stays in the picture, from wherever a viewer looks."""
-        self._target = self._target + _FOLLOWED * (self._base()[:2] - self._target)
-        self.meshcat.SetTransform(_WORLD, RigidTransform([*-self._target, -self._height_m]))
-        # The ground has no end: its disc and whole cells of its grid stay below the robot.
-        cells = _CELL_M * np.round(self._target / _CELL_M)
-        self.meshcat.SetTransform(_GROUND, RigidTransform([*self._target, 0.0]))
-        self.meshcat.SetTransform(_GRID, RigidTransform([*cells, 0.0]))
+        """Whether the robot has fallen; False where nothing can fall."""
+        column = self._fall_column
+        return column is not None and bool(self._eval("margins")[column] < 0)
 
 
 class LiveThrows(LiveSession):
@@ -238,7 +220,7 @@ class LiveThrows(LiveSession):
     THROW, STAND = "Throw", "Stand up again"
     MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
 
-    def __init__(self, loop: LeggedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         self._thrown = require(loop, HasBall)
         self.probability_port = self._thrown.trigger_port
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
@@ -307,11 +289,11 @@ class LiveGoals(LiveSession):
     ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
     AXES = ("x [m]", "y [m]", "z [m]")
     probability_port = "calibrated_safety_probability"
-    _TARGET, _NEAREST = f"{_WORLD}/target", f"{_WORLD}/nearest_accepted"
+    _TARGET, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
     def __init__(
         self,
-        loop: LeggedLoop,
+        loop: ClosedLoop,
         meshcat: Meshcat,
         *,
         threshold: float,
@@ -335,7 +317,7 @@ class LiveGoals(LiveSession):
             self.panel.add_button(name, key)
         for name, low, high, value in zip(self.AXES, *box.tolist(), start, strict=True):
             self.panel.add_slider(name, low, high, 0.01, value)
-        radius_m = 0.03 * self._size_m
+        radius_m = 0.03 * (self._camera.size_m if self._camera else _SIZE_M)
         meshcat.SetObject(self._TARGET, Sphere(radius_m), Rgba(*COLOURS["plain"], 0.8))
         meshcat.SetObject(self._NEAREST, Sphere(radius_m), Rgba(*COLOURS["safe"], 0.8))
         self._goal = np.full(3, np.nan)

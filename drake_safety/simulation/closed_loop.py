@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -269,6 +270,24 @@ def _told_from(value: Any, other: Any) -> str:
     return f"{len(value)} names, of which {own} are its own"
 
 
+def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None:
+    """Checks that a loop has output ports.
+
+    Args:
+        loop: The closed loop.
+        names: The ports.
+        who: Beginning of the message.
+
+    Raises:
+        ValueError: A port is missing.
+    """
+    missing = [name for name in names if not loop.HasOutputPort(name)]
+    if missing:
+        ports = [loop.get_output_port(i).get_name() for i in range(loop.num_output_ports())]
+        task = type(loop).__name__
+        raise ValueError(f"{who}task '{task}' exports no port {missing}; it exports {ports}")
+
+
 def check_ports(loop: ClosedLoop) -> None:
     """Checks that the required ports of a loop exist and have the sizes of their names.
 
@@ -279,14 +298,11 @@ def check_ports(loop: ClosedLoop) -> None:
         ValueError: A port is missing, or has another size.
     """
     who = f"task '{type(loop).__name__}'"
+    require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
     ports = {
         port.get_name(): port.size()
         for port in (loop.get_output_port(i) for i in range(loop.num_output_ports()))
     }
-    required = REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ())
-    missing = [name for name in required if name not in ports]
-    if missing:
-        raise ValueError(f"{who} exports no port {missing}; it exports {list(ports)}")
     sizes = {"safe": 1}
     for port, attribute in _SIZED_BY.items():
         names = vars(loop).get(attribute)

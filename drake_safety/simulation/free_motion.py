@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.simulation.capabilities import CanFall, remove_visuals
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng
 
@@ -62,6 +62,7 @@ def run_free(
     Raises:
         ValueError: The loop has no such port, or the simulation fails before the first row.
     """
+    require_ports(loop, ("margins", *ports))
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()

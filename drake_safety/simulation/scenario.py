@@ -139,7 +139,7 @@ class Scenario:
         Args:
             variation: The plant.
             assessment: Adds an assessor and, for example, recovery.
-            meshcat: Adds a visualiser.
+            meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
             **options: Options of the task, such as ``recovery=False``.
 
         Raises:
@@ -147,7 +147,9 @@ class Scenario:
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
-        return task(self, variation, assessment=assessment, meshcat=meshcat, **options)
+        if _takes(task, "meshcat"):
+            options["meshcat"] = meshcat
+        return task(self, variation, assessment=assessment, **options)
 
     def to_yaml(self) -> str:
         """The scenario as canonical YAML text with all defaults."""
@@ -242,15 +244,18 @@ _LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
 """Lines of a robot.yaml that do not affect a simulation."""
 
 
+def _takes(task: type[ClosedLoop], name: str) -> bool:
+    """Whether a task's constructor takes an argument."""
+    parameters = inspect.signature(task).parameters
+    return name in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+
+
 def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
-    parameters = inspect.signature(task).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    # Arguments of make_loop itself.
-    common = ("scenario", "variation", "assessment", "meshcat")
-    known = [parameter.name for parameter in parameters if parameter.name not in common]
-    unknown = [name for name in options if name not in known]
+    unknown = [name for name in options if not _takes(task, name)]
     if unknown:
+        # Arguments of make_loop itself.
+        common = ("scenario", "variation", "assessment", "meshcat")
+        known = [name for name in inspect.signature(task).parameters if name not in common]
         raise ValueError(
             f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], known)}; it "
             f"has {known}"

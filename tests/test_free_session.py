@@ -1,0 +1,231 @@
+"""A live session with a task that has no goals, no ball and no legs, and `play` of such a task."""
+
+import contextlib
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+
+from cart_pole_task import SCENARIO, CartPole
+from command_line import call
+from drake_safety import AddSafetyAssessor, SafetyAssessment, load_scenario, run_episodes
+from drake_safety.cli.training_folder import assessment_file
+from drake_safety.live.free_session import LiveEpisodes
+from drake_safety.live.session import BREAK_S, STOP, TICK_S, LiveGoals
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
+from drake_safety.simulation.free_motion import run_free
+from drake_safety.simulation.scenario import parse_scenario
+from gliding_task import Gliding, gliding
+from live_scenarios import quick
+from shuttle_task import shuttling
+
+SHOWN_S = 1.5
+
+
+class BareCartPole(CartPole):
+    """A task whose constructor takes no Meshcat."""
+
+    def __init__(self, scenario, variation="nominal", *, assessment=None):
+        super().__init__(scenario, variation, assessment=assessment)
+
+
+class FewPorts(Gliding):
+    """A task that exports no more of its assessor than it has to."""
+
+    def add_assessor(self, builder, *, period_s, **ports):
+        assessor = AddSafetyAssessor(builder, self.assessment, period_s=period_s, **ports)
+        for name in ASSESSMENT_PORTS:
+            builder.ExportOutput(assessor.GetOutputPort(name), name)
+
+
+def learned(scenario, num_episodes=30):
+    episodes = run_episodes(scenario, num_episodes, num_workers=1)
+    return SafetyAssessment(scenario.assessment).fit(episodes)
+
+
+@pytest.fixture(scope="module")
+def meshcat():
+    return Meshcat()
+
+
+@pytest.fixture(scope="module")
+def cart_loop(meshcat):
+    scenario = parse_scenario(SCENARIO, name="cart_pole", folder=Path())
+    return scenario.make_loop(assessment=learned(scenario, 60), meshcat=meshcat)
+
+
+@pytest.fixture(scope="module")
+def shuttle_loop():
+    scenario = quick(shuttling())
+    return scenario.make_loop(assessment=learned(scenario))
+
+
+@pytest.fixture
+def session(cart_loop, meshcat):
+    return LiveEpisodes(cart_loop, meshcat, threshold=0.5)
+
+
+def set_state(session, *state):
+    cart = session.loop.cart
+    cart.SetPositionsAndVelocities(cart.GetMyMutableContextFromRoot(session.context), state)
+
+
+def ticks(session, seconds):
+    for _ in range(round(seconds / TICK_S)):
+        assert session.tick()
+
+
+def test_the_verdict_is_that_of_calibrated_gamma(session):
+    gamma = session.loop.GetOutputPort("calibrated_safety_probability")
+    seen = set()
+    for _ in range(300):
+        assert session.tick()
+        assert session.panel.probability == gamma.Eval(session.context)[0]
+        status = session.panel.status
+        if not session.cause:
+            assert status.state == ("safe" if session.probability >= 0.5 else "unsafe")
+            assert status.tone == status.state
+            seen.add(status.state)
+    assert seen == {"safe", "unsafe"}
+    assert session.panel.quantity == "calibrated Γ"
+
+
+def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, meshcat):
+    state = cart_loop.GetOutputPort("state")
+    starts = []
+    for _ in range(2):
+        session = LiveEpisodes(cart_loop, meshcat, threshold=0.5, seed=3)
+        starts.append(state.Eval(session.context).copy())
+        ticks(session, 0.4)
+        session.panel.click(session.NEW)
+        session.tick()
+        assert session.context.get_time() == pytest.approx(TICK_S)
+        starts.append(state.Eval(session.context).copy())
+    np.testing.assert_array_equal(starts[:2], starts[2:])
+    assert np.abs(starts[0] - starts[1]).max() > 0.1
+    assert session.panel.buttons == {STOP: "Escape", session.NEW: "KeyR"}
+
+
+def test_an_episode_whose_duration_has_passed_is_followed_by_the_next(session):
+    set_state(session, 0.0, 0.0, 0.0, 0.0)
+    ticks(session, 2.0)
+    assert session.panel.status.note == "the episode's 2 s have passed; the next start follows"
+    ticks(session, 1.6)
+    assert session.context.get_time() < 3 * TICK_S
+    assert session.panel.status.note == "R starts anew"
+
+
+def test_that_it_left_the_safe_set_is_shown_until_the_next_start(session):
+    set_state(session, 0.95, 0.0, 10.0, 0.0)
+    for _ in range(round(SHOWN_S / TICK_S)):
+        session.tick()
+        assert session.panel.status.state == "left the safe set: rail"
+    ticks(session, 3 * TICK_S)
+    assert session.context.get_time() < 4 * TICK_S
+    assert not session.cause
+
+
+@pytest.mark.parametrize(("failure", "told"), [("raise", "the solver failed"), ("nan", "finite")])
+def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, told):
+    scenario = quick(gliding(failure=failure, speed_m_s=4.0))
+    loop = scenario.make_loop(assessment=learned(scenario), meshcat=meshcat)
+    session = LiveEpisodes(loop, meshcat, threshold=0.5)
+    while session.tick():
+        pass
+    num_waits = 1
+    while not session.tick():
+        assert session.panel.status.state == "the simulation failed"
+        assert told in session.panel.status.note
+        num_waits += 1
+    assert num_waits * BREAK_S == pytest.approx(SHOWN_S, abs=2 * BREAK_S)
+    assert session.context.get_time() == pytest.approx(TICK_S)
+    loop.mass.parameters.fails_at_start = True
+    session = LiveEpisodes(loop, meshcat, threshold=0.5)
+    assert session.panel.status.note == "no start"
+    loop.mass.parameters.fails_at_start = False
+    session.panel.click(session.NEW)
+    assert session.tick()
+
+
+def test_what_can_be_pushed_has_a_button_for_it(shuttle_loop, meshcat):
+    session = LiveEpisodes(shuttle_loop, meshcat, threshold=0.5)
+    before = shuttle_loop.GetOutputPort("state").Eval(session.context)[3:].copy()
+    session.panel.click(session.PUSH)
+    ticks(session, 0.16)
+    after = shuttle_loop.GetOutputPort("state").Eval(session.context)[3:]
+    assert np.linalg.norm(after - before) > 0.1
+    assert session.panel.status.note.startswith("pushed with")
+
+
+def test_goals_need_no_legs(shuttle_loop, meshcat):
+    session = LiveGoals(shuttle_loop, meshcat, threshold=0.5)
+    assert not session.tick()
+    session.panel.click(session.FORCE)
+    ticks(session, 0.4)
+    assert not session.has_fallen
+
+
+def test_ports_that_are_not_exported_are_named(meshcat):
+    scenario = quick(gliding())
+    loop = FewPorts(scenario, assessment=learned(scenario))
+    message = r"'FewPorts' exports no port \['calibrated_safety_probability'"
+    with pytest.raises(ValueError, match=message):
+        LiveEpisodes(loop, meshcat, threshold=0.5)
+    with pytest.raises(ValueError, match=message):
+        run_free(loop, seed=0, duration_s=0.4, ports=("calibrated_safety_probability",))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A function that trains on a task of a module, and returns the scenario and the folder."""
+
+    def train(task):
+        folder = tmp_path_factory.mktemp("trained")
+        file = folder / "cart_pole.yaml"
+        file.write_text(SCENARIO.replace("cart_pole_task:CartPole", task))
+        learned(quick(load_scenario(file))).save(assessment_file(folder, "sharpened"))
+        return file, "--assessment", folder
+
+    return train
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "warning"),
+    [
+        ("cart_pole_task:CartPole", ""),
+        (
+            "test_free_session:BareCartPole",
+            "warning: task 'test_free_session:BareCartPole' draws nothing in Meshcat",
+        ),
+    ],
+)
+def test_such_a_task_can_be_played_and_an_empty_scene_is_warned_of(
+    monkeypatch, capsys, trained, task, warning
+):
+    page = pytest.importorskip("drake_safety.live.page")
+    shown = []
+
+    @contextlib.contextmanager
+    def serve_page(panel, **_):
+        timer = threading.Timer(0.5, panel.click, [STOP])
+        timer.start()
+        yield
+        timer.join()
+        shown.append(panel)
+
+    monkeypatch.setattr(page, "serve_page", serve_page)
+    arguments = trained(task)
+    assert call(monkeypatch, "play", *arguments) in (0, None)
+    told = capsys.readouterr().out
+    assert "of calibrated Γ" in told
+    assert "real-time factor" in told
+    assert ("draws nothing" in told) == bool(warning)
+    assert warning in told
+    assert shown[0].status.state == "stopped"
+    assert call(monkeypatch, "run", *arguments) in (0, None)
+    told = capsys.readouterr().out
+    assert ("draws nothing" in told) == bool(warning)
+    assert warning in told
