@@ -45,6 +45,15 @@ def stated_values(remedy):
     return yaml.safe_load("{" + entries + "}")
 
 
+def follow(file, key, remedy):
+    """Writes under a key of robot.yaml what a remedy says."""
+    kept = yaml.safe_load(file.read_text())[key]
+    replaced = re.search(r"in place of (\[.*?\])", remedy)
+    for pattern in yaml.safe_load(replaced[1]) if replaced else []:
+        del kept[pattern]
+    edited(file, **{key: kept | stated_values(remedy)})
+
+
 def test_what_new_writes_passes_its_check_as_it_is(spider):
     assert problems(spider.folder / "balancing.yaml", num_episodes=4) == {}
 
@@ -348,6 +357,13 @@ def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_mend_it(own)
     ("change", "item", "key"),
     [
         ({"posture": {"knee_0": 9.0, "lift_0": -0.4}}, "joint stops", "posture"),
+        ({"posture": {"knee_.*": 9.0, "lift_0": -0.4}}, "joint stops", "posture"),
+        ({"posture": {"lift_0": 0.9}}, "feet level", "posture"),
+        (
+            {"posture": {"lift_.*": -0.4, "knee_[0-4]": 1.6, "knee_5": 0.9}},
+            "feet level",
+            "posture",
+        ),
         ({"effort_limits": {}}, "motors", "effort_limits"),
         (
             {"joint_gains": {".*": {"stiffness": 0.05, "damping": 0.05}}},
@@ -360,12 +376,40 @@ def test_the_values_of_a_remedy_are_keys_of_robot_yaml_and_mend_it(own, change, 
     edited(own / "robot.yaml", **change)
     found = problems(own / "balancing.yaml")[item]
     assert f"'{key}'" in found.remedy
-    values = stated_values(found.remedy)
-    robot = yaml.safe_load((own / "robot.yaml").read_text())
     for _ in range(12):  # Gains are doubled at each check.
-        edited(own / "robot.yaml", **{key: robot[key] | values})
-        left = problems(own / "balancing.yaml").get(item)
-        if left is None:
+        follow(own / "robot.yaml", key, found.remedy)
+        found = problems(own / "balancing.yaml").get(item)
+        if found is None:
             return
-        values = stated_values(left.remedy)
-    raise AssertionError(left.message)
+    raise AssertionError(found.message)
+
+
+def test_feet_beside_the_centre_of_mass_come_with_a_posture_that_moves_them_below_it(tmp_path):
+    write_porter(tmp_path)
+    written = write_robot("carrier", tmp_path / "porter.urdf", "reaching", tmp_path / "carrier")
+    file = written.folder / "robot.yaml"
+    posture = yaml.safe_load(file.read_text())["posture"]
+    for side in ("left", "right"):  # The feet stay level, far ahead of the robot.
+        posture[f"{side}_hip_y"] -= 0.5
+        posture[f"{side}_ankle_y"] += 0.5
+    edited(file, posture=posture)
+    items = {"centre of mass over the feet", "base over the feet"}
+    found = problems(written.folder / "reaching.yaml")
+    assert items <= set(found)
+    (shift,) = {re.search(r"moves the feet by \((\S+), ", found[item].remedy)[1] for item in items}
+    assert float(shift) < -0.1
+    follow(file, "posture", found["base over the feet"].remedy)
+    assert problems(written.folder / "reaching.yaml") == {}
+
+
+def test_where_no_posture_is_found_a_remedy_says_what_to_look_at(own):
+    robot = yaml.safe_load((own / "robot.yaml").read_text())
+    names = list(robot["feet"])
+    feet = {name: robot["feet"][name] for name in (names[0], names[3])}  # On one line.
+    edited(own / "robot.yaml", feet=feet)
+    remedy = problems(own / "balancing.yaml")["centre of mass over the feet"].remedy
+    assert "no posture was found" in remedy and "'contact_points' under 'feet'" in remedy
+    robot["feet"][names[0]]["contact_points"] = [[3.0, 0.0, 0.0]]  # Too long a leg.
+    edited(own / "robot.yaml", feet=robot["feet"])
+    remedy = problems(own / "balancing.yaml")["feet level"].remedy
+    assert "no posture was found within the joint stops" in remedy and "'contact_points'" in remedy

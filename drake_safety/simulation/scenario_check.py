@@ -24,7 +24,10 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.remedies import (
+    LEVEL_M,
     effort_limits,
+    feet_below,
+    level_feet,
     scaled_gains,
     scaled_start,
     within_stops,
@@ -33,7 +36,6 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
 _STANDS = "stands for 1 s"
-_LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
@@ -190,16 +192,16 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
         )
     p_WC = kinematics.contact_positions(q)
     heights = p_WC[:, 2] - kinematics.foot_radii
-    if np.ptp(heights) > _LEVEL_M:
+    if np.ptp(heights) > LEVEL_M:
         high_feet = [
             name
             for name, points in zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
-            if heights[points].max() > _LEVEL_M
+            if heights[points].max() > LEVEL_M
         ]
         yield failed(
             "feet level",
             f"feet {high_feet} hang up to {100 * np.ptp(heights):.1f} cm over the ground",
-            "change 'posture' until all feet are equally low, or their contact points",
+            level_feet(kinematics),
         )
     else:
         yield passed(
@@ -218,7 +220,7 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
             yield failed(
                 item,
                 f"{-100 * distance:.1f} cm outside their polygon",
-                "change 'posture' so that the feet surround it, or 'contact_points'",
+                feet_below(kinematics, point),
             )
 
 
