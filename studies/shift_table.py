@@ -40,6 +40,7 @@ def shifts_text(results: Results) -> str:
     for name, kind in kinds.items():
         cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
         lines.append(f"| {name.replace('_', ' ')} ({kind}) | {' | '.join(cells)} |")
+    lines += _ranking(results, kinds)
     lines += _promises(results, kinds)
     false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
     lines.append(
@@ -47,6 +48,31 @@ def shifts_text(results: Results) -> str:
         f"hour on {false.n} safe nominal motions."
     )
     return "\n".join(lines)
+
+
+_RANKING_COLUMNS = {
+    "gamma.unknown": "DK",
+    "gamma.known_auc": "Γ, rows it knows",
+    "gradient_boosting.known_auc": "boosting, the same rows",
+    "without_novelty.auc": "Γ without novelty, all rows",
+    "gradient_boosting.auc": "boosting, all rows",
+    "gamma.auc": "Γ, DK a refusal",
+}
+
+
+def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
+    """The table of AUCs: on what Γ knows, and on all rows with and without refusals."""
+    names = [name for name in kinds if results.has(f"shifts.{name}.without_novelty.auc")]
+    lines = [
+        "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
+        'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n',
+        f"| shift | {' | '.join(_RANKING_COLUMNS.values())} |",
+        "|---|" + "---|" * len(_RANKING_COLUMNS),
+    ]
+    for name in names:
+        cells = [_cell(results, f"shifts.{name}.{key}") for key in _RANKING_COLUMNS]
+        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
+    return lines if names else []
 
 
 _PROMISE_COLUMNS = {

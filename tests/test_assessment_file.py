@@ -36,6 +36,8 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
     for field in dataclasses.fields(before):
         np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
     np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
+    assert loaded.embedding_.is_same(assessment.embedding_)
+    assert np.isfinite(loaded.embedding_.input_range).all() == assessment.parameters.is_sharpened
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -191,3 +191,28 @@ def test_weights_that_do_not_fit_are_refused(embedding):
         Embedding(missing, num_margins=1)
     with pytest.raises(ValueError, match="output layer has 3 columns, expected 5"):
         Embedding(embedding.weights, num_margins=3)
+
+
+def test_an_input_beyond_the_range_is_that_at_its_edge(embedding):
+    x = np.array([[9.0, 5.0, 1.0, -9.0], [0.1, 4.0, 1.1, 2.0]])
+    low, high = [-1.0, 0.0, 0.5, -2.0], [1.0, 8.0, 1.5, 3.0]
+    clipping = embedding.clipping(np.array([low, high]))
+    edge = np.array([[1.0, 5.0, 1.0, -2.0], [0.1, 4.0, 1.1, 2.0]])
+    np.testing.assert_array_equal(clipping.embed(x), embedding.embed(edge))
+    np.testing.assert_array_equal(clipping.activations(x), embedding.activations(edge))
+    assert np.abs(embedding.embed(x)[:, 0] - embedding.embed(edge)[:, 0]).min() > 1.0
+    assert not clipping.is_same(embedding)
+    np.testing.assert_array_equal(clipping.scaled(np.ones(2)).embed(x), clipping.embed(x))
+    logit, gradient = clipping.logit_gradient(x)
+    expected_logit, expected = embedding.logit_gradient(edge)
+    np.testing.assert_allclose(logit, expected_logit)
+    assert (gradient[0, [0, 3]] == 0.0).all()
+    np.testing.assert_array_equal(gradient[0, 1:3], expected[0, 1:3])
+    np.testing.assert_array_equal(gradient[1], expected[1])
+
+
+def test_a_range_of_another_width_is_refused(embedding):
+    with pytest.raises(
+        ValueError, match=r"range of inputs has the shape \(2, 3\), expected \(2, 4\)"
+    ):
+        embedding.clipping(np.zeros((2, 3)))

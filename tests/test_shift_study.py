@@ -197,6 +197,26 @@ def test_a_plant_of_its_own_has_the_scenarios_variations_alone():
     assert run_changed_starts(scenario, 2, seed=1) == {}
 
 
+def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessment):
+    # The only known safe motion lies above both unsafe ones; the unknown ones are safe.
+    motions = [
+        motion(4, 0.8, is_unsafe=False),
+        *(motion(2, -1.0, is_unsafe=False) for _ in range(2)),
+        *(motion(4, 0.5, is_unsafe=True) for _ in range(2)),
+    ]
+
+    def other(state, preview, features, is_outside):
+        probability = np.where(state[:, 0] < 0.0, 0.9, 1.0 - state[:, 0])
+        return Verdicts(probability=probability, is_unknown=np.zeros(len(state), dtype=bool))
+
+    shifted = ShiftedSet(kind="plan", motions=motions)
+    found = evaluate_shift(shifted, assessment, {"gamma": told, "other": other}).estimates
+    assert found["gamma.known_auc"].value == 1.0
+    assert found["gamma.auc"].value == pytest.approx(0.5)
+    assert found["other.known_auc"].value == 0.0
+    assert found["other.auc"].value == pytest.approx(0.5)
+
+
 def test_postures_and_falls_are_never_called_safe():
     scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
     sets = run_changed_starts(scenario, 6, seed=77, num_workers=1)

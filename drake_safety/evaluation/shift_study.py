@@ -201,19 +201,23 @@ def evaluate_shift(
 
         return _BOOTSTRAP.over_episodes(mean, of)
 
-    for name, judge in judges.items():
-        verdicts = judge(*rows.values())
-        is_wrong = (verdicts.probability >= CONFIDENT) & ~verdicts.is_unknown & is_unsafe[motion]
+    judged = {name: judge(*rows.values()) for name, judge in judges.items()}
+    gamma = judged["gamma"]
+    is_known, ends_unsafely = ~gamma.is_unknown, is_unsafe[motion]
+    for name, verdicts in judged.items():
+        is_wrong = (verdicts.probability >= CONFIDENT) & ~verdicts.is_unknown & ends_unsafely
         found[f"{name}.confident_error"] = share(is_wrong)
         found[f"{name}.unknown"] = share(verdicts.is_unknown)
         found[f"{name}.first.confident_error"] = proportion(
             int(is_wrong[first].sum()), len(motions)
         )
-        if 0 < is_unsafe.sum() < len(motions):
-            score = 1.0 - np.nan_to_num(verdicts.probability)
-            found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
+        # Of all rows, with "don't know" as the lowest probability, and of those that Γ knows.
+        for key, which in (("auc", np.ones(len(motion), dtype=bool)), ("known_auc", is_known)):
+            if 0 < ends_unsafely[which].sum() < which.sum():
+                score = 1.0 - np.nan_to_num(verdicts.probability[which])
+                found[f"{name}.{key}"] = auc(score, ends_unsafely[which], motion[which])
         if name == "gamma":
-            gamma, is_confident = verdicts, is_wrong
+            is_confident = is_wrong
     promise = assessment.calibrations_.get(PLAN)
     if promise is not None and is_unsafe.any():
         found |= _promised(promise, gamma.probability[first], is_unsafe)
