@@ -175,6 +175,14 @@ def test_what_does_not_fit_is_refused_with_what_there_is(options, message):
         record_episodes(make_glider, 1, reset=reset_glider, **(given | options))
 
 
+def test_a_function_without_source_text_is_refused():
+    made = {}
+    exec("def reset(diagram, context, rng):\n    pass", made)
+    given = {"ports": {"state": "position_and_speed"}, "duration_s": 1.0, "step_s": STEP_S}
+    with pytest.raises(ValueError, match=r"source of <function reset .* cannot be read, expected"):
+        record_episodes(make_glider, 1, reset=made["reset"], **given)
+
+
 def test_a_drake_plant_that_diverges_is_no_mistake():
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
     from pydrake.multibody.tree import SpatialInertia

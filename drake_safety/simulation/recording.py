@@ -249,7 +249,13 @@ def _hash(*parts: Any) -> str:
             text = _hash(part.func, part.args, sorted(part.keywords.items()))
         elif callable(part):
             is_text = inspect.isroutine(part) or inspect.isclass(part)
-            text = inspect.getsource(part if is_text else type(part))
+            try:
+                text = inspect.getsource(part if is_text else type(part))
+            except OSError as error:
+                raise ValueError(
+                    f"record_episodes: the source of {part} cannot be read, expected a function or "
+                    "class in a file or a notebook: a change of it must be noticed"
+                ) from error
         digest.update(text.encode() + b"\0")
     return digest.hexdigest()
 

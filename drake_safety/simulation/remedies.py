@@ -22,11 +22,7 @@ _ROOM_RAD = 0.05  # Distance from a joint stop.
 _MISSED_M = 0.01  # Largest distance of a foot from where it shall be.
 _SAME_RAD = 1e-3  # Smaller changes are none.
 _RAISED = (0.05, 0.1, 0.2)  # Higher grounds to try, in standing heights.
-_NUDGES_RAD = (
-    0.0,
-    0.2,
-    -0.2,
-)  # Guesses beside the posture: straight legs do not bend by themselves.
+_NUDGES_RAD = (0.0, 0.2, -0.2)  # Guesses beside the posture: straight legs stay straight.
 _NUM_SHIFTS = 3  # Of the feet under the centre of mass, which moves with the legs.
 _EFFORT = 4.0  # Largest torque over mass times height [m/s²], as `new` estimates it.
 
