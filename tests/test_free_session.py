@@ -85,11 +85,20 @@ def test_the_verdict_is_that_of_calibrated_gamma(session):
         assert session.panel.probability == gamma.Eval(session.context)[0]
         status = session.panel.status
         if not session.cause:
-            assert status.state == ("safe" if session.probability >= 0.5 else "unsafe")
-            assert status.tone == status.state
+            is_known = session.panel.belief[2] <= 0.65  # Half of it is from empty cells.
+            refused = "unsafe" if is_known else "don't know"
+            assert status.state == ("safe" if session.probability >= 0.5 else refused)
+            assert status.tone == (status.state if is_known else "plain")
             seen.add(status.state)
-    assert seen == {"safe", "unsafe"}
+    assert "safe" in seen and len(seen) > 1
     assert session.panel.quantity == "calibrated Γ"
+
+
+def test_a_state_unlike_training_is_not_called_unsafe_but_unknown(session):
+    set_state(session, 0.0, 0.0, 15.0, 0.0)
+    assert session.tick()
+    assert session.panel.belief == (0.0, 0.0, 1.0)
+    assert (session.panel.status.state, session.panel.status.cause) == ("don't know", "")
 
 
 def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, meshcat):

@@ -114,7 +114,5 @@ class LiveCommands(LiveSession):
                 note=f"{self._words.value(passed)}; asked: {note}",
                 tone="recovery",
             )
-        elif self.probability >= self.threshold:
-            self.panel.show(f"safe: {state}", note=note, tone="safe")
         else:
-            self.panel.show(f"unsafe: {state}", cause=self._cause(), note=note, tone="unsafe")
+            self._show_by_gamma(note, state)

@@ -109,7 +109,5 @@ class LiveEpisodes(LiveSession):
         if self.cause:
             name = self.cause.replace("_", " ")
             self.panel.show(f"left the safe set: {name}", note=note, tone="unsafe")
-        elif self.probability >= self.threshold:
-            self.panel.show("safe", note=note, tone="safe")
         else:
-            self.panel.show("unsafe", cause=self._cause(), note=note, tone="unsafe")
+            self._show_by_gamma(note)

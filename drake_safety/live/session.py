@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
-from drake_safety.learning.prediction import gamma_of_port
+from drake_safety.learning.prediction import gamma_of_port, is_unknown
 from drake_safety.live.following_camera import WORLD, FollowingCamera
 from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
@@ -181,6 +181,16 @@ class LiveSession(ABC):
         self.probability = float(probability)
         self.panel.show_gamma(self.probability, belief, time_s)
 
+    def _show_by_gamma(self, note: str, doing: str = "") -> None:
+        """Shows whether Γ has at least its threshold, or "don't know", and what the robot does."""
+        doing = f": {doing}" if doing else ""
+        if self.probability >= self.threshold:
+            self.panel.show(f"safe{doing}", note=note, tone="safe")
+        elif is_unknown(self._eval("belief")[None], self.assessment.parameters.initial_uncertainty):
+            self.panel.show(f"don't know{doing}", note=note)
+        else:
+            self.panel.show(f"unsafe{doing}", cause=self._cause(), note=note, tone="unsafe")
+
     def _cause(self) -> str:
         """The constraint that is most likely to be violated; "" for none."""
         return likely_cause(
@@ -269,10 +279,8 @@ class LiveThrows(LiveSession):
             self.panel.show("fallen", note=note, tone="unsafe")
         elif self._has_recovery and self._eval("recovery_active")[0] > 0:
             self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
-        elif self.probability >= self.threshold:
-            self.panel.show("safe: balancing", note=note, tone="safe")
         else:
-            self.panel.show("unsafe: balancing", cause=self._cause(), note=note, tone="unsafe")
+            self._show_by_gamma(note, "balancing")
 
 
 class LiveGoals(LiveSession):
