@@ -63,14 +63,15 @@ _RANKING_COLUMNS = {
 def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
     """The table of AUCs: on what Γ knows, and on all rows with and without refusals."""
     names = [name for name in kinds if results.has(f"shifts.{name}.without_novelty.auc")]
+    shown = [k for k in _RANKING_COLUMNS if any(results.has(f"shifts.{s}.{k}") for s in kinds)]
     lines = [
         "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
         'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n',
-        f"| shift | {' | '.join(_RANKING_COLUMNS.values())} |",
-        "|---|" + "---|" * len(_RANKING_COLUMNS),
+        f"| shift | {' | '.join(_RANKING_COLUMNS[key] for key in shown)} |",
+        "|---|" + "---|" * len(shown),
     ]
     for name in names:
-        cells = [_cell(results, f"shifts.{name}.{key}") for key in _RANKING_COLUMNS]
+        cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
         lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
     return lines if names else []
 
