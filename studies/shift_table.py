@@ -31,15 +31,8 @@ def shifts_text(results: Results) -> str:
     """
     entries = results.entries["shifts"]
     kinds: dict[str, str] = entries["kinds"]
-    shown = [key for key in _COLUMNS if any(results.has(f"shifts.{s}.{key}") for s in kinds)]
-    lines = [
-        f"```sh\n{entries['command']}\n```\n",
-        f"| shift | {' | '.join(_COLUMNS[key] for key in shown)} |",
-        "|---|" + "---|" * len(shown),
-    ]
-    for name, kind in kinds.items():
-        cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
-        lines.append(f"| {name.replace('_', ' ')} ({kind}) | {' | '.join(cells)} |")
+    lines = [f"```sh\n{entries['command']}\n```\n"]
+    lines += _table(results, {name: f"{name} ({kind})" for name, kind in kinds.items()}, _COLUMNS)
     lines += _ranking(results, kinds)
     lines += _promises(results, kinds)
     false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
@@ -63,17 +56,12 @@ _RANKING_COLUMNS = {
 def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
     """The table of AUCs: on what Γ knows, and on all rows with and without refusals."""
     names = [name for name in kinds if results.has(f"shifts.{name}.without_novelty.auc")]
-    shown = [k for k in _RANKING_COLUMNS if any(results.has(f"shifts.{s}.{k}") for s in kinds)]
-    lines = [
+    intro = (
         "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
-        'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n',
-        f"| shift | {' | '.join(_RANKING_COLUMNS[key] for key in shown)} |",
-        "|---|" + "---|" * len(shown),
-    ]
-    for name in names:
-        cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
-        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
-    return lines if names else []
+        'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n'
+    )
+    table = _table(results, dict(zip(names, names, strict=True)), _RANKING_COLUMNS)
+    return [intro, *table] if names else []
 
 
 _PROMISE_COLUMNS = {
@@ -88,17 +76,26 @@ _PROMISE_COLUMNS = {
 def _promises(results: Results, kinds: dict[str, str]) -> list[str]:
     """The table of a promise under shifts: plans missed and accepted."""
     names = [name for name in kinds if results.has(f"shifts.{name}.fixed.accepted")]
-    lines = [
+    intro = (
         "\nThe promise for plans: the stored threshold, and one that has followed the outcomes of "
         "the first half of a shift's unsafe motions, both on the second half; with the monitor, "
-        "all motions until its alarm.\n",
-        f"| shift | {' | '.join(_PROMISE_COLUMNS.values())} |",
-        "|---|" + "---|" * len(_PROMISE_COLUMNS),
+        "all motions until its alarm.\n"
+    )
+    table = _table(results, dict(zip(names, names, strict=True)), _PROMISE_COLUMNS)
+    return [intro, *table] if names else []
+
+
+def _table(results: Results, titles: dict[str, str], columns: dict[str, str]) -> list[str]:
+    """A row for each shift by its title, and the columns of which any shift has a figure."""
+    shown = [key for key in columns if any(results.has(f"shifts.{s}.{key}") for s in titles)]
+    lines = [
+        f"| shift | {' | '.join(columns[key] for key in shown)} |",
+        "|---|" + "---|" * len(shown),
     ]
-    for name in names:
-        cells = [_cell(results, f"shifts.{name}.{key}") for key in _PROMISE_COLUMNS]
-        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
-    return lines if names else []
+    for name, title in titles.items():
+        cells = [_cell(results, f"shifts.{name}.{key}") for key in shown]
+        lines.append(f"| {title.replace('_', ' ')} | {' | '.join(cells)} |")
+    return lines
 
 
 def _cell(results: Results, key: str) -> str:

@@ -5,7 +5,7 @@ import functools
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.feedback import feedback_sets
-from drake_safety.learning.segments import Episodes
+from drake_safety.learning.segments import Episodes, split
 from lip_episodes import make_episodes
 
 QUICK = {
@@ -22,6 +22,12 @@ NUM_PAIRS = 40
 @functools.cache
 def quick_episodes():
     return make_episodes(260, noise=0.002)
+
+
+@functools.cache
+def held_out_segments():
+    """Segments of episodes that no quick assessment has learned from."""
+    return split(make_episodes(150, seed=1, noise=0.002), stride=2, discount=0.99)
 
 
 def quick_assessment(mode):

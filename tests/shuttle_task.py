@@ -7,10 +7,13 @@ from typing import ClassVar
 import numpy as np
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.scenario import parse_scenario
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import load_scenario, parse_scenario
 
 SIDES = {"left": 1.0, "right": -1.0}
 BOX = np.array([[0.6, -0.3, 0.2], [1.4, 1.4, 1.0]])
@@ -193,3 +196,15 @@ assessment:
 
 def shuttling():
     return parse_scenario(SCENARIO, name="shuttling", folder=Path())
+
+
+def train_shuttle(folder):
+    """Learns both modes into a folder; returns the scenario's file."""
+    file = folder / "shuttling.yaml"
+    file.write_text(SCENARIO)
+    scenario = load_scenario(file)
+    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
+    for mode in MODES:
+        scenario.assessment.mode = mode
+        SafetyAssessment(scenario.assessment).fit(episodes).save(assessment_file(folder, mode))
+    return file

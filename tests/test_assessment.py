@@ -9,7 +9,7 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.segments import split
 from drake_safety.learning.training import segments_for
-from lip_assessments import QUICK, inputs, quick_assessment, quick_episodes
+from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
 
 
@@ -20,7 +20,7 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def held_out():
-    return split(make_episodes(150, seed=1, noise=0.002), stride=2, discount=0.99)
+    return held_out_segments()
 
 
 @pytest.fixture(scope="module", params=["sharpened", "paper"])

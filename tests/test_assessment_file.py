@@ -11,14 +11,12 @@ from drake_safety.learning import assessment_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.calibration import calibrate
-from drake_safety.learning.segments import split
-from lip_assessments import inputs, quick_assessment
-from lip_episodes import make_episodes
+from lip_assessments import held_out_segments, inputs, quick_assessment
 
 
 @pytest.fixture(scope="module")
 def held_out():
-    return split(make_episodes(150, seed=1, noise=0.002), stride=2, discount=0.99)
+    return held_out_segments()
 
 
 @pytest.fixture(scope="module", params=["sharpened", "paper"])

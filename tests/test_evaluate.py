@@ -6,12 +6,9 @@ import shutil
 import pytest
 
 from command_line import call
-from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.cli.evaluate_plans import PlanOptions, check_options
 from drake_safety.cli.training_folder import (
     MODES,
-    assessment_file,
-    episodes_folder,
     fresh_episodes_folder,
     load_assessment,
 )
@@ -19,22 +16,14 @@ from drake_safety.evaluation import figure_style
 from drake_safety.simulation import pushed_motions, rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import SCENARIO as SHUTTLE_SCENARIO
+from shuttle_task import train_shuttle
 
 
 @pytest.fixture(scope="module")
 def shuttle_run(tmp_path_factory):
     """A scenario whose plans have a goal, and what was learned of it."""
     folder = tmp_path_factory.mktemp("shuttle")
-    file = folder / "shuttling.yaml"
-    file.write_text(SHUTTLE_SCENARIO)
-    scenario = load_scenario(file)
-    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
-    for mode in MODES:
-        scenario.assessment.mode = mode
-        assessment = SafetyAssessment(scenario.assessment).fit(episodes)
-        assessment.save(assessment_file(folder, mode))
-    return file, folder
+    return train_shuttle(folder), folder
 
 
 def evaluate_shuttle(monkeypatch, run, *arguments):

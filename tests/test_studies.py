@@ -7,13 +7,10 @@ import sys
 import pytest
 import typer
 
-from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.metrics import proportion
-from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation import rollouts
-from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import SCENARIO
+from shuttle_task import train_shuttle
 from studies import ablation_study, planning_study
 from studies.__main__ import app, main
 from studies.learning_curve import parse_sizes
@@ -31,14 +28,7 @@ def call(monkeypatch, *arguments):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shuttle")
-    file = folder / "shuttling.yaml"
-    file.write_text(SCENARIO)
-    scenario = load_scenario(file)
-    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
-    for mode in MODES:
-        scenario.assessment.mode = mode
-        SafetyAssessment(scenario.assessment).fit(episodes).save(assessment_file(folder, mode))
-    return file, folder
+    return train_shuttle(folder), folder
 
 
 @pytest.mark.slow

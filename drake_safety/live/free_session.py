@@ -86,7 +86,7 @@ class LiveEpisodes(LiveSession):
             yield
         except RuntimeError as error:
             # Drake's solvers raise it, and so does a task whose simulation diverges.
-            note = textwrap.shorten(str(error), _NUM_CHARACTERS, placeholder=" …")
+            note = textwrap.shorten(str(error), _NUM_CHARACTERS)
             self.panel.show("the simulation failed", note=note, tone="unsafe")
             self._num_waits = round(_SHOWN_S / BREAK_S)
             self._end_s = -math.inf
