@@ -208,17 +208,17 @@ def recalibrated(
     """Corrects the base logit by feedback, and the beliefs, (K, R*R, 3 + n_c), with it.
 
     Args:
-        feedback: See `fitted_correction`, as what follows up to `base_logit`.
-        segments: See there.
-        x: Inputs of the segments, (N, n_x).
-        points: See there.
-        inputs: See there.
-        embedding: See there.
-        base_logit: See there.
-        training: See `recalibrated_beliefs`, as the others.
-        grid: See there.
-        parameters: See there.
-        num_causes: See there.
+        feedback: Pairs of actual episodes and their nominal twins.
+        segments: Their segments.
+        x: Inputs of the segments, (M, n_x).
+        points: Psi(x), (K, M, 2).
+        inputs: Maps states, previews and features to x.
+        embedding: The maps.
+        base_logit: The base logit.
+        training: Scores of the training segments.
+        grid: The grid.
+        parameters: The assessment's parameters.
+        num_causes: n_c.
     """
     correction = fitted_correction(
         feedback,
