@@ -97,7 +97,7 @@ class CartPole(ClosedLoop):
             period_s=scenario.step_s,
             **{
                 name: balancer.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features")
+                for name in ("state", "desired_preview", "features", "margins")
             },
         )
         self.finish(builder)
@@ -119,5 +119,5 @@ step_s: 0.1
 time_step_s: 0.005
 control_period_s: 0.02
 variations: {nominal: {}, actual: {}}
-assessment: {horizon: 8, epochs: 20, ensemble_size: 1, hidden_sizes: [32]}
+assessment: {horizon: 8}
 """
