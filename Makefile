@@ -77,10 +77,11 @@ $(WALKING): $(INSTALLED) policies.txt
 	$(BIN)/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
 
-$(LIGHT)/.installed: pyproject.toml constraints.txt
+$(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 	$(PYTHON) -m venv $(LIGHT)
 	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
 		".[live,mujoco,report,robots,test,walking]"
+	$(LIGHT)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
 
 $(LOWEST)/.installed: pyproject.toml lowest.txt

@@ -12,9 +12,11 @@ import warnings
 from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
-from types import BuiltinFunctionType, ModuleType
+from operator import attrgetter
+from types import ModuleType
 from typing import Any
 
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
 from drake_safety.learning.progress import shown
@@ -193,16 +195,23 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, name="end_with_parent", daemon=True).start()
 
 
-def _reduce_builtin(function: Any) -> Any:
-    if type(function.__self__).__name__ == "PyCapsule":
-        return getattr, (importlib.import_module(function.__module__), function.__name__)
-    return function.__reduce__()
+def _named(module: str, name: str) -> Any:
+    return attrgetter(name)(importlib.import_module(module))
+
+
+def _reduce_bound(function: Any) -> Any:
+    # pybind11 binds a function as Python's built-in methods are, to a capsule of its own.
+    owner = getattr(function, "__self__", None)
+    if owner is not None and type(owner).__name__ != "PyCapsule":
+        return function.__reduce__()
+    return _named, (function.__module__, function.__qualname__.removeprefix("PyCapsule."))
 
 
 # Functions of a notebook or a script are pickled for the workers with all that they use. Two kinds
 # of pydrake objects cannot be pickled by name: bound functions such as StabilizingLQRController,
-# and the metaclass of its systems, whose module does not exist.
-copyreg.pickle(BuiltinFunctionType, _reduce_builtin)
+# whose type is Python's own with pybind11 and another with nanobind, and the metaclass of its
+# systems, whose module does not exist.
+copyreg.pickle(type(RigidTransform.Identity), _reduce_bound)
 _METACLASS = type(LeafSystem)
 vars(sys.modules.setdefault(_METACLASS.__module__, ModuleType(_METACLASS.__module__))).setdefault(
     _METACLASS.__name__, _METACLASS
