@@ -23,6 +23,8 @@ from drake_safety.control.whole_body_model import (
 SOLVED = 0
 """Status of a solved program; other values are daqp's negative exit flags."""
 
+# From 0.10 on daqp would first eliminate the equations, which takes longer.
+_OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTION_OFF") else {}
 _BOUNDLESS = 1e12  # Squared norms from this size on count as not finite.
 _TINY = 1e-300
 _ORIGIN = np.zeros(3)
@@ -281,9 +283,7 @@ def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     A, g = qp.A.copy(), np.zeros(n)
     A[: qp.num_vdot_rows, :n_v] = dtrtrs(U, qp.A[: qp.num_vdot_rows, :n_v].T, trans=1)[0].T
     g[:n_v] = dtrtrs(U, qp.g, trans=1)[0]
-    x, _, flag, _ = daqp.solve(
-        np.eye(n), g, A, qp.upper, qp.lower, qp.sense, eq_reduction=daqp.EQ_REDUCTION_OFF
-    )
+    x, _, flag, _ = daqp.solve(np.eye(n), g, A, qp.upper, qp.lower, qp.sense, **_OPTIONS)
     x[:n_v] = dtrtrs(U, x[:n_v])[0]
     is_solved = flag == 1 and x.dot(x) < math.inf
     return WholeBodySolution(
