@@ -23,7 +23,7 @@ from drake_safety.control.whole_body_model import (
 SOLVED = 0
 """Status of a solved program; other values are daqp's negative exit flags."""
 
-# From 0.10 on daqp would first eliminate the equations, which takes longer.
+# Before 0.10 daqp has no elimination of equations to switch off.
 _OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTION_OFF") else {}
 _BOUNDLESS = 1e12  # Squared norms from this size on count as not finite.
 _TINY = 1e-300
