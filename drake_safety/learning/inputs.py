@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
@@ -16,7 +18,14 @@ def is_rate(name: str) -> bool:
 def used_states(info: EpisodesInfo, parameters: AssessmentParameters) -> np.ndarray:
     """Returns which states are columns of x, (n_s,)."""
     has_rates = parameters.is_sharpened or parameters.paper.velocities
-    return np.array([has_rates or not is_rate(name) for name in info.state_names], dtype=bool)
+    return _used_states(tuple(info.state_names), has_rates)
+
+
+@functools.cache
+def _used_states(names: tuple[str, ...], has_rates: bool) -> np.ndarray:
+    is_used = np.array([has_rates or not is_rate(name) for name in names], dtype=bool)
+    is_used.setflags(write=False)
+    return is_used
 
 
 def plan_columns(info: EpisodesInfo, parameters: AssessmentParameters) -> slice:
@@ -45,10 +54,8 @@ def inputs(
         ValueError: One of them has another width or number of rows, is missing, or is no number.
     """
     is_used = used_states(info, parameters)
-    widths = {
-        "state": (state, len(is_used)),
-        "desired_preview": (desired_preview, info.horizon * len(info.output_names)),
-    }
+    given = [("state", state, len(is_used))]
+    given.append(("desired_preview", desired_preview, info.horizon * len(info.output_names)))
     who = f"SafetyAssessment of '{info.scenario}'"
     if parameters.is_sharpened and info.feature_names:
         if features is None:
@@ -56,9 +63,9 @@ def inputs(
                 f"{who}: features are missing, expected {len(info.feature_names)} columns: "
                 f"{info.feature_names}"
             )
-        widths["features"] = (features, len(info.feature_names))
+        given.append(("features", features, len(info.feature_names)))
     parts: list[np.ndarray] = []
-    for name, (values, width) in widths.items():
+    for name, values, width in given:
         try:
             part = np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
@@ -74,7 +81,7 @@ def inputs(
                 f"shape {parts[0].shape}"
             )
         parts.append(part)
-    if not is_used.all():
+    if parts[0].shape[-1] != np.count_nonzero(is_used):
         parts[0] = parts[0][..., is_used]
     if len(parts) == 3 and parameters.feature_unit:
         parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
