@@ -53,6 +53,7 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "evaluate",
         "compare",
         "adapt",
+        "export",
         "report",
     ]
     for command in commands.values():

@@ -32,13 +32,14 @@ ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessm
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "trimesh", "collada"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "onnx", "trimesh", "collada"}
 # What only an extra brings, and the files that may import it.
 EXTRAS = {
     "cluster": "drake_safety/simulation/cluster",
     "live": "drake_safety/live/page",
     "logs": "drake_safety/logs/",
     "mujoco": "drake_safety/plants/mujoco",
+    "onnx": "drake_safety/learning/onnx_graph.py",
     "report": "drake_safety/evaluation/report/page",
     "robots": "drake_safety/robots/",
     "walking": "drake_safety/control/policy_network.py",

@@ -448,6 +448,35 @@ class SafetyAssessment:
         learned = {name: value for name, value in vars(self).items() if name.endswith("_")}
         assessment_file.write(Path(path), self.parameters, learned)
 
+    def to_onnx(self, path: str | os.PathLike[str]) -> None:
+        """Writes `predict` as one ONNX graph, atomically; see docs/export.md.
+
+        It is that of the present beliefs, correction and novelty, and its metadata say what its
+        inputs are, what its thresholds promise and for which plant.
+
+        Args:
+            path: The file.
+
+        Raises:
+            ValueError: The package `onnx` is not installed, or the assessment is not fitted.
+        """
+        from drake_safety.learning import onnx_graph
+
+        self._check_fitted()
+        onnx_graph.write(
+            Path(path),
+            info=self.info_,
+            parameters=self.parameters,
+            embedding=self.embedding_,
+            grid=self.grid_,
+            beliefs=self.beliefs_,
+            correction=self.correction_,
+            base_logit=self.base_logit_,
+            novelty=self.novelty_,
+            calibrations=list(self.calibrations_.values()),
+            adaptation=self.adaptation_,
+        )
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
         """Reads a file written by `save`.
