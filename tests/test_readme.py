@@ -3,8 +3,10 @@
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +91,23 @@ def test_every_make_target_of_the_readme_is_in_the_makefile():
     targets = set(re.findall(r"^([a-z]+):.*## ", makefile, flags=re.MULTILINE))
     named = {call[0] for call in shell_commands("make")}
     assert {"demo", "test"} <= named <= targets
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_help_lists_every_target_that_is_no_file():
+    makefile = (ROOT / "Makefile").read_text()
+    named = " ".join(re.findall(r"^\.PHONY: (.*)$", makefile, flags=re.MULTILINE)).split()
+    command = ["make", "--no-print-directory", "help"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = re.findall(r"^  make (\S+) +\S", printed, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(named)
+
+
+def test_the_citation_is_of_this_version_and_licence():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    stated = ("name", "version", "license", "keywords")
+    assert [cited[key] for key in ("title", *stated[1:])] == [project[key] for key in stated]
 
 
 def test_what_is_said_of_the_demo_is_what_it_does():
