@@ -25,6 +25,9 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
 OWN_DIAGRAM = (ROOT / "docs/own_diagram.md").read_text(encoding="utf-8")
+CARDS = "".join(
+    path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("assessments/*/README.md"))
+)
 
 
 def blocks(language, text=README):
@@ -76,10 +79,10 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     assert belief.sum() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_every_command_of_the_readme_and_of_the_command_line_page_parses():
+def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():
     for program, commands in (("drake-safety", app), ("python -m studies", studies)):
         group = typer.main.get_command(commands)
-        calls = shell_commands(program, README + COMMANDS)
+        calls = shell_commands(program, README + COMMANDS + CARDS)
         assert {call[0] for call in calls} == set(group.commands)
         for name, *arguments in calls:
             # Parses and validates; nothing is run.
