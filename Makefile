@@ -23,7 +23,7 @@ demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the ro
 
 walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies
 
-test: $(DEVELOPED) ## Run the tests, a process a core
+test: $(DEVELOPED) ## Run the tests, a process a core, eight at most
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 \
 		--dist loadfile --no-loadscope-reorder
 
@@ -36,10 +36,10 @@ bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table,
 	mkdir -p $(dir $(BENCH))
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-quiet --benchmark-json=$(BENCH)
 
-docs: $(DEVELOPED) ## Build the reference into build/site; a warning is an error
+docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict
 
-clean: ## Remove the environment, the caches and what was built (runs/ stays)
+clean: ## Remove the environment, the tools' caches and what was built (runs/ stays)
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks
 
 $(INSTALLED): pyproject.toml constraints.txt
