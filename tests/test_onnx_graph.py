@@ -101,31 +101,20 @@ def difference(found, expected):
     return np.where(is_same, 0.0, np.where(np.isnan(apart), np.inf, apart)).max(initial=0.0)
 
 
-def own_rounding(assessment, ports, num=200):
-    """How far `predict_one` is from `predict`: the sums of single precision in another order."""
-    many = assessment.predict(**{name: values[:num] for name, values in ports.items()})
-    ones = [assessment.predict_one(**{n: v[row] for n, v in ports.items()}) for row in range(num)]
-    return {
-        name: difference(np.array([getattr(one, field) for one in ones]), getattr(many, field))
-        for name, field in FIELDS.items()
-    }
-
-
 def check_equal(assessment, runtime, ports=None):
     """Checks that all outputs are those of `predict`; returns these."""
     ports = every_kind_of_input(assessment) if ports is None else ports
     found, expected = runtime(ports), assessment.predict(**ports)
     assert found.keys() == FIELDS.keys()
-    rounding = own_rounding(assessment, ports)
     finite = np.isfinite(expected.novelty)
     for name in ("belief", "safety_probability", "cause_probability"):
         apart = difference(found[name], getattr(expected, FIELDS[name]))
-        assert apart <= SINGLE + 3.0 * rounding[name], name
+        assert apart <= SINGLE, name
     for name in ("predicted_margins", "embedding"):
         value = getattr(expected, FIELDS[name])
         np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(value))
         known = finite & (expected.novelty <= 1.0)
-        assert difference(found[name][known], value[known]) <= 1e-3 + 3.0 * rounding[name], name
+        assert difference(found[name][known], value[known]) <= 1e-3, name
     np.testing.assert_array_equal(np.isinf(found["novelty"]), ~finite)
     np.testing.assert_allclose(found["novelty"], expected.novelty, rtol=1e-9)
     assert all(values.dtype == np.float64 for values in found.values())

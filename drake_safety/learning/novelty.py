@@ -61,12 +61,17 @@ class Moments:
         return variance, axes
 
 
-class _Distances:
+class Distances:
     """Squared Mahalanobis distances whose variances have a lower bound along each axis.
 
     Axes with less than the bound v share it, so their part of a distance is what the others leave
     of the standardised offset z: Σ (aᵢ·z)²/max(vᵢ, v) = |z|²/v - Σ (aᵢ·z)² (1/v - 1/vᵢ) over the
     axes with vᵢ > v. That takes a third of the products.
+
+    Attributes:
+        mean: Mean of the known inputs, (n_x,).
+        axes: Axes along which offsets from it are projected, (n_x, m).
+        terms: Weights of the squares of an offset's entries and of its projections, (n_x + m, 3).
     """
 
     def __init__(self, known: Moments, plan: slice):
@@ -81,16 +86,16 @@ class _Distances:
             axes[:, is_redundant] / np.sqrt(redundant),
             _above(own_variance, planned, _LEAST_PLAN_VARIANCE),
         ]
-        self._mean = known.mean
-        self._axes = np.concatenate(parts, axis=1) / known.scale[:, None]
+        self.mean = known.mean
+        self.axes = np.concatenate(parts, axis=1) / known.scale[:, None]
         # The distances are sums of squares of the offset's entries and of those along the axes.
         num_inputs, squared_scale = len(axes), known.scale**2
-        self._terms = np.zeros((num_inputs + self._axes.shape[1], NUM_DISTANCES))
-        self._terms[:num_inputs, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
-        self._terms[plan, 2] = 1.0 / (_LEAST_PLAN_VARIANCE * squared_scale[plan])
+        self.terms = np.zeros((num_inputs + self.axes.shape[1], NUM_DISTANCES))
+        self.terms[:num_inputs, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
+        self.terms[plan, 2] = 1.0 / (_LEAST_PLAN_VARIANCE * squared_scale[plan])
         start = num_inputs
         for distance, (part, sign) in enumerate(zip(parts, (-1.0, 1.0, -1.0), strict=True)):
-            self._terms[start : start + part.shape[1], distance] = sign
+            self.terms[start : start + part.shape[1], distance] = sign
             start += part.shape[1]
 
     def squared(self, x: np.ndarray) -> np.ndarray:
@@ -98,18 +103,18 @@ class _Distances:
 
         One product for each row: those of many rows at once would round differently.
         """
-        num_inputs = len(self._mean)
-        entries = np.empty((len(x), 1, len(self._terms)))
-        offset = np.subtract(x, self._mean, out=entries[:, 0, :num_inputs])
-        np.matmul(offset[:, None], self._axes, out=entries[:, :, num_inputs:])
+        num_inputs = len(self.mean)
+        entries = np.empty((len(x), 1, len(self.terms)))
+        offset = np.subtract(x, self.mean, out=entries[:, 0, :num_inputs])
+        np.matmul(offset[:, None], self.axes, out=entries[:, :, num_inputs:])
         np.multiply(entries, entries, out=entries)
-        found: np.ndarray = (entries @ self._terms)[:, 0]
+        found: np.ndarray = (entries @ self.terms)[:, 0]
         return found
 
     def precision(self) -> np.ndarray:
         """The matrix of the sum of the three as a quadratic form of the offset, (n_x, n_x)."""
-        of_entries, of_axes = np.split(self._terms.sum(axis=1), [len(self._mean)])
-        return np.diag(of_entries) + (self._axes * of_axes) @ self._axes.T
+        of_entries, of_axes = np.split(self.terms.sum(axis=1), [len(self.mean)])
+        return np.diag(of_entries) + (self.axes * of_axes) @ self.axes.T
 
 
 def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
@@ -149,10 +154,10 @@ class Novelty:
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         self.plan = plan
         known = training if feedback is None else training.joined(feedback)
-        self._known, self._distances = known, _Distances(known, plan)
+        self._known, self.quadratic = known, Distances(known, plan)
         # Without other episodes to choose them from, the limits are infinite: nothing is novel that
         # is finite.
-        self._inverse_limits = 1.0 / np.square(self.limits)
+        self.inverse_limits = 1.0 / np.square(self.limits)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Novelty:
         return self
@@ -226,7 +231,7 @@ class Novelty:
         Those of an input that is not finite are infinite.
         """
         with ONE_BLAS_THREAD, np.errstate(invalid="ignore", over="ignore"):
-            squared = self._distances.squared(x)
+            squared = self.quadratic.squared(x)
             # Rounding may make a small square negative. `fmin` chooses the number beside NaN.
             distances: np.ndarray = np.fmin(np.sqrt(np.maximum(squared, 0.0)), np.inf)
         return distances
@@ -237,8 +242,8 @@ class Novelty:
         An input is novel above 1; that of an input that is not finite is infinite.
         """
         with ONE_BLAS_THREAD, np.errstate(invalid="ignore", over="ignore"):
-            squared = self._distances.squared(x)
-            squared *= self._inverse_limits
+            squared = self.quadratic.squared(x)
+            squared *= self.inverse_limits
             found = np.maximum.reduce(squared, axis=1)
             distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
         return distance
@@ -251,5 +256,5 @@ class Novelty:
         Args:
             x: One input, (n_x,).
         """
-        precision = self._distances.precision()
+        precision = self.quadratic.precision()
         return precision @ (x - self._known.mean) / np.sqrt(np.diag(precision))

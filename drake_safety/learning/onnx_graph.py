@@ -93,7 +93,7 @@ def write(
     if parameters.is_sharpened and info.feature_names:
         inputs["features"] = info.widths["features"]
     x, is_usable = _inputs(nodes, inputs, info, parameters)
-    y, logit, margins, activations = _maps(nodes, x, embedding)
+    y, logit, margins, activations = _maps(nodes, nodes("Where", is_usable, x, 0.0), embedding)
     share = _novelty(nodes, x, novelty)
     is_known = nodes("And", is_usable, nodes("LessOrEqual", share, 1.0))
     weights, inside = _cell_weights(nodes, y, grid, parameters.is_sharpened)
@@ -108,7 +108,7 @@ def write(
     nodes.columns(masses, 3, 3 + num_causes, output="cause_probability")
     nan = np.full(num_causes, np.nan)
     nodes("Where", is_usable, nan if margins is None else margins, nan, output="predicted_margins")
-    nodes("Squeeze", nodes("Where", is_usable, share, np.inf), [1], output="novelty")
+    nodes("Squeeze", share, [1], output="novelty")
     first = nodes("Gather", y, np.array(0), axis=0)
     nodes("Where", is_usable, first, np.full(2, np.nan), output="embedding")
     safe, unsafe, uncertainty = (
@@ -257,7 +257,7 @@ def _port(name: str, width: int | None) -> onnx.ValueInfoProto:
 def _inputs(
     nodes: _Nodes, ports: Iterable[str], info: EpisodesInfo, parameters: AssessmentParameters
 ) -> tuple[str, str]:
-    """x, (N, n_x), zero in rows that are not usable, and which are usable, (N, 1)."""
+    """x, (N, n_x), and which rows the maps can take, (N, 1)."""
     parts = list(ports)
     is_used = used_states(info, parameters)
     if not is_used.all():
@@ -268,12 +268,11 @@ def _inputs(
         root = nodes("Sqrt", nodes("Add", nodes("Mul", u, u), 1.0))
         size = nodes("Log", nodes("Add", nodes("Abs", u), root))
         parts.append(nodes("Mul", nodes("Sign", u), size))
-    x = nodes("Concat", *parts, axis=1)
+    x = nodes("Concat", *parts, axis=1, output="x")
     # False for NaN.
-    is_usable = nodes(
-        "Less", nodes("ReduceSumSquare", x, axes=[1], keepdims=1), INPUT_LIMIT, output="is_usable"
-    )
-    return nodes("Where", is_usable, x, 0.0, output="x"), is_usable
+    is_small = nodes.double(nodes("Less", nodes("Abs", x), INPUT_LIMIT))
+    is_usable = nodes("Greater", nodes("ReduceMin", is_small, axes=[1], keepdims=1), 0.5)
+    return x, is_usable
 
 
 def _maps(nodes: _Nodes, x: str, embedding: Embedding) -> tuple[str, str | None, str | None, str]:
@@ -283,13 +282,14 @@ def _maps(nodes: _Nodes, x: str, embedding: Embedding) -> tuple[str, str | None,
     weights = embedding.weights
 
     def layer(name: str, z: str) -> str:
-        product = nodes("MatMul", z, weights[f"{name}.weight"])
-        return nodes("Add", product, weights[f"{name}.bias"][:, None, :])
+        bias = embedding.centred_bias if name == "trunk.0" else weights[f"{name}.bias"]
+        return nodes("Add", nodes("MatMul", z, weights[f"{name}.weight"]), bias[:, None])
 
-    z = nodes("Cast", x, to=TensorProto.FLOAT)
+    z = x
     if np.isfinite(embedding.input_range).any():
-        low, high = embedding.input_range
+        low, high = embedding.input_range.astype(float)
         z = nodes("Max", nodes("Min", z, high), low)
+    z = nodes("Cast", nodes("Sub", z, embedding.centre), to=TensorProto.FLOAT)
     for i in range(embedding.num_layers):
         z = nodes("Relu", layer(f"trunk.{i}", z))
     output = layer("output", z)
@@ -305,18 +305,14 @@ def _maps(nodes: _Nodes, x: str, embedding: Embedding) -> tuple[str, str | None,
 
 def _novelty(nodes: _Nodes, x: str, novelty: Novelty) -> str:
     """The largest distance in units of its limit, (N, 1), in double precision."""
-    known = novelty.training
-    if novelty.feedback is not None:
-        known = known.joined(novelty.feedback)
-    whitenings = known.whitenings(novelty.plan)
-    widths = [whitening.shape[1] for whitening in whitenings]
-    whitened = nodes(
-        "MatMul", nodes("Sub", x, known.mean), np.concatenate(whitenings, axis=1), output="whitened"
-    )
-    # Sums the squares of each distance's axes; those of an infinite limit count as zero.
-    sums = np.repeat(np.diag(1.0 / novelty.limits**2), widths, axis=0)
-    shares = nodes("MatMul", nodes("Mul", whitened, whitened), sums)
-    return nodes("Sqrt", nodes("ReduceMax", shares, axes=[1], keepdims=1))
+    of = novelty.quadratic
+    offset = nodes("Sub", x, of.mean)
+    entries = nodes("Concat", offset, nodes("MatMul", offset, of.axes), axis=1)
+    shares = nodes("MatMul", nodes("Mul", entries, entries), of.terms * novelty.inverse_limits)
+    largest = nodes("ReduceMax", shares, axes=[1], keepdims=1)
+    # Of inputs that are not finite, some entries are NaN.
+    is_finite = nodes("Less", largest, np.inf)
+    return nodes("Sqrt", nodes("Where", is_finite, nodes("Max", largest, 0.0), np.inf))
 
 
 def _cell_weights(nodes: _Nodes, y: str, grid: Grid, is_sharpened: bool) -> tuple[str, str]:

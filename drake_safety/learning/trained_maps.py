@@ -40,6 +40,10 @@ class Embedding:
     (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them. They are copied to
     single precision.
 
+    Attributes:
+        centre: What is subtracted from inputs before they are multiplied, (n_x,).
+        centred_bias: Bias of the first layer for these inputs, (K, out).
+
     Args:
         weights: The arrays.
         num_margins: n_c, the number of predicted margins.
@@ -87,17 +91,6 @@ class Embedding:
                 f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
                 f"{2 + num_margins} for {num_margins} margins"
             )
-        # With an axis for the rows of x.
-        *self._trunk, self._readout = [(w[:, None], b[:, None]) for w, b in self._layers]
-        if self.has_safety_head:
-            # The safety head reads y, so its first layer is a part of the output layer.
-            (weight, bias), (head, head_bias) = self._layers[-1], self._layer("safety.0")
-            y = [part[..., :2].astype(float) for part in (weight, bias)]
-            columns = (weight, y[0] @ head), (bias, y[1] @ head + head_bias)
-            weight, bias = (np.concatenate(c, axis=2).astype(np.float32)[:, None] for c in columns)
-            self._readout = weight, bias
-            weight, bias = self._layer("safety.1")
-            self._logit = weight[:, None], bias[:, None]
         self.input_range = np.full((2, self.num_inputs), np.inf, dtype=np.float32)
         self.input_range[0] = -np.inf
         if input_range is not None:
@@ -108,6 +101,28 @@ class Embedding:
                 )
             self.input_range[:] = input_range
         self.input_range.setflags(write=False)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Sets what `evaluate` multiplies, each with an axis for the rows of x."""
+        (weight, bias), *others = self._layers
+        # A column's spread may be a thousandth of its values, which single precision would lose.
+        self.centre = np.zeros(self.num_inputs)
+        if np.isfinite(self.input_range).all():
+            self.centre = self.input_range.mean(axis=0, dtype=float)
+            bias = (bias + (self.centre @ weight.astype(float))[:, None]).astype(np.float32)
+        self.centred_bias = bias[:, 0]
+        layers = [(w[:, None], b[:, None]) for w, b in ((weight, bias), *others)]
+        *self._trunk, self._readout = layers
+        if self.has_safety_head:
+            # The safety head reads y, so its first layer is a part of the output layer.
+            (weight, bias), (head, head_bias) = self._layers[-1], self._layer("safety.0")
+            y = [part[..., :2].astype(float) for part in (weight, bias)]
+            columns = (weight, y[0] @ head), (bias, y[1] @ head + head_bias)
+            weight, bias = (np.concatenate(c, axis=2).astype(np.float32)[:, None] for c in columns)
+            self._readout = weight, bias
+            weight, bias = self._layer("safety.1")
+            self._logit = weight[:, None], bias[:, None]
 
     def _layer(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Weights (K, in, out) and biases (K, 1, out)."""
@@ -155,7 +170,7 @@ class Embedding:
         return output
 
     def _outputs(self, x: np.ndarray) -> EmbeddingOutput:
-        """Outputs at finite inputs within the range."""
+        """Outputs at finite inputs, given as `_clipped` returns them."""
         if len(x) > _CHUNK:
             parts = (self._outputs(x[i : i + _CHUNK]) for i in range(0, len(x), _CHUNK))
             return EmbeddingOutput(*map(partial(np.concatenate, axis=1), zip(*parts, strict=True)))
@@ -221,13 +236,13 @@ class Embedding:
             )
 
     def _clipped(self, x: np.ndarray) -> np.ndarray:
-        """Inputs clipped to the range, in single precision."""
+        """Inputs clipped to the range, from its centre, in single precision."""
         least, largest = self.input_range
-        clipped: np.ndarray = np.maximum(np.asarray(x, dtype=np.float32), least)
-        return np.minimum(clipped, largest, out=clipped)
+        offset = np.minimum(np.maximum(np.asarray(x, dtype=float), least), largest)
+        return (offset - self.centre).astype(np.float32)
 
     def _hidden(self, x: np.ndarray) -> np.ndarray:
-        """The last hidden layers at inputs (N, n_x), (K, N, 1, num_activations).
+        """The last hidden layers, (K, N, 1, num_activations), at inputs of `_clipped`.
 
         One product for each row: those of many rows at once would round differently.
         """
