@@ -1,7 +1,16 @@
-PYTHON ?= $(shell for python in python3.11 python3; do \
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	&& echo $$python && break; done)
 BIN := .venv/bin
+PYTEST := -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# The Pythons of this machine, on the PATH and pyenv's, one of each version: `3.12=/path/to/it`.
+PYTHONS = $(shell { echo "$$PATH" | tr : '\n'; ls -d "$$(pyenv root)"/versions/*/bin; } 2>/dev/null \
+	| while read -r at; do for python in "$$at"/python3.[0-9] "$$at"/python3.[0-9][0-9]; do \
+	"$$python" -c 'import ensurepip, sys; print("%d.%d=%s" % (*sys.version_info[:2], sys.executable))'; \
+	done; done 2>/dev/null | sort -t= -k1,1V -u | grep -E '^3\.(1[1-9]|[2-9][0-9])=')
+# An environment of the light install, and one of the lowest versions.
+LIGHT ?= .pythons/light
+LOWEST := .pythons/lowest
 # What the demonstration needs, and on top of it, in the same environment, what development does.
 INSTALLED := .venv/.installed
 DEVELOPED := .venv/.developed
@@ -10,7 +19,7 @@ WALKING := .venv/.walking
 BENCH ?= runs/bench.json
 
 .DEFAULT_GOAL := help
-.PHONY: help demo walking test lint bench docs clean
+.PHONY: help demo walking test light pythons lowest lint bench docs clean
 
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,8 +33,19 @@ demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the ro
 walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies
 
 test: $(DEVELOPED) ## Run the tests, a process a core, eight at most
-	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 \
-		--dist loadfile --no-loadscope-reorder
+	$(BIN)/python $(PYTEST)
+
+light: $(LIGHT)/.installed ## Test the light install, without what learns
+	$(LIGHT)/bin/python $(PYTEST) -m "not train"
+
+pythons: ## Test the light install on each Python of this machine that `make test` does not use
+	@own=$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); \
+	found="$(PYTHONS)"; echo "Pythons found: $${found:-none}; of .venv: $${own:-none}"; \
+	for one in $$found; do version=$${one%%=*}; if [ "$$version" != "$$own" ]; then \
+	$(MAKE) light PYTHON="$${one#*=}" LIGHT=".pythons/$$version" || exit 1; fi; done
+
+lowest: $(LOWEST)/.installed ## Test the lowest versions of all dependencies, on Python 3.11
+	$(LOWEST)/bin/python $(PYTEST)
 
 lint: $(DEVELOPED) ## Check style, format and types
 	$(BIN)/ruff check .
@@ -39,13 +59,13 @@ bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table,
 docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict
 
-clean: ## Remove the environment, the tools' caches and what was built (runs/ stays)
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks
+clean: ## Remove the environments, the tools' caches and what was built (runs/ stays)
+	rm -rf .venv .pythons build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/it" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[live]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[live,train]"
 	touch $@
 
 $(DEVELOPED): $(INSTALLED) $(WALKING)
@@ -55,4 +75,16 @@ $(DEVELOPED): $(INSTALLED) $(WALKING)
 $(WALKING): $(INSTALLED) policies.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[robots,walking]"
 	$(BIN)/python -m pip install --no-deps --require-hashes --requirement policies.txt
+	touch $@
+
+$(LIGHT)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(LIGHT)
+	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
+		".[live,mujoco,onnx,report,robots,test,walking]"
+	touch $@
+
+$(LOWEST)/.installed: pyproject.toml lowest.txt
+	python3.11 -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --constraint lowest.txt --editable \
+		".[cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
 	touch $@

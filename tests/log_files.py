@@ -4,7 +4,6 @@ import dataclasses
 import functools
 
 import numpy as np
-import pandas as pd
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
@@ -93,6 +92,8 @@ def frame_of(log, joints):
     columns |= {f"{name}_vel": log.v[:, 6 + i] for i, name in enumerate(joints)}
     columns |= {f"goal_{a}": log.desired_output[:, i] for i, a in enumerate(POINT)}
     columns |= {f"feet_{i}": log.foot_positions[:, i] for i in range(log.foot_positions.shape[1])}
+    import pandas as pd
+
     return pd.DataFrame(columns)
 
 

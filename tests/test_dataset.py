@@ -8,8 +8,6 @@ import sys
 import time
 
 import numpy as np
-import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from cart_episodes import ARRAYS, make_episode, make_info
@@ -80,6 +78,8 @@ def test_loaded_arrays_can_be_written_to(tmp_path):
 
 def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
     write(tmp_path, [1, 0], flush_episodes=1)
+    import pandas as pd
+
     frame = pd.read_parquet(sorted(tmp_path.glob("episodes-*.parquet")))
     assert list(frame.columns) == [
         "episode",
@@ -381,6 +381,8 @@ def test_a_foreign_info_is_refused(tmp_path, content, message):
 
 def test_a_foreign_parquet_file_is_refused(tmp_path):
     write(tmp_path, [0])
+    import pandas as pd
+
     pd.DataFrame({"a": [1]}).to_parquet(tmp_path / "episodes-00001.parquet")
     with pytest.raises(ValueError, match="expected columns"):
         completed(tmp_path)
@@ -425,6 +427,8 @@ def test_a_closed_writer_takes_no_more(tmp_path):
 
 def test_every_field_of_an_episode_is_a_column(tmp_path):
     write(tmp_path, [0])
+    import pandas as pd
+
     columns = set(pd.read_parquet(tmp_path / "episodes-00000.parquet").columns)
     fields = {field.name for field in dataclasses.fields(Episode)} - {"index"}
     assert columns == fields | {"episode", "step"}
@@ -433,6 +437,8 @@ def test_every_field_of_an_episode_is_a_column(tmp_path):
 def test_a_shard_from_before_failures_were_counted_has_none(tmp_path):
     write(tmp_path, [0, 1])
     shard = tmp_path / "episodes-00000.parquet"
+    import pyarrow.parquet as pq
+
     table = pq.read_table(shard)
     pq.write_table(table.drop_columns(["num_controller_failures"]), shard)
     assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0]

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import tslearn.metrics
 
 from drake_safety.learning import distance
 from drake_safety.learning.assessment_parameters import AssessmentParameters
@@ -127,6 +126,8 @@ def test_tslearn_has_no_absolute_cost(segments):
 
 def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
     episodes, learned, asked = make_episodes(40), {}, []
+    import tslearn.metrics
+
     cdist = tslearn.metrics.cdist_dtw
     monkeypatch.setattr(tslearn.metrics, "cdist_dtw", lambda *of: asked.append(of) or cdist(*of))
     for backend in distance.BACKENDS:

@@ -6,9 +6,12 @@ import re
 import sys
 import tomllib
 from importlib.metadata import packages_distributions
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from drake_safety.extras import MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,20 +32,30 @@ ALLOWED["planning"] = {*ALLOWED["simulation"], "simulation"}
 ALLOWED["diagrams"] = ALLOWED["logs"] = ALLOWED["planning"]
 ALLOWED["evaluation"] = ALLOWED["live"] = {*ALLOWED["planning"], "planning"}
 ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessments"}
+# Every room may name the extra that it needs.
+ALLOWED["extras"] = set()
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
-HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags", "mujoco", "onnx", "trimesh", "collada"}
-# What only an extra brings, and the files that may import it.
+HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "pyarrow", "matplotlib"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags", "pandas", "mujoco", "onnx", "trimesh", "collada"}
+# Each extra and the files that may import what only it brings.
 EXTRAS = {
-    "cluster": "drake_safety/simulation/cluster",
-    "live": "drake_safety/live/page",
-    "logs": "drake_safety/logs/",
-    "mujoco": "drake_safety/plants/mujoco",
-    "onnx": "drake_safety/learning/onnx_graph.py",
-    "report": "drake_safety/evaluation/report/page",
-    "robots": "drake_safety/robots/",
-    "walking": "drake_safety/control/policy_network.py",
+    "cluster": ("drake_safety/simulation/cluster",),
+    "live": ("drake_safety/live/page",),
+    "logs": ("drake_safety/logs/",),
+    "mujoco": ("drake_safety/plants/mujoco",),
+    "onnx": ("drake_safety/learning/onnx_graph.py",),
+    "report": ("drake_safety/evaluation/report/page",),
+    "robots": ("drake_safety/robots/",),
+    "train": (
+        "drake_safety/control/policy_network.py",
+        "drake_safety/evaluation/baselines.py",
+        "drake_safety/evaluation/shift_study.py",
+        "drake_safety/learning/",
+        "drake_safety/simulation/dataset.py",
+        "drake_safety/simulation/episode_shards.py",
+    ),
+    "walking": ("drake_safety/control/policy_network.py",),
 }
 ONLY_IN = {
     "torch": ("drake_safety/learning/embedding.py", "drake_safety/control/policy_network.py"),
@@ -137,7 +150,7 @@ def upward_imports(source, name):
         if target is not None and target not in ALLOWED:
             if target != "__version__":
                 offences.append(f"{name}:{line} imports {dotted}: import it from its own room")
-        elif target not in {None, room} | ALLOWED.get(room, set()):
+        elif target not in {None, room, "extras"} | ALLOWED.get(room, set()):
             offences.append(f"{name}:{line} in {room} imports {dotted}")
     return offences
 
@@ -256,10 +269,12 @@ def test_no_test_module_imports_from_another():
 def test_every_package_the_library_imports_is_a_declared_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     declared = {re.match(r"[\w-]+", line)[0].lower() for line in project["dependencies"]}
+    # What an extra brings may be imported under its modules' names, in that extra's files alone.
     optional = {
-        re.match(r"[\w-]+", line)[0].lower(): room
-        for extra, room in EXTRAS.items()
-        for line in project["optional-dependencies"][extra]
+        (name, place)
+        for extra, files in EXTRAS.items()
+        for name in MODULES[extra]
+        for place in files
     }
     providers = packages_distributions()
     imported = {
@@ -273,11 +288,21 @@ def test_every_package_the_library_imports_is_a_declared_dependency():
     assert [
         (name, path)
         for name, path in sorted(third_party)
-        if not any(
-            provider in declared or path.startswith(optional.get(provider, " "))
-            for provider in (provider.lower() for provider in providers.get(name, [name]))
-        )
+        if not any((name, place) in optional and path.startswith(place) for _, place in optional)
+        and not any(provider.lower() in declared for provider in providers.get(name, [name]))
     ] == []
+
+
+def test_each_extra_declares_what_the_library_imports_of_it():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    providers = packages_distributions()
+    assert MODULES.keys() == EXTRAS.keys()
+    for extra, modules in MODULES.items():
+        lines = project["optional-dependencies"][extra]
+        declared = {re.match(r"[\w-]+", line)[0].lower() for line in lines}
+        for name in modules:
+            # What is not installed here is provided by nothing.
+            assert not find_spec(name) or {one.lower() for one in providers[name]} & declared
 
 
 def test_no_robot_is_named_in_the_library_or_in_a_task():

@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import os
-import re
 import resource
 import shutil
 import subprocess
@@ -17,6 +16,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from drake_safety.extras import MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 # Where the source tree's folders stand once installed.
@@ -117,26 +118,23 @@ def needed_by(*names):
 
 
 @pytest.fixture(scope="module")
-def online_environment(wheel, tmp_path_factory):
-    """Makes an environment with the wheel and a few packages, this one's, and nothing else."""
-
-    def make(*names):
-        folder = tmp_path_factory.mktemp("online") / "environment"
-        run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
-        python = folder / "bin" / "python"
-        install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
-        run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
-        code = "import sysconfig; print(sysconfig.get_path('purelib'))"
-        site_packages = Path(run(python, "-c", code, cwd="/").strip())
-        for name in needed_by(*names):
-            distribution = importlib.metadata.distribution(name)
-            for top in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
-                link = site_packages / top
-                if not link.exists():
-                    link.symlink_to(distribution.locate_file(top))
-        return python
-
-    return make
+def light_environment(wheel, tmp_path_factory):
+    """An environment with the wheel and what pip installs with it, this one's, and no extra."""
+    folder = tmp_path_factory.mktemp("light") / "environment"
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
+    python = folder / "bin" / "python"
+    install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
+    run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
+    code = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site_packages = Path(run(python, "-c", code, cwd="/").strip())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for name in needed_by(*(Requirement(line).name for line in project["dependencies"])):
+        distribution = importlib.metadata.distribution(name)
+        for top in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
+            link = site_packages / top
+            if not link.exists():
+                link.symlink_to(distribution.locate_file(top))
+    return folder
 
 
 LOOP = """
@@ -151,33 +149,58 @@ simulator.AdvanceTo(0.2)
 print(loop.GetOutputPort("safety_probability").Eval(simulator.get_context())[0])
 print(*(name for name in {1} if importlib.util.find_spec(name)))
 """
-ABSENT = ["torch", "sklearn", "tslearn", "pandas", "pyarrow", "joblib", "jinja2", "numba"]
+# What the extras bring, directly or not.
+ABSENT = [*{name for extra in MODULES.values() for name in extra}, "numba", "statsmodels"]
 
 
-def test_a_loop_with_an_assessment_runs_where_little_more_than_drake_is_installed(
-    online_environment,
-):
-    python = online_environment("drake", "numpy", "safetensors")
-    absent = [*ABSENT, "scipy", "typer", "daqp"]
+@pytest.mark.parametrize("scenario", ["laikago_balancing", "atlas_reaching"])
+def test_a_loop_with_an_assessment_runs_in_the_light_install(light_environment, scenario):
+    code = LOOP.format(scenario, ABSENT)
     probability, *found = run(
-        python, "-c", LOOP.format("laikago_balancing", absent), cwd="/"
+        light_environment / "bin" / "python", "-c", code, cwd="/"
     ).splitlines()
     assert 0.0 <= float(probability) <= 1.0
     assert found == [""]
 
 
-def test_targets_are_asked_for_where_what_learns_is_not_installed(online_environment):
-    text = (ROOT / "docs/online.md").read_text(encoding="utf-8")
-    (named,) = re.findall(r"^pip install (.* typer)$", text, flags=re.MULTILINE)
-    python = online_environment(*named.split())
+def test_targets_are_asked_for_in_the_light_install(light_environment):
     ask = ["ask", "atlas_reaching", "--target", "0.7", "0.3", "1.0", "--json"]
-    answer = json.loads(run(python, "-m", "drake_safety.cli", *ask, cwd="/"))
+    answer = json.loads(run(light_environment / "bin" / "drake-safety", *ask, cwd="/"))
     assert answer["verdict"] == "safe"
-    probability, *found = run(
-        python, "-c", LOOP.format("atlas_reaching", ABSENT), cwd="/"
-    ).splitlines()
-    assert 0.0 <= float(probability) <= 1.0
-    assert found == [""]
+
+
+def test_a_motion_is_run_in_the_light_install(light_environment, tmp_path):
+    command = light_environment / "bin" / "drake-safety"
+    run(command, "run", "laikago_balancing", "--push", "ball", "--out", tmp_path, cwd="/")
+    written = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert "torch" not in written["versions"]
+    assert (tmp_path / "run" / "timeline.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [
+        ("train pendulum --out {}", "train"),
+        ("calibrate pendulum", "train"),
+        ("evaluate pendulum --assessment {}", "train"),
+        ("compare pendulum --out {}", "train"),
+        ("adapt pendulum", "train"),
+        ("report {}", "report"),
+        ("play pendulum", "live"),
+        ("train pendulum --out {} --cluster tcp://127.0.0.1:1", "train"),
+    ],
+)
+def test_a_command_names_its_extra_before_it_does_anything(
+    light_environment, tmp_path, command, extra
+):
+    folder = tmp_path / "out"
+    words = [light_environment / "bin" / "drake-safety", *command.format(folder).split()]
+    done = subprocess.run([str(word) for word in words], cwd="/", capture_output=True, text=True)
+    assert done.returncode == 2
+    (line,) = done.stdout.splitlines()
+    assert line.startswith(f"error {command.split()[0]}: the package '")
+    assert line.endswith(f"is not installed: pip install 'drake_safety[{extra}]'")
+    assert not folder.exists()
 
 
 def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):

@@ -18,7 +18,7 @@ from drake_safety.control.policy import (
     observation_term,
 )
 from drake_safety.control.policy_network import _read_metadata, load_network
-from drake_safety.robots.model_files import MissingExtraError
+from drake_safety.extras import MissingExtraError
 from drake_safety.robots.robot_model import JointGains
 from policy_networks import save_network
 

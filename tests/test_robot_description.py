@@ -10,8 +10,9 @@ from pydrake.geometry import Box, Capsule, Role, Sphere
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_safety.extras import MissingExtraError
 from drake_safety.robots import model_files, urdf_copy
-from drake_safety.robots.model_files import MissingExtraError, model_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import load_robot_file
 
@@ -172,7 +173,7 @@ def test_what_only_looks_other_comes_from_another_urdf_where_its_package_is(tmp_
 
 def test_without_the_converter_a_robot_keeps_its_own_looks(tmp_path, monkeypatch):
     def missing(path, rgba):
-        raise MissingExtraError(f"nothing converts {path.name}")
+        raise MissingExtraError(f"nothing converts {path.name}", "a-converter")
 
     monkeypatch.setattr(urdf_copy, "shown_mesh", missing)
     robot = write(tmp_path, visuals="looks.urdf")

@@ -30,6 +30,7 @@ from drake_safety.cli import (
 )
 from drake_safety.cli.console import command_line, console
 from drake_safety.cli.targets import TargetCommand
+from drake_safety.extras import require_extra
 
 # In the order in which the help lists them.
 _COMMANDS = (
@@ -48,6 +49,16 @@ _COMMANDS = (
     report.report,
 )
 
+# The extra that a command needs, said before it does anything.
+_NEEDS = {
+    "train": "train",
+    "calibrate": "train",
+    "evaluate": "train",
+    "compare": "train",
+    "adapt": "train",
+    "report": "report",
+    "play": "live",
+}
 # What continues a stopped command that keeps finished episodes: the same line with this option.
 _RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "compare": "", "adapt": ""}
 _DEBUG = "--debug"
@@ -55,10 +66,12 @@ _STOPPED = 130  # Exit code after Ctrl-C.
 
 
 class _Command(TargetCommand):
-    """A command whose ``--cluster`` is connected while it runs."""
+    """A command whose extra is installed, and whose ``--cluster`` is connected while it runs."""
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
+        if self.name in _NEEDS:
+            require_extra(_NEEDS[self.name], self.name)
         address = ctx.params.get("cluster")
         if address is None:
             return super().invoke(ctx)

@@ -53,15 +53,10 @@ def play(
     push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
     verdict are shown.
     """
-    try:
-        from drake_safety.live.page import serve_page
-    except ImportError as error:
-        raise ValueError(
-            f"play: the package '{error.name}' is not installed: pip install 'drake_safety[live]'"
-        ) from error
     from drake_safety.learning.prediction import CALIBRATED, GAMMA
     from drake_safety.live.commanded_session import LiveCommands
     from drake_safety.live.free_session import LiveEpisodes
+    from drake_safety.live.page import serve_page
     from drake_safety.live.session import LiveGoals, LiveThrows
     from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
     from drake_safety.simulation.scenario import load_scenario

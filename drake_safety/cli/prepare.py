@@ -27,7 +27,7 @@ _WORDS = {
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
-    from drake_safety.robots.model_files import MissingExtraError
+    from drake_safety.extras import MissingExtraError
     from drake_safety.simulation.scenario import load_scenario, scenario_names
 
     table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")

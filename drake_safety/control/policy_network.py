@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-_EXTRA = "pip install 'drake_safety[walking]'"
+from drake_safety.extras import require_extra
+
 _MOST = 1_000_000_000  # Bytes of a file.
 
 
@@ -112,8 +113,8 @@ def load_network(path: Path) -> PolicyNetwork:
         path: The file.
 
     Raises:
-        ValueError: The file does not exist, is of another kind, or cannot be read; or
-            `onnxruntime` is not installed.
+        MissingExtraError: The package that evaluates it is not installed.
+        ValueError: The file does not exist, is of another kind, or cannot be read.
     """
     loaders = {".onnx": _load_onnx, ".pt": _load_torchscript, ".jit": _load_torchscript}
     if path.suffix not in loaders:
@@ -126,10 +127,9 @@ def load_network(path: Path) -> PolicyNetwork:
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise ValueError(f"{path}: ONNX policies need onnxruntime: {_EXTRA}") from error
+    require_extra("walking", f"ONNX network {path}")
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     # A thread pool costs more than the network, and would make sums depend on its size.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -157,6 +157,7 @@ def _load_onnx(path: Path) -> PolicyNetwork:
 
 
 def _load_torchscript(path: Path) -> PolicyNetwork:
+    require_extra("train", f"TorchScript network {path}", "torch")
     import torch
 
     try:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.segments import Episodes, Segments, split
 
 KINDS = ("gradient_boosting", "mlp")
@@ -53,8 +54,10 @@ class DirectClassifier:
         """Fits the classifier to episodes and returns it.
 
         Raises:
+            MissingExtraError: The extra "train" is not installed.
             ValueError: There are fewer than two safe or two unsafe episodes.
         """
+        require_extra("train", f"DirectClassifier '{self.kind}'", "sklearn")
         from threadpoolctl import threadpool_limits
 
         segments = split(episodes, stride=1, discount=1.0, shortest=self.shortest)

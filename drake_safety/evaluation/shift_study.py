@@ -15,6 +15,7 @@ from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.monitoring_study import rate_per_hour
 from drake_safety.evaluation.scorers import Scorer, StageProgress
 from drake_safety.evaluation.shifted_motions import Motion, ShiftedSet
+from drake_safety.extras import require_extra
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
@@ -100,6 +101,7 @@ def detector_judges(assessment: SafetyAssessment, episodes: Episodes) -> dict[st
         assessment: Γ.
         episodes: Its training episodes.
     """
+    require_extra("train", "detector_judges", "sklearn")
     from sklearn.ensemble import IsolationForest
     from sklearn.neighbors import NearestNeighbors
     from threadpoolctl import threadpool_limits

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
@@ -111,8 +112,10 @@ class SafetyAssessment:
             Itself.
 
         Raises:
+            MissingExtraError: The extra "train" is not installed.
             ValueError: The horizons differ, or the episodes give too few segments.
         """
+        require_extra("train", "SafetyAssessment.fit")
         from threadpoolctl import threadpool_limits
 
         # The order of sums depends on the number of threads, and the last bits with it.
@@ -201,9 +204,11 @@ class SafetyAssessment:
             A new assessment with the same maps.
 
         Raises:
+            MissingExtraError: The extra "train" is not installed.
             ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
                 feedback of another scenario.
         """
+        require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
         who = f"SafetyAssessment of '{self.info_.scenario}'"
         method = adaptation.chosen_method(method, has_heads=self.base_logit_ is not None, who=who)

@@ -20,6 +20,8 @@ from functools import partial
 
 import numpy as np
 
+from drake_safety.extras import require_extra
+
 BACKENDS = ("dtaidistance", "tslearn")
 WARPING_COSTS = ("squared", "rooted", "absolute")
 """Cost of a warping path: sum ||.||^2, its square root, or sum ||.||."""
@@ -79,6 +81,7 @@ def neighbour_graph(
         The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
 
     Raises:
+        MissingExtraError: The extra "train" is not installed.
         ValueError: Unknown backend or cost, errors that are not finite, or too few segments or
             candidates.
     """
@@ -87,6 +90,7 @@ def neighbour_graph(
             raise ValueError(f"distance: unknown {name} '{value}'; it is one of {list(known)}")
     if backend == "tslearn" and cost == "absolute":
         raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
+    require_extra("train", "neighbour_graph", backend)
     error = np.asarray(error, dtype=float)
     score = np.asarray(score, dtype=float)
     num_segments = len(error)

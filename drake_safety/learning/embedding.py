@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import NeighbourGraph
 from drake_safety.learning.trained_maps import Embedding
@@ -48,6 +49,7 @@ def tsne(
             f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours per segment, "
             f"the graph has {num_neighbours}"
         )
+    require_extra("train", "tsne", "openTSNE", "sklearn")
     import openTSNE
     from openTSNE import initialization as initial_points
     from openTSNE.affinity import PerplexityBasedNN
@@ -154,6 +156,7 @@ def train_map(
     Returns:
         The weights of one member, named as in `Embedding`, without the leading member axis.
     """
+    require_extra("train", "train_map", "torch")
     import torch
 
     num_threads = torch.get_num_threads()

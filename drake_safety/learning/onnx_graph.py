@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_file import replacing
@@ -80,14 +81,11 @@ def write(
         adaptation: The adaptation to feedback, if any.
 
     Raises:
-        ValueError: The package `onnx` is not installed.
+        MissingExtraError: The extra `onnx` is not installed.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise ValueError(
-            f"export to '{path}' needs the package '{error.name}': pip install 'drake_safety[onnx]'"
-        ) from error
+    require_extra("onnx", f"export to '{path}'")
+    import onnx
+
     nodes = _Nodes()
     inputs = {name: info.widths[name] for name in ("state", "desired_preview")}
     if parameters.is_sharpened and info.feature_names:

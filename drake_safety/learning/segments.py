@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
+
+from drake_safety.extras import require_extra
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,13 +41,13 @@ def installed_versions(*packages: str) -> dict[str, str]:
     """Versions of this package and of others, by name.
 
     Args:
-        packages: Names of installed distributions.
+        packages: Names of distributions; those that are not installed are left out.
     """
-    try:
-        own = importlib.metadata.version("drake_safety")
-    except importlib.metadata.PackageNotFoundError:
-        own = "0+uninstalled"
-    return {"drake_safety": own, **{name: importlib.metadata.version(name) for name in packages}}
+    found = {"drake_safety": "0+uninstalled"}
+    for name in ("drake_safety", *packages):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 @dataclass(kw_only=True)
@@ -196,6 +199,7 @@ class Episodes(Sequence[Episode]):
         ``margins.NAME``, ``desired_preview.NAME[k]``, ...), and of the row's episode ``is_safe``,
         ``cause`` and ``first_step``. ``to_frame().to_pandas()`` is a pandas DataFrame.
         """
+        require_extra("train", "Episodes.to_frame", "pyarrow")
         import pyarrow as pa
 
         episodes, info = self._episodes, self.info

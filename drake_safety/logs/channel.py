@@ -63,10 +63,3 @@ def listed(names: Iterable[str]) -> str:
     if len(names) <= _MANY:
         return str(names)
     return f"{names[:_MANY]} and {len(names) - _MANY} more"
-
-
-def missing_extra(path: Path, error: ImportError) -> ValueError:
-    """Returns the error for a package that is not installed."""
-    return ValueError(
-        f"log '{path}' needs the package '{error.name}': pip install 'drake_safety[logs]'"
-    )

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.logs.channel import Channel, listed, missing_extra
+from drake_safety.extras import require_extra
+from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
 from drake_safety.robots.reading import reading
 
@@ -31,11 +32,10 @@ def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) ->
         ValueError: The extra is not installed, the file is damaged, or a topic or field is
             missing.
     """
-    try:
-        from mcap.reader import make_reader
-        from mcap_ros2.decoder import DecoderFactory
-    except ImportError as error:
-        raise missing_extra(path, error) from error
+    require_extra("logs", f"log '{path}'", "mcap", "mcap_ros2")
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
     # A damaged file makes the reader raise errors of any kind.
     with reading(path, "damaged, or not an MCAP file: log", Exception), path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -64,11 +64,10 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
         ValueError: The extra is not installed, the bag is damaged, or a topic or field is
             missing.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise missing_extra(path, error) from error
+    require_extra("logs", f"log '{path}'", "rosbags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     # A damaged bag makes the reader raise errors of any kind.
     with (
         reading(path, "damaged, or not a ROS bag: log", Exception),

@@ -6,12 +6,12 @@ import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.logs.channel import Channel, listed, missing_extra
+from drake_safety.extras import require_extra
+from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
 from drake_safety.robots.reading import reading
 
@@ -30,7 +30,9 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
     Raises:
         ValueError: A column is missing, duplicate or not numeric, or the extra is not installed.
     """
-    pd = _pandas(path)
+    require_extra("logs", f"log '{path}'", "pandas")
+    import pandas as pd
+
     # Parser errors are of several kinds.
     with reading(path, "not a CSV table: log", Exception):
         names = _checked_names(path, wanted, time, _header_of(path))
@@ -53,9 +55,9 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         ValueError: The file is not a Parquet file, a column is missing or not numeric, or the extra
             is not installed.
     """
+    require_extra("logs", f"log '{path}'", "pandas", "pyarrow")
     import pyarrow.parquet as pq
 
-    _pandas(path)
     with (
         reading(path, "damaged, or not a Parquet file: log", Exception),
         pq.ParquetFile(path, page_checksum_verification=True) as file,
@@ -63,14 +65,6 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
         names = _checked_names(path, wanted, time, file.schema_arrow.names)
         frame = file.read(columns=names).to_pandas(timestamp_as_object=False)
         return _channel(path, frame, wanted, time, "row", 0)
-
-
-def _pandas(path: Path) -> ModuleType:
-    try:
-        import pandas
-    except ImportError as error:
-        raise missing_extra(path, error) from error
-    return pandas
 
 
 def _header_of(path: Path) -> list[str]:

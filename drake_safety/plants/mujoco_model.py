@@ -22,6 +22,7 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 
+from drake_safety.extras import require_extra
 from drake_safety.robots.model_files import required_file
 from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel, by_pattern
@@ -46,14 +47,11 @@ def import_mujoco() -> Any:
     """Imports the optional package ``mujoco``.
 
     Raises:
-        ValueError: The package is not installed.
+        MissingExtraError: The package is not installed.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ValueError(
-            "engine 'mujoco' needs the package mujoco: pip install 'drake_safety[mujoco]'"
-        ) from error
+    require_extra("mujoco", "engine 'mujoco'")
+    import mujoco
+
     return mujoco
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_safety.extras import MissingExtraError
 from drake_safety.robots.fitted_shapes import FittedShape, fitted_shape
 from drake_safety.robots.mesh_cache import mesh_points
-from drake_safety.robots.model_files import MissingExtraError
 from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy
 from drake_safety.robots.urdf_survey import Limb, Survey
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.robots.model_files import MissingExtraError
+from drake_safety.extras import require_extra
 
 if TYPE_CHECKING:
     import trimesh
@@ -122,16 +122,11 @@ def mesh_points(path: Path) -> np.ndarray:
 
 
 def _scene(path: Path) -> trimesh.Scene:
-    try:
-        import trimesh
+    # trimesh reads COLLADA files through the other.
+    modules = ("trimesh", "collada") if path.suffix.lower() == ".dae" else ("trimesh",)
+    require_extra("robots", f"mesh '{path}', as Drake does not read {path.suffix} files", *modules)
+    import trimesh
 
-        if path.suffix.lower() == ".dae":
-            import collada  # noqa: F401  # trimesh reads this format through it.
-    except ImportError as error:
-        raise MissingExtraError(
-            f"mesh '{path}': Drake does not read {path.suffix} files, and '{error.name}', which "
-            "converts them, is not installed: pip install 'drake_safety[robots]'"
-        ) from error
     try:
         scene = trimesh.load_scene(path)
     except Exception as error:  # trimesh's readers raise many kinds of exceptions.

@@ -12,21 +12,10 @@ from urllib.parse import urlparse
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_safety.extras import MissingExtraError, missing_extra
+
 _EXTRAS = {"example-robot-data": "robots"}
 """Packages of models that an extra installs."""
-
-
-class MissingExtraError(ValueError):
-    """A file needs a package that is not installed.
-
-    Args:
-        message: The message.
-        needs: What pip is to install.
-    """
-
-    def __init__(self, message: str, needs: str = "drake_safety[robots]"):
-        super().__init__(message)
-        self.needs = needs
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
@@ -93,10 +82,8 @@ def model_file(url: str, folder: str = "") -> Path:
     if package_map.Contains(parts.netloc):
         return Path(package_map.GetPath(parts.netloc)) / parts.path.lstrip("/")
     if parts.netloc in _EXTRAS:
-        raise MissingExtraError(
-            f"'{url}': the package '{parts.netloc}' is not installed: "
-            f"pip install 'drake_safety[{_EXTRAS[parts.netloc]}]'",
-            f"drake_safety[{_EXTRAS[parts.netloc]}]",
+        raise missing_extra(
+            _EXTRAS[parts.netloc], f"'{url}': the package '{parts.netloc}' is not installed"
         )
     raise ValueError(f"'{url}': no package '{parts.netloc}'; use a path instead")
 
@@ -127,7 +114,5 @@ def required_file(url: str, folder: str, requires: str) -> Path:
         ValueError: The package is unknown.
     """
     if requires and not is_installed(url):
-        raise MissingExtraError(
-            f"'{url}': its package is not installed: pip install --no-deps {requires}", requires
-        )
+        raise MissingExtraError(f"'{url}': its package is not installed", requires, "--no-deps ")
     return model_file(url, folder)

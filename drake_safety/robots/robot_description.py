@@ -22,8 +22,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
+from drake_safety.extras import MissingExtraError
 from drake_safety.robots.model_files import (
-    MissingExtraError,
     is_installed,
     model_file,
     package_parser,

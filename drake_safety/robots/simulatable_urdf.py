@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from drake_safety.extras import MissingExtraError
 from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_points, shown_mesh
-from drake_safety.robots.model_files import MissingExtraError, model_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")

@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.segments import installed_versions
 from drake_safety.simulation.scenario import Scenario, own_files, parse_scenario, source_digest
 
@@ -35,16 +36,13 @@ def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
         timeout_s: Time to wait for the scheduler, and for its first worker [s].
 
     Raises:
-        ValueError: dask is not installed, no scheduler answers, or it has no workers.
+        MissingExtraError: dask is not installed.
+        ValueError: No scheduler answers, or it has no workers.
     """
+    require_extra("cluster", f"cluster '{address}'")
     import joblib
+    from distributed import Client
 
-    try:
-        from distributed import Client
-    except ImportError:
-        raise ValueError(
-            "a cluster needs dask's scheduler: pip install 'drake_safety[cluster]'"
-        ) from None
     try:
         client = Client(address, timeout=timeout_s)
     # Another server's answer may be taken for the size of a huge message.

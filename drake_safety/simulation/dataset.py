@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.robots.reading import reading, shortened
@@ -57,6 +58,7 @@ class EpisodeWriter:
         accept_code_change: See :func:`open_folder`.
 
     Raises:
+        MissingExtraError: The extra "train" is not installed.
         ValueError: The folder holds another set of episodes, or something else, or has a writer.
     """
 
@@ -70,6 +72,7 @@ class EpisodeWriter:
         flush_seconds: float = 10.0,
         accept_code_change: bool = False,
     ) -> None:
+        require_extra("train", f"episodes in {path}", "pyarrow")
         if flush_episodes < 1:
             raise ValueError(f"EpisodeWriter: flush_episodes must be >= 1; got {flush_episodes}")
         if not flush_seconds > 0:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.segments import DIVERGED, Episode, EpisodesInfo
 from drake_safety.simulation.episode_recorder import LARGEST
 
@@ -135,8 +136,10 @@ def read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
         columns: The columns; all by default.
 
     Raises:
+        MissingExtraError: The extra "train" is not installed.
         ValueError: The shard is truncated or damaged, or lacks a column.
     """
+    require_extra("train", f"episodes in {shard.parent}", "pyarrow")
     import pyarrow as pa
     import pyarrow.parquet as pq
 

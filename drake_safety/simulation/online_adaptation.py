@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from pydrake.systems.framework import Context, EventStatus
 
+from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.segments import Episodes
@@ -60,6 +61,7 @@ class OnlineAdaptation:
         run: Callable[..., Episodes] = run_twins,
         capacity: int = 400,
     ):
+        require_extra("train", "OnlineAdaptation", "sklearn")
         if capacity < 1:
             raise ValueError(f"OnlineAdaptation: capacity is {capacity}, expected >= 1")
         self._scenario, self._prior, self._method = scenario, prior, method

@@ -26,6 +26,7 @@ from drake_safety.evaluation.report.cell_map import (
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
 from drake_safety.evaluation.report.tables import Column, Table
 from drake_safety.evaluation.report.verdicts import other_tables, verdict_tables
+from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_SVG_BYTES = 1_500_000  # Larger figures are embedded as PNG.
@@ -101,13 +102,9 @@ def write_report(
 
 @cache
 def _environment() -> Any:
-    try:
-        from jinja2 import Environment, FunctionLoader, StrictUndefined
-    except ImportError as error:
-        raise ValueError(
-            f"report: the package '{error.name}' is not installed: pip install "
-            "'drake_safety[report]'"
-        ) from error
+    require_extra("report", "write_report")
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
     environment = Environment(
         loader=FunctionLoader(_text),
         autoescape=True,

@@ -1,0 +1,59 @@
+"""The package's extras, and the error for one that is not installed."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+MODULES = {
+    "cluster": ("distributed",),
+    "live": ("nicegui",),
+    "logs": ("mcap", "mcap_ros2", "pandas", "pyarrow", "rosbags"),
+    "mujoco": ("mujoco",),
+    "onnx": ("onnx",),
+    "report": ("jinja2",),
+    "robots": ("trimesh", "collada"),
+    "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),
+    "walking": ("onnxruntime",),
+}
+"""What the library imports of each extra."""
+
+
+class MissingExtraError(ValueError):
+    """Packages that pip can install are not installed.
+
+    Args:
+        message: Who needs what.
+        needs: What pip is to install; appended to the message as its command.
+        options: Options of that command.
+    """
+
+    def __init__(self, message: str, needs: str, options: str = ""):
+        quoted = f"'{needs}'" if "[" in needs else needs
+        super().__init__(f"{message}: pip install {options}{quoted}")
+        self.needs = needs
+
+
+def missing_extra(extra: str, message: str) -> MissingExtraError:
+    """Returns the error for an extra that is not installed.
+
+    Args:
+        extra: The extra.
+        message: Who needs what.
+    """
+    return MissingExtraError(message, f"drake_safety[{extra}]")
+
+
+def require_extra(extra: str, who: str, *modules: str) -> None:
+    """Checks that an extra is installed, before anything else is done; nothing is imported.
+
+    Args:
+        extra: The extra.
+        who: Who needs it.
+        *modules: Its modules that are needed; all of them by default.
+
+    Raises:
+        MissingExtraError: One of them is not installed.
+    """
+    for name in modules or MODULES[extra]:
+        if find_spec(name) is None:
+            raise missing_extra(extra, f"{who}: the package '{name}' is not installed")
