@@ -91,8 +91,10 @@ def _libraries(has_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int],
 def _openblas_functions(library: Any) -> tuple[Callable[[], int], Callable[[int], Any]] | None:
     for prefix in ("", "scipy_"):
         for suffix in ("", "64_", "_64"):
-            names = (f"{prefix}openblas_{verb}_num_threads{suffix}" for verb in ("get", "set"))
-            functions = [getattr(library, name, None) for name in names]
-            if None not in functions:
-                return functions[0], functions[1]
+            get, set_to = (
+                getattr(library, f"{prefix}openblas_{verb}_num_threads{suffix}", None)
+                for verb in ("get", "set")
+            )
+            if get is not None and set_to is not None:
+                return get, set_to
     return None

@@ -56,11 +56,10 @@ def inputs(
     is_used = used_states(info, parameters)
     given = [("state", state, len(is_used))]
     given.append(("desired_preview", desired_preview, info.horizon * len(info.output_names)))
-    who = f"SafetyAssessment of '{info.scenario}'"
     if parameters.is_sharpened and info.feature_names:
         if features is None:
             raise ValueError(
-                f"{who}: features are missing, expected {len(info.feature_names)} columns: "
+                f"{_who(info)}: features are missing, expected {len(info.feature_names)} columns: "
                 f"{info.feature_names}"
             )
         given.append(("features", features, len(info.feature_names)))
@@ -69,16 +68,20 @@ def inputs(
         try:
             part = np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{who}: {name} must be an array of numbers: {error}") from error
+            raise ValueError(
+                f"{_who(info)}: {name} must be an array of numbers: {error}"
+            ) from error
         if part.shape[-1:] != (width,):
             rows = parts[0].shape[:-1] if parts else part.shape[:1] if part.ndim > 1 else ()
             expected = (*rows, width)
-            raise ValueError(f"{who}: {name} has the shape {part.shape}, expected {expected}")
+            raise ValueError(
+                f"{_who(info)}: {name} has the shape {part.shape}, expected {expected}"
+            )
         if parts and part.shape[:-1] != parts[0].shape[:-1]:
             expected = (*parts[0].shape[:-1], width)
             raise ValueError(
-                f"{who}: {name} has the shape {part.shape}, expected {expected}, as state has the "
-                f"shape {parts[0].shape}"
+                f"{_who(info)}: {name} has the shape {part.shape}, expected {expected}, as state "
+                f"has the shape {parts[0].shape}"
             )
         parts.append(part)
     if parts[0].shape[-1] != np.count_nonzero(is_used):
@@ -86,6 +89,10 @@ def inputs(
     if len(parts) == 3 and parameters.feature_unit:
         parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
     return np.concatenate(parts, axis=-1)
+
+
+def _who(info: EpisodesInfo) -> str:
+    return f"SafetyAssessment of '{info.scenario}'"
 
 
 def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
-
 NUM_DISTANCES = 3
 NUM_FOLDS = 5
 """Folds of the episodes for the limits: every distance is from the inputs of other episodes."""
@@ -230,7 +228,7 @@ class Novelty:
 
         Those of an input that is not finite are infinite.
         """
-        with ONE_BLAS_THREAD, np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             squared = self.quadratic.squared(x)
             # Rounding may make a small square negative. `fmin` chooses the number beside NaN.
             distances: np.ndarray = np.fmin(np.sqrt(np.maximum(squared, 0.0)), np.inf)
@@ -241,7 +239,7 @@ class Novelty:
 
         An input is novel above 1; that of an input that is not finite is infinite.
         """
-        with ONE_BLAS_THREAD, np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             squared = self.quadratic.squared(x)
             squared *= self.inverse_limits
             found = np.maximum.reduce(squared, axis=1)

@@ -146,13 +146,20 @@ class BaseLogit:
     safety_slope: float = 1.0
     margin_slope: float = 1.0
 
-    def heads(self, output: EmbeddingOutput) -> np.ndarray:
-        """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head."""
+    def heads(self, output: EmbeddingOutput, margins: np.ndarray | None = None) -> np.ndarray:
+        """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head.
+
+        Args:
+            output: Outputs of the maps.
+            margins: The mean of their margins, (N, n_c), if known.
+        """
         found = np.zeros((output.embedding.shape[1], 2))
         logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
-        found[:, 0] = np.where(np.isnan(logit), 0.0, logit)
+        if np.count_nonzero(np.isnan(logit)) < logit.size:
+            found[:, 0] = logit
         if output.margins.shape[2]:
-            smallest = np.minimum.reduce(mean_of_maps(output.margins), axis=1)
+            margins = mean_of_maps(output.margins) if margins is None else margins
+            smallest = np.minimum.reduce(margins, axis=1)
             found[:, 1] = _clip(smallest, *self.margin_range)
             found[:, 1] /= -self.margin_unit
         return found
@@ -304,33 +311,36 @@ def predict(
     found, is_inside = read(output.embedding, table)
     summed = np.add.reduce(found, axis=0)
     masses = summed[:, :num_columns] / num_members
-    num_outside = num_members - np.add.reduce(is_inside, axis=0)
-    # A map whose output lies outside its grid contributes the empty belief.
-    masses[:, belief_masses.UNCERTAINTY] += num_outside / num_members
+    is_any_outside = np.count_nonzero(is_inside) < is_inside.size
+    if is_any_outside:
+        # A map whose output lies outside its grid contributes the empty belief.
+        share_inside = np.add.reduce(is_inside, axis=0) / num_members
+        masses[:, belief_masses.UNCERTAINTY] += 1.0 - share_inside
     # Departure: beyond the training inputs the maps place x in cells of others.
     distance = novelty.of(x)
     is_novel = distance > 1.0
-    if is_novel.any():
+    if np.count_nonzero(is_novel):
         masses[is_novel] = belief_masses.empty((), num_columns - 3)
     safe = masses[:, belief_masses.SAFE]
     # A sum instead of 1 - mu, so that rounding cannot raise the share above one.
     known = safe + masses[:, belief_masses.UNSAFE]
     normalized = safe / np.maximum(known, _TINY)
-    calibrated = normalized
-    margins = np.full((len(x), num_columns - 3), np.nan)
+    calibrated = normalized.copy()
     if output.margins.shape[2]:
         margins = mean_of_maps(output.margins)
+    else:
+        margins = np.full((len(x), num_columns - 3), np.nan)
     if base_logit is not None:
-        heads = base_logit.heads(output)
+        heads = base_logit.heads(output, margins)
         logit = base_logit.of_heads(heads)
         if has_correction:
             is_known = known > 0.0
-            guard = summed[:, num_columns] / np.maximum(num_members - num_outside, 1)
+            guard = summed[:, num_columns] / np.maximum(np.add.reduce(is_inside, axis=0), 1)
             residual = np.zeros(len(x))
             residual[is_known] = correction.residual(embedding, x[is_known])
             logit += correction.shift(heads, residual, guard)
-        calibrated = sigmoid(-logit)
-    calibrated = np.where(is_unknown(masses, initial_uncertainty), 0.0, calibrated)
+        calibrated = 1.0 / (1.0 + np.exp(logit))
+    calibrated[is_unknown(masses, initial_uncertainty)] = 0.0
     return Assessments(
         # The paper's Γ(x) = b_safe of the cell of Psi(x).
         literal=safe,

@@ -108,6 +108,8 @@ class Embedding:
         (weight, bias), *others = self._layers
         # A column's spread may be a thousandth of its values, which single precision would lose.
         self.centre = np.zeros(self.num_inputs)
+        self._range = self.input_range.astype(float)
+        self._is_clipping = bool(np.isfinite(self._range).any())
         if np.isfinite(self.input_range).all():
             self.centre = self.input_range.mean(axis=0, dtype=float)
             bias = (bias + (self.centre @ weight.astype(float))[:, None]).astype(np.float32)
@@ -160,8 +162,8 @@ class Embedding:
         A row has the same bits whatever the others are.
         """
         self._check(x)
-        is_usable = np.abs(x) < INPUT_LIMIT
-        if np.logical_and.reduce(is_usable, axis=None):
+        is_usable = np.abs(x) < INPUT_LIMIT  # False for NaN.
+        if np.count_nonzero(is_usable) == is_usable.size:
             return self._outputs(self._clipped(x))
         is_usable = is_usable.all(axis=1)
         output = self._outputs(self._clipped(np.where(is_usable[:, None], x, 0.0)))
@@ -237,7 +239,9 @@ class Embedding:
 
     def _clipped(self, x: np.ndarray) -> np.ndarray:
         """Inputs clipped to the range, from its centre, in single precision."""
-        least, largest = self.input_range
+        if not self._is_clipping:
+            return np.asarray(x, dtype=np.float32)
+        least, largest = self._range
         offset = np.minimum(np.maximum(np.asarray(x, dtype=float), least), largest)
         return (offset - self.centre).astype(np.float32)
 
