@@ -56,6 +56,12 @@ def files_under(folder):
     }
 
 
+def pins(name):
+    """The lines of a file of exact versions."""
+    lines = (ROOT / name).read_text().splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
 def call_backend(hook, source, out):
     """Builds with the setuptools of this environment, as `python -m build` would, offline."""
     out.mkdir()
@@ -206,7 +212,14 @@ def test_a_command_names_its_extra_before_it_does_anything(
 def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "LICENSE", "README.md", "constraints.txt", "Makefile"} <= names
+    assert {
+        "pyproject.toml",
+        "LICENSE",
+        "README.md",
+        "constraints.txt",
+        "lowest.txt",
+        "Makefile",
+    } <= names
     for folder in ("tests", "studies", "assessments"):
         assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
     assert names >= SHIPPED
@@ -234,14 +247,26 @@ def test_the_wheel_takes_no_top_level_name_but_its_own(wheel):
 
 def test_no_dependency_names_an_index_or_an_address():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    listed = project["dependencies"] + project["optional-dependencies"]["dev"]
-    pinned = [
-        line
-        for line in (ROOT / "constraints.txt").read_text().splitlines()
-        if line and not line.startswith("#")
+    listed = project["dependencies"] + [
+        one for of in project["optional-dependencies"].values() for one in of
     ]
+    pinned = pins("constraints.txt") + pins("lowest.txt")
     assert not [line for line in listed + pinned if "://" in line or line.startswith("-")]
     assert not [line for line in pinned if line.count("==") != 1]
+
+
+def test_every_lower_bound_of_what_users_install_is_a_version_that_is_tested():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    tested = {
+        canonicalize_name(one.name): one.specifier for one in map(Requirement, pins("lowest.txt"))
+    }
+    listed = [*project["dependencies"]]
+    for extra, lines in project["optional-dependencies"].items():
+        listed += lines if extra not in {"dev", "docs", "test"} else []
+    for line in map(Requirement, listed):
+        if line.name != project["name"]:
+            (bound,) = [one.version for one in line.specifier if one.operator == ">="]
+            assert tested[canonicalize_name(line.name)].contains(bound), line
 
 
 def test_the_installed_package_imports_from_the_root_folder(clean_environment):
