@@ -35,8 +35,8 @@ walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, po
 test: $(DEVELOPED) ## Run the tests, a process a core, eight at most
 	$(BIN)/python $(PYTEST)
 
-light: $(LIGHT)/.installed ## Test the light install, without what learns
-	$(LIGHT)/bin/python $(PYTEST) -m "not train"
+light: $(LIGHT)/.installed ## Test the light install: quick tests of all that does not learn
+	$(LIGHT)/bin/python $(PYTEST) -m "not train and not slow"
 
 pythons: ## Test the light install on each Python of this machine that `make test` does not use
 	@own=$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); \
@@ -77,10 +77,11 @@ $(WALKING): $(INSTALLED) policies.txt
 	$(BIN)/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
 
-$(LIGHT)/.installed: pyproject.toml constraints.txt
+$(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 	$(PYTHON) -m venv $(LIGHT)
 	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
 		".[live,mujoco,onnx,report,robots,test,walking]"
+	$(LIGHT)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
 
 $(LOWEST)/.installed: pyproject.toml lowest.txt

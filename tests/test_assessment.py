@@ -13,6 +13,8 @@ from drake_safety.learning.training import segments_for
 from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def episodes():

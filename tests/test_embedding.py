@@ -15,6 +15,8 @@ from drake_safety.learning.segments import split
 from drake_safety.learning.trained_maps import Embedding
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 SETTINGS = AssessmentParameters(
     hidden_sizes=[32, 32],
     dropout=0.0,

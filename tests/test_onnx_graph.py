@@ -322,7 +322,7 @@ def test_the_same_assessment_gives_the_same_file(tmp_path):
 
 def test_where_onnx_is_not_installed_the_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ValueError, match=r"needs the package 'onnx': pip .*\[onnx\]"):
+    with pytest.raises(ValueError, match=r"the package 'onnx' is not installed: pip .*\[onnx\]"):
         load_assessment("go2_walking").to_onnx(tmp_path / "gamma.onnx")
     with pytest.raises(ValueError, match="not fitted"):
         SafetyAssessment().to_onnx(tmp_path / "gamma.onnx")
