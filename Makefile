@@ -32,11 +32,11 @@ demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the ro
 
 walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies
 
-test: $(DEVELOPED) ## Run the tests, a process a core
+test: $(DEVELOPED) ## Run the tests, a process a core, eight at most
 	$(BIN)/python $(PYTEST)
 
-light: $(LIGHT)/.installed ## Test the light install, without what learns
-	$(LIGHT)/bin/python $(PYTEST) -m "not train"
+light: $(LIGHT)/.installed ## Test the light install: quick tests of all that does not learn
+	$(LIGHT)/bin/python $(PYTEST) -m "not train and not slow"
 
 pythons: ## Test the light install on each Python of this machine that `make test` does not use
 	@own=$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); \
@@ -56,10 +56,10 @@ bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table,
 	mkdir -p $(dir $(BENCH))
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-quiet --benchmark-json=$(BENCH)
 
-docs: $(DEVELOPED) ## Build the reference into build/site; a warning is an error
+docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict
 
-clean: ## Remove the environment, the caches and what was built (runs/ stays)
+clean: ## Remove the environments, the tools' caches and what was built (runs/ stays)
 	rm -rf .venv .pythons build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks
 
 $(INSTALLED): pyproject.toml constraints.txt
@@ -80,12 +80,12 @@ $(WALKING): $(INSTALLED) policies.txt
 $(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 	$(PYTHON) -m venv $(LIGHT)
 	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
-		".[live,mujoco,report,robots,test,walking]"
+		".[live,mujoco,onnx,report,robots,test,walking]"
 	$(LIGHT)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
 
 $(LOWEST)/.installed: pyproject.toml lowest.txt
 	python3.11 -m venv $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --constraint lowest.txt --editable \
-		".[cluster,live,logs,mujoco,report,robots,test,train,tutorials,walking]"
+		".[cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
 	touch $@

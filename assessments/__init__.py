@@ -1,7 +1,7 @@
 """Trained assessments shipped with the package, one folder per scenario, and their loader.
 
-A folder contains `MODE.safetensors` and `evaluation.json`: results on fresh episodes, the files'
-hashes, and the verdicts on the first of these episodes.
+A folder contains `MODE.safetensors`; `evaluation.json`: results on fresh episodes, the files'
+hashes, and the verdicts on the first of these episodes; and its card `README.md`.
 """
 
 from __future__ import annotations

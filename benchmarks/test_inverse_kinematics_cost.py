@@ -14,7 +14,6 @@ from pydrake.multibody.inverse_kinematics import (
 )
 from pydrake.solvers import SnoptSolver
 from pydrake.systems.analysis import Simulator
-from threadpoolctl import threadpool_limits
 
 from drake_safety import Scenario
 from drake_safety.control.inverse_kinematics import solve_from
@@ -112,8 +111,7 @@ def solve_by_snopt(balancing: Balancing, tick: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def balancing(scenario: Scenario) -> Balancing:
-    with threadpool_limits(1):
-        return Balancing(scenario)
+    return Balancing(scenario)
 
 
 @pytest.mark.benchmark(timer=time.process_time)
@@ -130,14 +128,13 @@ def test_one_tick(
         controller.GetInputPort(name).FixValue(context, rows[0])
     controller.start(context)
     rounds: list[np.ndarray] = []
-    with threadpool_limits(1):
-        benchmark.pedantic(
-            lambda: rounds.append(
-                tick_costs_us(controller, context, balancing.inputs, "desired_joint_state")
-            ),
-            rounds=ROUNDS,
-            warmup_rounds=1,
-        )
+    benchmark.pedantic(
+        lambda: rounds.append(
+            tick_costs_us(controller, context, balancing.inputs, "desired_joint_state")
+        ),
+        rounds=ROUNDS,
+        warmup_rounds=1,
+    )
     quickest = min(rounds, key=np.mean)
     report(
         f"IK tick, {scenario.robot}, mean",
@@ -170,16 +167,15 @@ def test_its_solution_beside_drakes(
 
         return run
 
-    with threadpool_limits(1):
-        cost_s, peers_s = alternate(
-            benchmark,
-            solve_all(ours),
-            {
-                "DoDifferentialInverseKinematics": solve_all(solve_one_step),
-                "InverseKinematics, SNOPT": solve_all(solve_by_snopt),
-            },
-            rounds=ROUNDS,
-        )
+    cost_s, peers_s = alternate(
+        benchmark,
+        solve_all(ours),
+        {
+            "DoDifferentialInverseKinematics": solve_all(solve_one_step),
+            "InverseKinematics, SNOPT": solve_all(solve_by_snopt),
+        },
+        rounds=ROUNDS,
+    )
     peers = {name: 1e6 * seconds / len(ticks) for name, seconds in peers_s.items()}
     report(
         f"IK of a tick, {scenario.robot}",

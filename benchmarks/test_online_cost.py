@@ -19,7 +19,6 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from pydrake.systems.primitives import ConstantVectorSource
-from threadpoolctl import threadpool_limits
 
 from drake_safety import SafetyAssessment, Scenario
 from drake_safety.evaluation.baselines import DirectClassifier
@@ -161,25 +160,24 @@ def test_one_evaluation_inside_a_diagram(
     previous_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1):
-            running = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
-            empty = Running(EmptySystem(running.system), inputs)
-            eager = EagerNetworks(assessment.embedding_)
-            # Γ is really evaluated, and torch does the same.
-            assert running.output("safety_probability")[0] > 0.0
-            ours = assessment.embedding_.evaluate(x[None])
-            theirs = np.stack([z.numpy() for z in eager.evaluate(x)])
-            np.testing.assert_allclose(ours.embedding[:, 0], theirs[:, :2], rtol=1e-3, atol=1e-3)
-            np.testing.assert_allclose(ours.margins[:, 0], theirs[:, 2:], rtol=1e-3, atol=1e-3)
-            cost_s, peers_s = alternate(
-                benchmark,
-                running.update,
-                {
-                    "empty LeafSystem": empty.update,
-                    "torch, forward pass": repeat(lambda: eager.evaluate(x)),
-                },
-                rounds=ROUNDS,
-            )
+        running = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
+        empty = Running(EmptySystem(running.system), inputs)
+        eager = EagerNetworks(assessment.embedding_)
+        # Γ is really evaluated, and torch does the same.
+        assert running.output("safety_probability")[0] > 0.0
+        ours = assessment.embedding_.evaluate(x[None])
+        theirs = np.stack([z.numpy() for z in eager.evaluate(x)])
+        np.testing.assert_allclose(ours.embedding[:, 0], theirs[:, :2], rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(ours.margins[:, 0], theirs[:, 2:], rtol=1e-3, atol=1e-3)
+        cost_s, peers_s = alternate(
+            benchmark,
+            running.update,
+            {
+                "empty LeafSystem": empty.update,
+                "torch, forward pass": repeat(lambda: eager.evaluate(x)),
+            },
+            rounds=ROUNDS,
+        )
     finally:
         torch.set_num_threads(previous_threads)
     weights = assessment.embedding_.weights
@@ -205,23 +203,20 @@ def test_novelty_and_monitor_beside_an_evaluation(
     assessment.info_ = dataclasses.replace(assessment.info_, step_s=PERIOD_S)
     inputs = {name: getattr(some[0], name)[0] for name in INPUT_NAMES}
     x = assessment.inputs_of(*inputs.values())[None]
-    with threadpool_limits(1):
-        gamma = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
-        monitor = Running(NoveltyMonitor(assessment), {**inputs, "novelty": np.zeros(1)})
+    gamma = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
+    monitor = Running(NoveltyMonitor(assessment), {**inputs, "novelty": np.zeros(1)})
 
-        novelty = repeat(lambda: assessment.novelty_.of(x))
+    novelty = repeat(lambda: assessment.novelty_.of(x))
 
-        def update() -> None:
-            monitor.update()
-            novelty()
-
-        # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
+    def update() -> None:
         monitor.update()
-        assert monitor.output("alarm")[0] == 1.0
-        assert monitor.output("levels")[2:].min() > 0.0
-        cost_s, peers_s = alternate(
-            benchmark, update, {"Γ in a diagram": gamma.update}, rounds=ROUNDS
-        )
+        novelty()
+
+    # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
+    monitor.update()
+    assert monitor.output("alarm")[0] == 1.0
+    assert monitor.output("levels")[2:].min() > 0.0
+    cost_s, peers_s = alternate(benchmark, update, {"Γ in a diagram": gamma.update}, rounds=ROUNDS)
     peers = {name: per_update_us(seconds) for name, seconds in peers_s.items()}
     report(
         "novelty and monitor in a diagram",
@@ -242,13 +237,12 @@ def test_one_prediction_beside_gradient_boosting(
     boosting.fit(episodes)  # All: the cost grows with the number of trees.
     inputs = [getattr(episodes[0], name)[0] for name in INPUT_NAMES]
     x = np.concatenate(inputs)[None].astype(np.float32)
-    with threadpool_limits(1):
-        cost_s, peers_s = alternate(
-            benchmark,
-            repeat(lambda: gamma.predict_one(*inputs)),
-            {"gradient boosting": repeat(lambda: boosting.model_.predict_proba(x))},
-            rounds=3,
-        )
+    cost_s, peers_s = alternate(
+        benchmark,
+        repeat(lambda: gamma.predict_one(*inputs)),
+        {"gradient boosting": repeat(lambda: boosting.model_.predict_proba(x))},
+        rounds=3,
+    )
     report(
         "Γ, one prediction",
         per_update_us(cost_s),

@@ -1,6 +1,7 @@
 """Cost of reaching compared with its bare plant, and convergence with finer steps."""
 
 import copy
+import multiprocessing
 import time
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from bare_plant import SEED, BarePlant, costs_beside, log_motion, loop_with_everything
+from costs import alternate
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from threadpoolctl import threadpool_limits
 
@@ -52,11 +55,10 @@ def bare_plant(loop: ClosedLoop) -> BarePlant:
 def test_reaching_beside_its_bare_plant(
     benchmark: Any, report: Callable[..., None], reaching: Scenario, everything: bool
 ) -> None:
-    with threadpool_limits(1):
-        loop = loop_with_everything(reaching) if everything else reaching.make_loop()
-        port = loop.plant.get_actuation_input_port(loop.robot_instance)
-        motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
-        loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
+    loop = loop_with_everything(reaching) if everything else reaching.make_loop()
+    port = loop.plant.get_actuation_input_port(loop.robot_instance)
+    motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
+    loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
     spans = np.array([motion.duration_s for motion in motions])
     report(
         f"simulated second, {SCENARIO}" + (", everything on" if everything else ""),
@@ -70,6 +72,46 @@ def test_reaching_beside_its_bare_plant(
         note=f"{1 / reaching.control_period_s:.0f} Hz control, "
         f"{1e3 * reaching.time_step_s:g} ms plant, {len(motions)} episodes",
     )
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_threads_of_blas_cost_nothing_beside_a_busy_core(
+    benchmark: Any, report: Callable[..., None], reaching: Scenario
+) -> None:
+    """An ordinary simulation, with the threads that BLAS has by default and with one."""
+    loop = loop_with_everything(reaching)
+
+    def simulate() -> None:
+        simulator = Simulator(loop)
+        loop.reset(simulator.get_mutable_context(), np.random.default_rng(SEED))
+        simulator.AdvanceTo(reaching.episode_duration_s)
+
+    def simulate_with_one_thread() -> None:
+        with threadpool_limits(1):
+            simulate()
+
+    busy = multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
+    busy.start()
+    try:
+        cost_s, peers_s = alternate(
+            benchmark, simulate, {"one thread": simulate_with_one_thread}, rounds=ROUNDS
+        )
+    finally:
+        busy.kill()
+    span_s = reaching.episode_duration_s
+    report(
+        f"simulated second beside a busy core, {SCENARIO}, everything on",
+        cost_s / span_s,
+        "CPU-s",
+        at_most=1.1 * peers_s["one thread"] / span_s,
+        peers={name: seconds / span_s for name, seconds in peers_s.items()},
+        note="an ordinary Simulator, BLAS threads as by default",
+    )
+
+
+def _spin() -> None:
+    while True:
+        pass
 
 
 def test_labels_beside_those_of_finer_steps(

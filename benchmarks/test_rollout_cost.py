@@ -10,7 +10,6 @@ import pytest
 from bare_plant import SEED, BarePlant, costs_beside, log_motion, loop_with_everything
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.framework import DiagramBuilder
-from threadpoolctl import threadpool_limits
 
 from drake_safety import Scenario, run_episodes
 from drake_safety.models import load_robot
@@ -46,11 +45,10 @@ def bare_plant(loop: ClosedLoop) -> BarePlant:
 def test_the_closed_loop_beside_its_bare_plant(
     benchmark: Any, report: Callable[..., None], scenario: Scenario, everything: bool
 ) -> None:
-    with threadpool_limits(1):
-        loop = loop_with_everything(scenario) if everything else scenario.make_loop()
-        port = loop.plant.get_desired_state_input_port(loop.robot_instance)
-        motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
-        loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
+    loop = loop_with_everything(scenario) if everything else scenario.make_loop()
+    port = loop.plant.get_desired_state_input_port(loop.robot_instance)
+    motions = [log_motion(loop, index, port) for index in range(NUM_EPISODES)]
+    loop_s, plant_s = costs_beside(benchmark, loop, bare_plant(loop), motions, ROUNDS)
     spans = np.array([motion.duration_s for motion in motions])
     is_whole = spans > scenario.episode_duration_s - 1e-9
     what = "rollout with everything on" if everything else "rollout"

@@ -10,7 +10,6 @@ from bare_plant import BarePlant, log_commands
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from threadpoolctl import threadpool_limits
 
 from drake_safety import load_assessment, load_scenario
 from drake_safety.plants.physics import add_ground
@@ -42,34 +41,33 @@ def test_walking_beside_its_bare_plant(
     benchmark: Any, report: Callable[..., None], name: str, everything: bool
 ) -> None:
     scenario = load_scenario(name)
-    with threadpool_limits(1):
-        options: dict[str, Any] = {}
-        if everything:
-            options = {"assessment": load_assessment(name), "guard": True, "recovery": True}
-        loop = scenario.make_loop(**options)
-        simulator = Simulator(loop)
+    options: dict[str, Any] = {}
+    if everything:
+        options = {"assessment": load_assessment(name), "guard": True, "recovery": True}
+    loop = scenario.make_loop(**options)
+    simulator = Simulator(loop)
 
-        def begin() -> Simulator:
-            loop.reset_standing(simulator.get_mutable_context(), COMMAND)
-            simulator.Initialize()
-            return simulator
+    def begin() -> Simulator:
+        loop.reset_standing(simulator.get_mutable_context(), COMMAND)
+        simulator.Initialize()
+        return simulator
 
-        port = loop.plant.get_desired_state_input_port(loop.robot_instance)
-        motion = log_commands(loop, begin(), port, SPAN_S)
-        bare = bare_plant(loop)
-        np.testing.assert_allclose(bare.follow(motion), motion.end_state, atol=1e-6)
-        loop_s, plant_s = [], []
+    port = loop.plant.get_desired_state_input_port(loop.robot_instance)
+    motion = log_commands(loop, begin(), port, SPAN_S)
+    bare = bare_plant(loop)
+    np.testing.assert_allclose(bare.follow(motion), motion.end_state, atol=1e-6)
+    loop_s, plant_s = [], []
 
-        def alternate() -> None:
-            started = time.process_time()
-            bare.follow(motion)
-            plant_s.append(time.process_time() - started)
-            begin()
-            started = time.process_time()
-            simulator.AdvanceTo(SPAN_S)
-            loop_s.append(time.process_time() - started)
+    def alternate() -> None:
+        started = time.process_time()
+        bare.follow(motion)
+        plant_s.append(time.process_time() - started)
+        begin()
+        started = time.process_time()
+        simulator.AdvanceTo(SPAN_S)
+        loop_s.append(time.process_time() - started)
 
-        benchmark.pedantic(alternate, rounds=ROUNDS)
+    benchmark.pedantic(alternate, rounds=ROUNDS)
     report(
         f"simulated second, {name}" + (", everything on" if everything else ""),
         min(loop_s) / SPAN_S,

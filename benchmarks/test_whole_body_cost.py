@@ -20,7 +20,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
-from threadpoolctl import threadpool_limits
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
@@ -152,9 +151,8 @@ def precise() -> SolverOptions:
 
 @pytest.fixture(scope="module")
 def reach() -> Reach:
-    with threadpool_limits(1):
-        reach = Reach()
-        reach.simulate()
+    reach = Reach()
+    reach.simulate()
     return reach
 
 
@@ -164,12 +162,11 @@ def test_one_tick(benchmark: Any, report: Callable[..., None], reach: Reach) -> 
     controller = WholeBodyController(reach.kinematics, hand=HAND, period_s=PERIOD_S)
     context = controller.CreateDefaultContext()
     rounds: list[np.ndarray] = []
-    with threadpool_limits(1):
-        benchmark.pedantic(
-            lambda: rounds.append(tick_costs_us(controller, context, inputs, "actuation")),
-            rounds=ROUNDS,
-            warmup_rounds=1,
-        )
+    benchmark.pedantic(
+        lambda: rounds.append(tick_costs_us(controller, context, inputs, "actuation")),
+        rounds=ROUNDS,
+        warmup_rounds=1,
+    )
     assert controller.GetOutputPort("num_failures").Eval(context)[0] == 0
     quickest = min(rounds, key=np.mean)
     note = f"{len(quickest)} ticks of a reach"
@@ -204,16 +201,15 @@ def test_its_qp_beside_other_solvers(
 
         return run
 
-    with threadpool_limits(1):
-        cost_s, peers_s = alternate(
-            benchmark,
-            solve_all(solve_qp),
-            {
-                "daqp alone": solve_all(solve_by_daqp),
-                "Clarabel through MathematicalProgram": solve_all(solve_by_clarabel),
-            },
-            rounds=QP_ROUNDS,
-        )
+    cost_s, peers_s = alternate(
+        benchmark,
+        solve_all(solve_qp),
+        {
+            "daqp alone": solve_all(solve_by_daqp),
+            "Clarabel through MathematicalProgram": solve_all(solve_by_clarabel),
+        },
+        rounds=QP_ROUNDS,
+    )
     num_rows, num_variables = programs[0].A.shape
     peers = {name: 1e6 * seconds / len(programs) for name, seconds in peers_s.items()}
     report(

@@ -9,6 +9,7 @@ MODULES = {
     "live": ("nicegui",),
     "logs": ("mcap", "mcap_ros2", "pandas", "pyarrow", "rosbags"),
     "mujoco": ("mujoco",),
+    "onnx": ("onnx",),
     "report": ("jinja2",),
     "robots": ("trimesh", "collada"),
     "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),

@@ -9,12 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli.console import TrainingOption, open_stages, print_path
 from drake_safety.cli.evaluate_shifts import SHIFTS_FILE
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.report.results import Results, read_evaluation
 from drake_safety.simulation.dataset import read_info
 from drake_safety.simulation.scenario import load_scenario
+from studies.cards import write_card
 from studies.converged import CONVERGED_FILE
 from studies.learning_curve import CURVE_FILE
 from studies.readings import READINGS_FILE
@@ -44,11 +46,14 @@ def readme(
 ) -> None:
     """Rewrite the tables of README.md and docs from docs/results/NAME.json.
 
-    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->.
+    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->. Without
+    PATHS also the cards of the shipped assessments, from what ships.
     """
     for path in paths or _DOCUMENTS:
         for name in rewrite_readme(path):
             print_path(f"results of {name} in", path)
+    for name in [] if paths else assessed_scenarios():
+        print_path("card", write_card(shipped_folder(name), load_scenario(name)))
 
 
 def ship(
@@ -57,7 +62,7 @@ def ship(
         Path, typer.Option(help="Parent of the folder, which is named after the scenario.")
     ] = Path("assessments"),
 ) -> None:
-    """Copy trained assessments, with their evaluation, into the package."""
+    """Copy trained assessments, with their evaluation and a card, into the package."""
     results, extra = _evaluated(assessment)
     if "command" not in extra:
         raise ValueError(

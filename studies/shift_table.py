@@ -32,7 +32,8 @@ def shifts_text(results: Results) -> str:
     entries = results.entries["shifts"]
     kinds: dict[str, str] = entries["kinds"]
     lines = [f"```sh\n{entries['command']}\n```\n"]
-    lines += _table(results, {name: f"{name} ({kind})" for name, kind in kinds.items()}, _COLUMNS)
+    titles = {name: f"{name} ({kind})" for name, kind in kinds.items()}
+    lines += shift_rows(results, titles, _COLUMNS)
     lines += _ranking(results, kinds)
     lines += _promises(results, kinds)
     false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
@@ -60,7 +61,7 @@ def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
         "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
         'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n'
     )
-    table = _table(results, dict(zip(names, names, strict=True)), _RANKING_COLUMNS)
+    table = shift_rows(results, dict(zip(names, names, strict=True)), _RANKING_COLUMNS)
     return [intro, *table] if names else []
 
 
@@ -81,12 +82,18 @@ def _promises(results: Results, kinds: dict[str, str]) -> list[str]:
         "the first half of a shift's unsafe motions, both on the second half; with the monitor, "
         "all motions until its alarm.\n"
     )
-    table = _table(results, dict(zip(names, names, strict=True)), _PROMISE_COLUMNS)
+    table = shift_rows(results, dict(zip(names, names, strict=True)), _PROMISE_COLUMNS)
     return [intro, *table] if names else []
 
 
-def _table(results: Results, titles: dict[str, str], columns: dict[str, str]) -> list[str]:
-    """A row for each shift by its title, and the columns of which any shift has a figure."""
+def shift_rows(results: Results, titles: dict[str, str], columns: dict[str, str]) -> list[str]:
+    """Lines of a table: a row for each shift, the columns of which any shift has a figure.
+
+    Args:
+        results: Stored results with those of the shifts.
+        titles: Title of the row by shift.
+        columns: Title of the column by the last part of its keys.
+    """
     shown = [key for key in columns if any(results.has(f"shifts.{s}.{key}") for s in titles)]
     lines = [
         f"| shift | {' | '.join(columns[key] for key in shown)} |",

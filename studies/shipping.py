@@ -2,7 +2,7 @@
 
 A shipped folder holds the files of a run and `evaluation.json`: results, commands, seeds and
 versions of the evaluation, the SHA-256 of every evaluated file, and the verdicts on the first fresh
-episodes of its seed, which can be simulated again for comparison.
+episodes of its seed, which can be simulated again for comparison; and the card, `README.md`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from drake_safety.learning.segments import split
 from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
-from studies.stored_results import read_results, store_results
+from studies.cards import write_card
+from studies.stored_results import EVALUATION_FILE, read_results, store_results
 
-EVALUATION_FILE = "evaluation.json"
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
@@ -43,7 +43,7 @@ def ship(
     num_workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Copies trained assessments into a folder, with their evaluation.
+    """Copies trained assessments into a folder, with their evaluation and their card.
 
     Args:
         results: Results of the evaluation.
@@ -102,6 +102,7 @@ def ship(
         folder / EVALUATION_FILE,
         train_command=train_command,
     )
+    write_card(folder, scenario)
     return folder
 
 

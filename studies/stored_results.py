@@ -11,6 +11,8 @@ from typing import Any
 
 from drake_safety.evaluation.report.results import Results, as_estimate, read_object
 
+EVALUATION_FILE = "evaluation.json"
+"""Of a shipped folder."""
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
 _NUM_DIGITS = 6  # Significant digits, more than any table shows.

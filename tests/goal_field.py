@@ -59,7 +59,6 @@ class FieldAssessment:
             embedding=np.zeros((n, 2)),
             cause_probability=np.column_stack([0.2 * unsafe, 0.8 * unsafe]),
             predicted_margins=np.column_stack([gamma - 0.5, np.full(n, 0.02)]),
-            unsafe_logit=np.zeros(n),
             calibrated=gamma,
             novelty=np.zeros(len(gamma)),
         )

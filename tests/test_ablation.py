@@ -35,6 +35,8 @@ from studies.ablation_study import (
 )
 from studies.adaptation_study import TestSet
 
+pytestmark = pytest.mark.train
+
 BASE = AssessmentParameters(
     epochs=3, ensemble_size=1, hidden_sizes=[16], perplexity=8.0, min_count=3
 )

@@ -50,6 +50,7 @@ def feedback_cells(assessment, feedback, is_wanted):
     return [assessment.grid_.locate(p[is_wanted(segments)]) for p in points]
 
 
+@pytest.mark.train
 def test_without_a_differing_pair_no_learned_cell_changes(sharpened):
     feedback = pairs_with(lambda episode: False)
     adapted = sharpened.adapt(feedback)
@@ -60,6 +61,7 @@ def test_without_a_differing_pair_no_learned_cell_changes(sharpened):
     assert adapted.adaptation_.num_sets == NUM_PAIRS
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("is_unsafe", [False, True])
 def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_did(
     sharpened, is_unsafe
@@ -91,6 +93,7 @@ def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_di
     assert known[1 if is_unsafe else 0] > (0.7 if is_unsafe else 0.99) * known.sum()
 
 
+@pytest.mark.train
 def test_gamma_falls_for_a_robot_that_fails_more_and_rises_for_one_that_fails_less(sharpened):
     before = sharpened.beliefs_[..., 0]
     lower, higher = (sharpened.adapt(sets).beliefs_[..., 0] for sets in (worse(), better()))
@@ -98,6 +101,7 @@ def test_gamma_falls_for_a_robot_that_fails_more_and_rises_for_one_that_fails_le
     assert higher.sum() > before.sum() + 0.1
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("make", [worse, better])
 def test_gamma_never_rises_in_a_learned_cell_whose_feedback_was_unsafe(sharpened, make):
     feedback = make()
@@ -131,6 +135,7 @@ def test_gamma_never_rises_in_a_learned_cell_whose_feedback_was_unsafe(sharpened
     assert np.all(held <= sharpened.predict(*x).calibrated + 1e-12)
 
 
+@pytest.mark.train
 def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(sharpened):
     correction = sharpened.adapt(worse()).correction_
     least, most = correction.hidden_range
@@ -143,6 +148,7 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
     assert np.ptp(correction.residual(sharpened.embedding_, x)) > 0.0
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(("offset", "expected"), [(1e5, 0.0), (-1e5, 1.0)])
 def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, offset, expected):
     own = sharpened.correction_
@@ -155,6 +161,7 @@ def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, off
     assert single == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.train
 def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_it(sharpened):
     before = sharpened.beliefs_.copy()
     adapted = sharpened.adapt(worse())
@@ -166,6 +173,7 @@ def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_i
     np.testing.assert_array_equal(adapted.prior_beliefs(), before)
 
 
+@pytest.mark.train
 def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path):
     held_out = worse(12)
     for mode, assessment in fitted.items():
@@ -198,6 +206,7 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
         assert np.abs(unmoved.normalized - results[0].normalized).max() > 0.01
 
 
+@pytest.mark.train
 def test_grid_and_published_probability_move_the_same_way(sharpened):
     segments = segments_of(worse(), stride=3, shortest=10, discount=0.99, plain=False)
     before = sharpened.predict(*inputs(segments))
@@ -216,6 +225,7 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     np.testing.assert_allclose(unsafe[..., 3:].sum(axis=2), unsafe[..., 1], atol=1e-12)
 
 
+@pytest.mark.train
 def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prior(paper):
     feedback = worse()[:1]
     segments = paper.feedback_segments(feedback)
@@ -232,6 +242,7 @@ def test_in_the_papers_mode_a_cell_of_which_feedback_says_nothing_keeps_its_prio
     np.testing.assert_array_equal(adapted.beliefs_[0, far], paper.beliefs_[0, far])
 
 
+@pytest.mark.train
 def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper):
     feedback = worse()
     segments = paper.feedback_segments(feedback)
@@ -288,6 +299,7 @@ def test_the_average_refuses_cells_that_are_not_as_many_as_beliefs():
         average_cells(np.zeros((3, 3)), np.zeros(2, dtype=int), np.zeros(4))
 
 
+@pytest.mark.train
 def test_the_discrepancy_is_high_where_scores_differ_and_unknown_far_away():
     rng = np.random.default_rng(0)
     points = rng.uniform(-60.0, 60.0, (300, 2))
@@ -303,6 +315,7 @@ def test_the_discrepancy_is_high_where_scores_differ_and_unknown_far_away():
     np.testing.assert_allclose(mu, [0.1 + 0.9 * mean[0], 0.1 + 0.9 * mean[1], 0.3])
 
 
+@pytest.mark.train
 def test_points_that_are_not_finite_teach_nothing_and_are_not_known():
     points = np.array([[0.0, 0.0], [np.nan, 0.0], [5.0, 5.0]])
     discrepancy = DiscrepancyFunction().fit(points, np.array([1.0, 0.5, 1.0]))
@@ -313,6 +326,7 @@ def test_points_that_are_not_finite_teach_nothing_and_are_not_known():
         DiscrepancyFunction().fit(points[1:2], np.ones(1))
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -335,6 +349,7 @@ def test_feedback_of_another_scenario_is_refused(sharpened, change, message):
         sharpened.adapt([])
 
 
+@pytest.mark.train
 def test_a_method_that_does_not_exist_or_does_not_fit_is_refused(sharpened, paper):
     with pytest.raises(ValueError, match="cannot adapt by 'luck'"):
         sharpened.adapt(worse(), method="luck")
@@ -342,6 +357,7 @@ def test_a_method_that_does_not_exist_or_does_not_fit_is_refused(sharpened, pape
         paper.adapt(worse(), method="recalibration")
 
 
+@pytest.mark.train
 def test_the_papers_update_can_be_asked_for_in_the_sharpened_mode(sharpened):
     adapted = sharpened.adapt(worse(), method="paper")
     assert adapted.adaptation_.method == "paper"

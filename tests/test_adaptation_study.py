@@ -12,6 +12,8 @@ from studies.adaptation_figure import adaptation_figure, study_figure
 from studies.adaptation_losses import STEPS, losses
 from studies.adaptation_study import Pool, TestSet, scores, study, train_baselines
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def assessment():

@@ -22,6 +22,8 @@ from drake_safety.simulation.goal_motion import GoalMotion
 from drake_safety.simulation.scenario import load_scenario
 from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, made_up_episodes
 
+pytestmark = pytest.mark.train
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -13,6 +13,8 @@ from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.calibration import calibrate
 from lip_assessments import held_out_segments, inputs, quick_assessment
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def held_out():

@@ -38,6 +38,7 @@ def test_the_maps_never_leave_out_so_much_that_nothing_is_left(segments):
     assert not held_out_segments(segments, parameters(mode="paper")).any()
 
 
+@pytest.mark.train
 def test_the_logit_is_fitted_on_an_ensemble_that_knows_none_of_the_episodes(monkeypatch):
     episodes = make_episodes(120, noise=0.002)
     settings = parameters(epochs=2, hidden_sizes=[24, 24], held_out=0.3)

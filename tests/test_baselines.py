@@ -6,6 +6,8 @@ from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.learning.segments import Episodes, split
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def training():

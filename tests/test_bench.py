@@ -53,6 +53,7 @@ def run_of(*figures, cpu="Some CPU"):
     }
 
 
+@pytest.mark.train
 def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(run_benchmarks):
     result, file = run_benchmarks(THREE)
     result.assert_outcomes(passed=1)
@@ -70,6 +71,7 @@ def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(
     assert "StdDev" not in printed
 
 
+@pytest.mark.train
 def test_the_json_holds_every_row_and_where_and_when_it_was_measured(run_benchmarks):
     _, file = run_benchmarks(THREE)
     content = json.loads(file.read_text())
@@ -91,6 +93,7 @@ def test_the_json_holds_every_row_and_where_and_when_it_was_measured(run_benchma
     assert read_run(file) == content
 
 
+@pytest.mark.train
 def test_a_value_that_is_no_number_is_within_no_limit(run_benchmarks):
     body = "def test_nan(benchmark, report):\n    benchmark(int)\n"
     body += "    for key in ('at_most', 'at_least'):\n"
@@ -99,6 +102,7 @@ def test_a_value_that_is_no_number_is_within_no_limit(run_benchmarks):
     assert "0 of 2 within their limits" in result.stdout.str()
 
 
+@pytest.mark.train
 def test_two_figures_of_one_name_are_refused(run_benchmarks):
     body = "def test_twice(benchmark, report):\n    benchmark(int)\n"
     body += "    report('tick', 1.0, 's')\n    report('tick', 2.0, 's')\n"

@@ -24,6 +24,7 @@ from drake_safety.plants.balls import Throw
 from gliding_task import SCENARIO
 
 
+@pytest.mark.train
 def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, monkeypatch, capsys):
     file = tmp_path / "gliding.yaml"
     file.write_text(SCENARIO + "parameters: {failure: bug}\n")
@@ -53,6 +54,7 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "evaluate",
         "compare",
         "adapt",
+        "export",
         "report",
     ]
     for command in commands.values():
@@ -65,6 +67,7 @@ def test_a_table_of_scenarios_is_printed(monkeypatch, capsys):
     assert "nominal, actual" in printed
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -92,6 +95,7 @@ def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.train
 def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simulated(
     monkeypatch, capsys, tmp_path
 ):
@@ -117,6 +121,7 @@ def stopped(monkeypatch):
     monkeypatch.setattr("drake_safety.simulation.rollouts.run_episodes", stop)
 
 
+@pytest.mark.train
 def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, stopped, tmp_path):
     out = tmp_path / "my run"
     assert call(monkeypatch, "train", "pendulum", "--out", out, "--mode", "paper") == 130
@@ -127,6 +132,7 @@ def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, 
     assert capsys.readouterr().out.splitlines()[1].endswith(f"--out '{out}' --resume")
 
 
+@pytest.mark.train
 def test_what_keeps_its_episodes_is_continued_by_the_same_command(
     monkeypatch, capsys, stopped, tmp_path
 ):
@@ -136,6 +142,7 @@ def test_what_keeps_its_episodes_is_continued_by_the_same_command(
     assert line == "continue with: drake-safety calibrate laikago_balancing --episodes 7"
 
 
+@pytest.mark.train
 def test_sigterm_says_what_continues_too(tmp_path):
     program = (
         "import os, signal; import drake_safety.simulation.rollouts as rollouts;"
@@ -186,6 +193,7 @@ def test_a_shell_completes_commands_and_scenarios_without_drake():
         assert ended.stdout.split() == [found]
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
@@ -203,6 +211,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
     assert f"error folder '{what}' cannot be written" in capsys.readouterr().out
 
 
+@pytest.mark.train
 def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("drake_safety.simulation.dataset.completed", lambda path: {0, 1, 2})
     (tmp_path / "episodes").mkdir()

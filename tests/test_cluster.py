@@ -74,6 +74,7 @@ def assert_same(found, expected):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
+@pytest.mark.train
 def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     address, workers = two_workers
     pendulum, own_task = load_scenario("pendulum"), gliding()
@@ -97,6 +98,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     assert_same(glided, run_episodes(own_task, 8, num_workers=1))
 
 
+@pytest.mark.train
 def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path):
     with (
         pytest.raises(ValueError, match=r"no dask scheduler answers at 'tcp://127.0.0.1:9'"),
@@ -151,6 +153,7 @@ def test_a_worker_with_other_versions_is_refused_by_name():
         call()
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("command", ["train", "evaluate", "calibrate", "adapt", "compare"])
 def test_every_long_command_takes_a_cluster(command, monkeypatch, tmp_path):
     seen = []

@@ -41,7 +41,6 @@ class SlowIsSafe:
             calibrated=gamma,
             predicted_margins=np.zeros((n, 1)),
             novelty=np.full(n, self.novelty),
-            unsafe_logit=np.zeros(n),
         )
 
 

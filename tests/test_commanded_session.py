@@ -8,6 +8,8 @@ from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.live.commanded_session import LiveCommands
 from live_scenarios import quick
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def session():

@@ -71,6 +71,7 @@ def test_a_finished_row_is_read_again_and_another_effort_makes_another(tmp_path,
         compare_scenario(scenario, tmp_path, more, progress=progress)
 
 
+@pytest.mark.train
 def test_a_task_without_recovery_has_a_row_without_falls(tmp_path, monkeypatch, capsys):
     file, out = tmp_path / "shuttling.yaml", tmp_path / "table"
     file.write_text(SCENARIO)

@@ -14,6 +14,8 @@ from cart_episodes import ARRAYS, make_episode, make_info
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
 
+pytestmark = pytest.mark.train
+
 
 def write(path, indices, **options):
     with EpisodeWriter(path, make_info(), **options) as writer:

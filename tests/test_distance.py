@@ -9,6 +9,8 @@ from drake_safety.learning.segments import split
 from drake_safety.learning.training import learned_maps, segments_for
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def segments():

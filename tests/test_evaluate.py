@@ -137,6 +137,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     assert judged == {"sharpened", "paper", "fair"}
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -200,6 +201,7 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
     assert all(again[key] == report[key] for key in report if key.startswith("monitoring."))
 
 
+@pytest.mark.train
 def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, shuttle_run):
     _, folder = shuttle_run
     arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)

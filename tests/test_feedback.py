@@ -17,6 +17,8 @@ from drake_safety.simulation.feedback import (
 from drake_safety.simulation.rollouts import episode_rng, run_episode
 from drake_safety.systems.feedback_recorder import RecordedWindow
 
+pytestmark = pytest.mark.train
+
 
 def quick():
     scenario = load_scenario("laikago_balancing")

@@ -37,13 +37,14 @@ ALLOWED["extras"] = set()
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "pyarrow", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags", "pandas", "mujoco", "trimesh", "collada"}
+HEAVY |= {"mcap", "mcap_ros2", "rosbags", "pandas", "mujoco", "onnx", "trimesh", "collada"}
 # Each extra and the files that may import what only it brings.
 EXTRAS = {
     "cluster": ("drake_safety/simulation/cluster",),
     "live": ("drake_safety/live/page",),
     "logs": ("drake_safety/logs/",),
     "mujoco": ("drake_safety/plants/mujoco",),
+    "onnx": ("drake_safety/learning/onnx_graph.py",),
     "report": ("drake_safety/evaluation/report/page",),
     "robots": ("drake_safety/robots/",),
     "train": (

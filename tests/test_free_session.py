@@ -21,6 +21,8 @@ from gliding_task import Gliding, gliding
 from live_scenarios import quick
 from shuttle_task import shuttling
 
+pytestmark = pytest.mark.train
+
 SHOWN_S = 1.5
 
 

@@ -21,6 +21,8 @@ from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from log_files import FORMATS, balancing_loop, map_text, part, recorded, write
 
+pytestmark = pytest.mark.train
+
 NUM_FILES = int(os.environ.get("FUZZ_FILES", "1000"))
 LONGEST_MESSAGE = 800
 ROOT = Path(__file__).parents[1]

@@ -16,12 +16,19 @@ def test_the_first_coordinate_counts_rows():
     assert GRID.locate(np.array([-59.0, -69.0])) == 14
 
 
+def interpolated(grid, points, values):
+    """One value a cell, at points of one map."""
+    found, _ = grid.interpolate(np.asarray(points)[None], np.asarray(values)[None, :, None])
+    return found[0, :, 0]
+
+
 @pytest.mark.parametrize("point", [(70.0, 0.0), (0.0, -70.1), (np.nan, 0.0), (np.inf, 0.0)])
 def test_a_point_beyond_the_edge_is_outside_and_not_in_the_last_cell(point):
     assert GRID.locate(np.array(point)) == OUTSIDE
-    cells, weights = GRID.bilinear(np.array(point))
-    assert np.all(cells == OUTSIDE)
-    assert np.all(weights == 0.0)
+    for read in (GRID.interpolate, GRID.look_up):
+        values, is_inside = read(np.array([[point]]), np.ones((1, GRID.num_cells, 2)))
+        np.testing.assert_array_equal(values, np.zeros((1, 1, 2)))
+        assert not is_inside.any()
 
 
 def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth():
@@ -32,29 +39,36 @@ def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth():
 
 
 def test_interpolation_reproduces_a_linear_function_between_the_outermost_centres():
-    values = GRID.centres @ [2.0, -3.0] + 5.0
     points = np.random.default_rng(1).uniform(-65.0, 65.0, size=(200, 2))
-    cells, weights = GRID.bilinear(points)
-    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), points @ [2.0, -3.0] + 5.0)
+    found = interpolated(GRID, points, GRID.centres @ [2.0, -3.0] + 5.0)
+    np.testing.assert_allclose(found, points @ [2.0, -3.0] + 5.0, atol=1e-9)
 
 
 def test_at_a_centre_interpolation_gives_the_cell_itself():
-    cells, weights = GRID.bilinear(GRID.centres)
     values = np.random.default_rng(2).uniform(size=GRID.num_cells)
-    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), values, atol=1e-12)
+    np.testing.assert_allclose(interpolated(GRID, GRID.centres, values), values, atol=1e-12)
 
 
 def test_between_the_outermost_centres_and_the_edge_the_nearest_centres_count():
     values = np.arange(GRID.num_cells, dtype=float)
-    cells, weights = GRID.bilinear(np.array([[-69.9, -69.9], [69.9, -65.0], [-69.0, -60.0]]))
-    np.testing.assert_allclose((weights * values[cells]).sum(axis=1), [0.0, 13 * 14, 0.5])
+    found = interpolated(GRID, [[-69.9, -69.9], [69.9, -65.0], [-69.0, -60.0]], values)
+    np.testing.assert_allclose(found, [0.0, 13 * 14, 0.5])
 
 
 def test_a_grid_of_one_cell_interpolates_to_that_cell():
     grid = Grid(resolution=1, cell_length=2.0)
-    cells, weights = grid.bilinear(np.array([0.3, -0.7]))
-    assert set(cells.tolist()) == {0}
-    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(interpolated(grid, [[0.3, -0.7]], [4.0]), [4.0])
+
+
+def test_each_map_reads_its_own_cells():
+    values = np.random.default_rng(3).uniform(size=(3, GRID.num_cells, 2))
+    points = np.random.default_rng(4).uniform(-69.0, 69.0, size=(3, 50, 2))
+    found, is_inside = GRID.look_up(points, values)
+    assert is_inside.all()
+    for k in range(3):
+        np.testing.assert_array_equal(found[k], values[k][GRID.locate(points[k])])
+        alone, _ = GRID.interpolate(points[k : k + 1], values[k : k + 1])
+        np.testing.assert_array_equal(GRID.interpolate(points, values)[0][k], alone[0])
 
 
 def test_points_that_coincide_cannot_be_scaled():

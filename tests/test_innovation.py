@@ -45,11 +45,13 @@ def levels(innovation, novelty, x):
     return innovation.levels(x, [novelty.of(one) for one in x])
 
 
+@pytest.mark.train
 def test_hours_of_the_same_plant_raise_no_alarm(innovation, novelty):
     x = motions(5400, 2)  # Three hours.
     assert levels(innovation, novelty, x).max() < 1.0
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("change", "within_s"),
     [
@@ -66,12 +68,14 @@ def test_a_changed_plant_is_noticed_though_no_input_is_novel(innovation, novelty
     assert (np.argmax(found) + 1) * STEP_S <= within_s
 
 
+@pytest.mark.train
 def test_one_impact_is_no_lasting_change(innovation, novelty):
     x = motions(20, 4)
     x[10][20, 2] += 5.0
     assert levels(innovation, novelty, x)[:, [FAST, SLOW]].max() < 1.0
 
 
+@pytest.mark.train
 def test_a_frozen_input_is_noticed_after_few_repeats(innovation, novelty):
     x = motions(3, 5)
     x[1][5:] = x[1][5]
@@ -79,11 +83,13 @@ def test_a_frozen_input_is_noticed_after_few_repeats(innovation, novelty):
     assert 5 < np.argmax(found) - STEPS <= 5 + innovation.longest_repeat + 1
 
 
+@pytest.mark.train
 def test_inputs_far_from_training_add_up(innovation, novelty):
     x = [3.0 * one for one in motions(20, 6)]
     assert levels(innovation, novelty, x)[:, DISTANCE].max() > 1.0
 
 
+@pytest.mark.train
 def test_the_cause_names_the_state_that_is_pushed(innovation):
     x = motions(20, 7, force=(0.0, -0.02))
     errors = np.concatenate([innovation.of(one[:-1], one[1:, :NUM_STATES]) for one in x])
@@ -111,6 +117,7 @@ def test_the_other_alarms_say_it_too():
     assert said[3].startswith("inputs noisier")
 
 
+@pytest.mark.train
 def test_what_an_actual_robot_does_is_no_alarm_after_feedback(innovation, novelty):
     change = {"force": (0.01, 0.0)}
     adapted_novelty = novelty.with_feedback(np.concatenate(motions(60, 8, **change)), 0.01)
@@ -123,6 +130,7 @@ def test_what_an_actual_robot_does_is_no_alarm_after_feedback(innovation, novelt
     assert levels(adapted, adapted_novelty, other).max() > 1.0
 
 
+@pytest.mark.train
 def test_too_little_motion_gives_no_alarm(novelty):
     innovation = Innovation.fit(motions(1, 11)[0:1], NUM_STATES, STEP_S, novelty)
     assert np.all(np.isinf([chart.limit for chart in innovation.charts]))
@@ -134,6 +142,7 @@ def test_a_motion_of_one_input_is_refused():
         Innovation.fit([np.zeros((1, 6))], NUM_STATES, STEP_S, novelty)
 
 
+@pytest.mark.train
 def test_a_file_keeps_the_bits(innovation):
     arrays = innovation.arrays()
     again = Innovation.from_arrays(arrays, num_inputs=6, num_states=NUM_STATES)
@@ -141,6 +150,7 @@ def test_a_file_keeps_the_bits(innovation):
         np.testing.assert_array_equal(value, arrays[name], err_msg=name)
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("name", ["offset", "chart_whitenings", "layer.1.bias"])
 def test_damaged_arrays_are_refused(innovation, name):
     arrays = innovation.arrays()
@@ -156,6 +166,7 @@ def test_damaged_arrays_are_refused(innovation, name):
         )
 
 
+@pytest.mark.train
 def test_an_assessment_learns_it_and_keeps_it(tmp_path):
     assessment = SafetyAssessment(AssessmentParameters(**{**QUICK, "epochs": 1}))
     episodes = make_episodes(120, noise=0.002)

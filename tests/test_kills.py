@@ -67,6 +67,7 @@ def assert_kept(folder, undisturbed):
             np.testing.assert_array_equal(getattr(episode, name), getattr(expected, name))
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, undisturbed):
     process = start(tmp_path)
@@ -83,6 +84,7 @@ def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, 
     assert_kept(tmp_path / "episodes", undisturbed)
 
 
+@pytest.mark.train
 def test_a_killed_worker_is_one_line_that_says_how_to_go_on(tmp_path, undisturbed):
     process = start(tmp_path)
     workers = workers_of(process)

@@ -8,6 +8,8 @@ from shuttle_task import shuttling
 from studies.learning_curve import learning_curve
 from studies.learning_curve_figure import learning_curve_figure
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

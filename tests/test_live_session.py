@@ -66,6 +66,7 @@ def goals(goals_loop, meshcat):
     return LiveGoals(goals_loop, meshcat, threshold=0.4)
 
 
+@pytest.mark.train
 def test_a_tick_goes_on_by_its_time_and_the_panel_shows_the_gamma_of_the_loop(throws):
     assert throws.tick()
     assert throws.context.get_time() == pytest.approx(TICK_S)
@@ -75,6 +76,7 @@ def test_a_tick_goes_on_by_its_time_and_the_panel_shows_the_gamma_of_the_loop(th
     assert throws.panel.curve()[-1] == (0.0, pytest.approx(gamma, abs=0.001))
 
 
+@pytest.mark.train
 def test_a_click_throws_the_ball_of_the_sliders_once(throws):
     ball = throws.loop.GetOutputPort("ball_state")
     throws.tick()
@@ -91,6 +93,7 @@ def test_a_click_throws_the_ball_of_the_sliders_once(throws):
     assert ball.Eval(throws.context)[5] - was[1] == pytest.approx(4.0 * TICK_S, rel=0.05)
 
 
+@pytest.mark.train
 def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
     context = throws.context
     plant = throws.loop.plant
@@ -107,6 +110,7 @@ def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
     assert context.get_time() <= 2 * TICK_S
 
 
+@pytest.mark.train
 def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypatch):
     tick, ticks = throws.tick, []
 
@@ -132,6 +136,7 @@ def test_factors_are_simulated_by_real_time():
     assert np.isnan(Pace().realtime_factor)
 
 
+@pytest.mark.train
 def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
     move(goals, NEAR)
     assert not goals.tick()
@@ -144,6 +149,7 @@ def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
     assert goals.context.get_time() == 0.0
 
 
+@pytest.mark.train
 def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told(goals):
     move(goals, FAR)
     goals.panel.click(goals.GO)
@@ -154,6 +160,7 @@ def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told
     assert f"accepted {distance_cm:.0f} cm away" in goals.panel.status.note
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(("target", "button"), [(NEAR, "GO"), (FAR, "FORCE")])
 def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
     move(goals, target)
@@ -196,6 +203,7 @@ def test_play_without_a_library_for_pages_says_how_to_install_it(monkeypatch, ca
     assert "pip install 'drake_safety[live]'" in capsys.readouterr().out
 
 
+@pytest.mark.train
 def test_the_robot_stays_in_the_middle_of_the_picture(throws, monkeypatch):
     moved, camera, context = {}, throws._camera, throws.context
     spy = SimpleNamespace(SetTransform=lambda path, X: moved.update({path: X.translation()}))

@@ -21,6 +21,8 @@ from log_files import (
     write,
 )
 
+pytestmark = pytest.mark.train
+
 INDICES = (10, 0)
 
 

@@ -41,6 +41,7 @@ def without(log, first, last):
     return dataclasses.replace(log, **rows)
 
 
+@pytest.mark.train
 def test_a_missing_value_costs_its_row_alone(tmp_path):
     log = recorded(SAFE)
     frame = frame_of(log, JOINTS)
@@ -60,6 +61,7 @@ def test_a_missing_value_costs_its_row_alone(tmp_path):
     ]
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_gap_in_a_log_of_any_format_is_where_it_is_cut(kind, tmp_path):
     log = recorded(SAFE)
@@ -72,6 +74,7 @@ def test_a_gap_in_a_log_of_any_format_is_where_it_is_cut(kind, tmp_path):
         read_log(path, tmp_path / "columns.yaml", ROBOT)
 
 
+@pytest.mark.train
 def test_a_log_without_either_is_read_as_it_is(tmp_path):
     path = write(recorded(SAFE), JOINTS, "parquet", tmp_path)
     found = read(path, "parquet")
@@ -82,6 +85,7 @@ def test_a_log_without_either_is_read_as_it_is(tmp_path):
     assert (found.cuts, found.kept_share) == ([], 1.0)
 
 
+@pytest.mark.train
 def test_a_line_that_was_cut_off_is_left_out(tmp_path):
     path = write(part(recorded(SAFE), 0, 40), JOINTS, "csv", tmp_path)
     path.write_text(path.read_text().rsplit(",", 30)[0])
@@ -89,6 +93,7 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path):
     assert len(piece.time_s) == 39
 
 
+@pytest.mark.train
 def test_pieces_without_derivatives_are_dropped_and_not_counted(tmp_path):
     frame = frame_of(recorded(SAFE), JOINTS)
     frame.loc[40, "gyro_x"] = np.nan
@@ -98,6 +103,7 @@ def test_pieces_without_derivatives_are_dropped_and_not_counted(tmp_path):
     assert found.kept_share == pytest.approx(STEP_S * (39 + 197) / 0.6)
 
 
+@pytest.mark.train
 def test_a_log_of_which_nothing_is_left_is_refused_with_the_reason(tmp_path):
     frame = frame_of(recorded(SAFE), JOINTS)
     with pytest.raises(
@@ -106,6 +112,7 @@ def test_a_log_of_which_nothing_is_left_is_refused_with_the_reason(tmp_path):
         read_frame(frame.assign(goal_x=np.nan), tmp_path)
 
 
+@pytest.mark.train
 def test_what_is_wrong_with_the_map_is_still_refused(tmp_path):
     frame = frame_of(recorded(SAFE), JOINTS)
     frame.loc[40, "gyro_x"] = np.nan

@@ -49,6 +49,7 @@ def read_csv(frame, folder, *changes):
     return read_log(folder / "run.csv", map_of("csv", folder, *changes), ROBOT)
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("kind", FORMATS)
 def test_every_format_gives_the_same_episode(kind, tmp_path):
     log = recorded(UNSAFE)
@@ -61,6 +62,7 @@ def test_every_format_gives_the_same_episode(kind, tmp_path):
     assert_same(episode, direct)
 
 
+@pytest.mark.train
 def test_a_log_can_be_resampled(few_rows, tmp_path):
     frame_of(few_rows, JOINTS).to_parquet(tmp_path / "run.parquet")
     log = read_log(tmp_path / "run.parquet", map_of("parquet", tmp_path), ROBOT, step_s=0.00375)
@@ -70,6 +72,7 @@ def test_a_log_can_be_resampled(few_rows, tmp_path):
     np.testing.assert_allclose(log.v[1], middle, atol=1e-11)
 
 
+@pytest.mark.train
 def test_velocities_that_are_not_logged_are_derivatives(few_rows, tmp_path):
     path = map_of("csv", tmp_path)
     lines = [line for line in path.read_text().splitlines() if "velocit" not in line]
@@ -131,6 +134,7 @@ SPOILT = {
 }  # fmt: skip
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("what", SPOILT)
 def test_what_is_wrong_is_named_with_row_and_column(what, few_rows, tmp_path):
     spoil, changes, message = SPOILT[what]
@@ -138,11 +142,13 @@ def test_what_is_wrong_is_named_with_row_and_column(what, few_rows, tmp_path):
         read_csv(spoil(frame_of(few_rows, JOINTS)), tmp_path, *changes)
 
 
+@pytest.mark.train
 def test_a_quaternion_order_that_turns_the_robot_around_is_told_by_its_sliding_feet(tmp_path):
     with pytest.raises(ValueError, match=r"line 2 and .* slide by .* 'base_orient.* is xyzw"):
         read_csv(frame_of(recorded(UNSAFE), JOINTS), tmp_path, ("order: xyzw", "order: wxyz"))
 
 
+@pytest.mark.train
 def test_messages_that_lack_something_say_what_there_is(few_rows, tmp_path):
     path = write(few_rows, JOINTS, "mcap", tmp_path)
     for old, new, message in [
@@ -157,6 +163,7 @@ def test_messages_that_lack_something_say_what_there_is(few_rows, tmp_path):
             read_log(path, map_of("mcap", tmp_path, (old, new)), ROBOT)
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("kind", ["parquet", "mcap", "ros1"])
 def test_a_file_that_was_cut_off_is_refused(kind, few_rows, tmp_path):
     path = write(few_rows, JOINTS, kind, tmp_path)
@@ -165,6 +172,7 @@ def test_a_file_that_was_cut_off_is_refused(kind, few_rows, tmp_path):
         read_log(path, map_of(kind, tmp_path), ROBOT)
 
 
+@pytest.mark.train
 def test_a_line_that_was_cut_off_is_refused(few_rows, tmp_path):
     path = write(few_rows, JOINTS, "csv", tmp_path)
     path.write_text(path.read_text().rsplit(",", 30)[0])
@@ -172,6 +180,7 @@ def test_a_line_that_was_cut_off_is_refused(few_rows, tmp_path):
         read_log(path, map_of("csv", tmp_path), ROBOT)
 
 
+@pytest.mark.train
 @pytest.mark.parametrize("kind", ["mcap", "ros2"])
 def test_without_the_extra_it_is_named(kind, few_rows, tmp_path, monkeypatch):
     path = write(few_rows, JOINTS, kind, tmp_path)
@@ -181,6 +190,7 @@ def test_without_the_extra_it_is_named(kind, few_rows, tmp_path, monkeypatch):
         read_log(path, map_of(kind, tmp_path), ROBOT)
 
 
+@pytest.mark.train
 def test_what_is_no_log_or_no_table_with_topics_is_refused(few_rows, tmp_path):
     columns = map_of("csv", tmp_path)
     for path, message in [
@@ -215,6 +225,7 @@ def test_a_map_that_says_nothing_or_nonsense_is_refused(text, message, tmp_path)
         load_log_map(path)
 
 
+@pytest.mark.train
 def test_a_map_without_a_column_for_a_joint_names_it(few_rows, tmp_path):
     joints = f"{{columns: {{{JOINTS[0]}: a, wing: b}}, unit: deg}}"
     with pytest.raises(ValueError, match=rf"none for \['{JOINTS[1]}'.*no joints \['wing'\]"):
@@ -237,6 +248,7 @@ def test_a_field_is_found_by_name_by_number_and_by_the_name_beside_it():
         field_of("motors[0].q[c]")(State())
 
 
+@pytest.mark.train
 def test_a_date_column_needs_no_unit(few_rows, tmp_path):
     frame = frame_of(few_rows, JOINTS)
     import pandas as pd

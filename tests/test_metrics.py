@@ -98,6 +98,7 @@ def test_the_area_is_the_share_of_pairs_in_the_right_order_and_a_tie_counts_half
     assert area_under_curve(-score, label) == 0.5 / 4
 
 
+@pytest.mark.train
 def test_the_area_agrees_with_scikit_learn_with_weights_and_ties():
     from sklearn.metrics import roc_auc_score
 

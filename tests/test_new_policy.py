@@ -38,6 +38,7 @@ def uncommented(path, *starts):
     path.write_text("\n".join(lines))
 
 
+@pytest.mark.train
 def test_a_network_alone_leaves_what_it_cannot_tell_to_be_asked_for(tmp_path):
     network = save_network(tmp_path / "walk.pt", 42, 18, scale=0.0)
     out, result = new(tmp_path, network)
@@ -86,6 +87,7 @@ def deploy(folder):
     return folder / "deploy.yaml"
 
 
+@pytest.mark.train
 def test_a_deploy_yaml_leaves_the_names_of_the_motors_alone(tmp_path):
     out, result = new(tmp_path, deploy(tmp_path))
     assert result.exit_code == 0, result.output
@@ -100,6 +102,7 @@ def test_a_deploy_yaml_leaves_the_names_of_the_motors_alone(tmp_path):
     assert problems(out / "walking.yaml") == []
 
 
+@pytest.mark.train
 def test_joints_that_a_policy_moves_are_not_fixed(tmp_path):
     # Three legs have feet; the policy moves the others too.
     network = save_network(tmp_path / "walk.pt", 42, 18)

@@ -40,6 +40,35 @@ def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
     np.testing.assert_allclose(again, distance, rtol=1e-6)
 
 
+def whitened_distances(known, x, plan):
+    """The same by whitening along every axis, the variance of each bounded from below."""
+    scale = np.maximum(np.sqrt(np.diag(known.covariance)), 1e-2)
+    found = []
+    for columns, least, most in (
+        (slice(None), 1e-2, np.inf),
+        (slice(None), 1e-8, 1e-7),
+        (plan, 1e-4, np.inf),
+    ):
+        unit = scale[columns]
+        variance, axes = np.linalg.eigh(known.covariance[columns, columns] / np.outer(unit, unit))
+        along = (x - known.mean)[:, columns] / unit @ axes
+        squares = (along**2 / np.maximum(variance, least))[:, variance < most]
+        found.append(np.sqrt(squares.sum(axis=1)))
+    return np.stack(found, axis=1)
+
+
+@pytest.mark.parametrize("name", ["atlas_reaching", "go2_walking"])
+def test_the_distances_are_those_of_whitened_inputs_with_bounded_variances(name):
+    novelty = load_assessment(name).novelty_
+    known, rng = novelty.training, np.random.default_rng(0)
+    root = np.linalg.cholesky(known.covariance + 1e-12 * np.eye(len(known.mean)))
+    x = known.mean + rng.normal(size=(200, len(root))) @ root.T
+    x[100:] += rng.normal(size=(100, len(root))) * 10.0 ** rng.integers(-6, 6, size=(100, 1))
+    expected = whitened_distances(known, x, novelty.plan)
+    np.testing.assert_allclose(novelty.distances(x), expected, rtol=1e-6)
+    np.testing.assert_allclose(novelty.of(x), (expected / novelty.limits).max(axis=1), rtol=1e-6)
+
+
 def test_an_input_far_outside_the_range_is_novel_though_it_contradicts_nothing(novelty):
     along = np.array([[0.5, 50.0, 1.0, 0.0]])
     distances = novelty.distances(7.0 * np.eye(4)[3] + along * [[1.0], [20.0]]) / novelty.limits

@@ -17,6 +17,8 @@ from drake_safety.systems.safety_assessor import SafetyAssessor
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
 
+pytestmark = pytest.mark.train
+
 INPUTS = ("state", "desired_preview", "features")
 
 

@@ -17,6 +17,8 @@ from drake_safety.simulation.online_adaptation import OnlineAdaptation
 from drake_safety.simulation.rollouts import episode_rng
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 
+pytestmark = pytest.mark.train
+
 STEP_S, NUM_STEPS = 0.1, 4
 INFO = EpisodesInfo(
     scenario="rest",

@@ -266,7 +266,7 @@ def test_every_lower_bound_of_what_users_install_is_a_version_that_is_tested():
     for line in map(Requirement, listed):
         if line.name != project["name"]:
             (bound,) = [one.version for one in line.specifier if one.operator == ">="]
-            assert str(tested[canonicalize_name(line.name)]) == f"=={bound}", line
+            assert tested[canonicalize_name(line.name)].contains(bound), line
 
 
 def test_the_installed_package_imports_from_the_root_folder(clean_environment):

@@ -60,6 +60,7 @@ def test_segments_overlap_by_all_but_one_sample_or_not_at_all(episodes):
         assert not np.any(segments.start_row % expected)
 
 
+@pytest.mark.train
 def test_without_velocities_gamma_depends_on_configurations_alone(episodes):
     names = [f"base_{i}" if i % 2 else f"velocity_{i}" for i in range(6)]
     info = replace(episodes.info, state_names=names)
@@ -80,6 +81,7 @@ def test_without_velocities_gamma_depends_on_configurations_alone(episodes):
     np.testing.assert_array_equal(x[:, : (~rates).sum()], state[:, ~rates])
 
 
+@pytest.mark.train
 def test_neighbours_under_omega_meet_in_the_plane_where_the_target_does_not_say_so():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(200, 6))
@@ -104,6 +106,7 @@ def test_taking_inputs_keeps_the_neighbours_that_are_taken():
     np.testing.assert_array_equal(data.neighbours, [[-1, 1], [-1, 2], [1, -1]])
 
 
+@pytest.mark.train
 def test_the_loss_without_a_square_gives_the_median_and_with_it_the_mean():
     # Of equal inputs, four fifths are at one point and a fifth is at another.
     rng = np.random.default_rng(0)
@@ -117,6 +120,7 @@ def test_the_loss_without_a_square_gives_the_median_and_with_it_the_mean():
     assert abs(np.mean(found["norm"])) < 0.5
 
 
+@pytest.mark.train
 def test_stopping_early_keeps_the_epoch_that_is_best_on_held_out_inputs():
     rng = np.random.default_rng(1)
     x = rng.normal(size=(240, 12))
@@ -130,6 +134,7 @@ def test_stopping_early_keeps_the_epoch_that_is_best_on_held_out_inputs():
     assert error(trained(seen, reading, unseen)) < 0.95 * error(trained(seen, reading))
 
 
+@pytest.mark.train
 def test_standardised_inputs_make_the_map_independent_of_units():
     rng = np.random.default_rng(2)
     x = rng.normal(size=(200, 3))
@@ -142,6 +147,7 @@ def test_standardised_inputs_make_the_map_independent_of_units():
         assert np.allclose(one, other, atol=1e-3) == standardized
 
 
+@pytest.mark.train
 def test_the_discrepancy_is_predicted_where_t_sne_has_put_the_segments(episodes, tmp_path):
     settings = AdaptationParameters(discrepancy_at="tsne")
     prior = SafetyAssessment(paper(adaptation=settings, paper=PaperReading(epochs=2)))

@@ -46,6 +46,7 @@ def test_every_reading_differs_from_the_default_in_what_it_names(name):
     assert len({one.name for one in readings}) == len(readings)
 
 
+@pytest.mark.train
 def test_feedback_without_a_gap_leaves_less_uncertainty_and_refuses_less_at_the_papers_threshold():
     prior = SafetyAssessment(AssessmentParameters(mode="paper", **QUICK)).fit(make_episodes(240))
     other, test = make_episodes(60, seed=5), make_episodes(60, seed=6)

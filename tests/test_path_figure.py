@@ -8,6 +8,8 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from lip_assessments import QUICK
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 
 def test_the_path_is_that_of_the_points_and_events_are_marked_where_they_happen():
     episodes = make_episodes(80)

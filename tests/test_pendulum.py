@@ -140,6 +140,7 @@ def test_numbers_that_cannot_be_are_refused(parameters, message):
         parse_scenario(text, name="odd", folder=None)
 
 
+@pytest.mark.train
 def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario):
     episodes = run_episodes(scenario, 160, num_workers=1)
     parameters = replace(scenario.assessment, ensemble_size=1, perplexity=20.0)

@@ -117,6 +117,7 @@ def test_outcomes_and_controller_failures_are_counted(fresh, plans):
     assert estimates["episodes_with_controller_failures"].value == num_failing / len(fresh)
 
 
+@pytest.mark.train
 def test_every_rule_has_every_figure_on_every_set(study):
     for prefix in ("plans", "plans.fair", "plans.other", "plans.other.fair"):
         for rule in RULES:
@@ -126,6 +127,7 @@ def test_every_rule_has_every_figure_on_every_set(study):
         assert f"{prefix}.outcomes.safe" in study.estimates
 
 
+@pytest.mark.train
 def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, plans, assessment):
     score = RULES[0].unsafe_score(calibration)
     miss_rate = promised_miss_rate(calibration)
@@ -138,6 +140,7 @@ def test_thresholds_come_from_the_calibration_plans_alone(study, calibration, pl
     assert study.estimates["plans.sharpened.threshold"].n == len(calibration)
 
 
+@pytest.mark.train
 def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
     study, calibration, caplog
 ):
@@ -152,11 +155,13 @@ def test_with_few_unsafe_plans_the_promise_is_the_highest_that_can_be_kept(
         promised_miss_rate(safe)
 
 
+@pytest.mark.train
 def test_no_unsafe_calibration_plan_is_missed_when_there_are_few(study, calibration):
     refused = RULES[0].unsafe_score(calibration) > study.thresholds["sharpened"]
     assert refused[calibration.is_unsafe].all()
 
 
+@pytest.mark.train
 def test_who_sees_what_happens_is_right_and_who_refuses_all_has_no_safe_recall(study, plans):
     estimates = study.estimates
     assert estimates["plans.sharpened.auc"].value == 1.0
@@ -180,6 +185,7 @@ def test_the_mirrored_loop_sees_the_same_plans_as_the_loop_itself():
         )
 
 
+@pytest.mark.train
 def test_the_cause_is_the_constraint_whose_predicted_margin_is_smallest(study, assessment, plans):
     named = named_causes(assessment, plans)
     said = assessment.predict(plans.first.state, plans.first.desired_preview, plans.first.features)
@@ -190,6 +196,7 @@ def test_the_cause_is_the_constraint_whose_predicted_margin_is_smallest(study, a
         assert study.estimates[f"plans.causes.{name}"].value == right
 
 
+@pytest.mark.train
 def test_causes_are_judged_on_the_correctly_refused_alone(study, plans):
     is_refused = RULES[0].unsafe_score(plans) > study.thresholds["sharpened"]
     estimates = study.estimates

@@ -53,6 +53,7 @@ def test_what_gamma_sees_of_a_plan_is_what_it_would_see_when_it_chooses(trials):
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.train
 def test_a_stopped_study_goes_on_with_the_motions_it_has(trials, tmp_path, monkeypatch):
     num_run = 0
     run_episode = planning_study_module.run_episode

@@ -52,6 +52,7 @@ def see(made, q=None, v=None, command=(0.1, 0.2, 0.3)):
     return made.see(q, v, np.array(command), np.array([3.0, 4.0]), made.initial_phases)
 
 
+@pytest.mark.train
 def test_joints_are_in_the_policys_order_relative_to_zero_action(tmp_path):
     made = policy(tmp_path)
     seen = see(made)
@@ -60,6 +61,7 @@ def test_joints_are_in_the_policys_order_relative_to_zero_action(tmp_path):
     np.testing.assert_allclose(made.targets(np.array([1.0, 2.0])), [0.5, 0.5 + 0.25, 0.0])
 
 
+@pytest.mark.train
 def test_the_observation_has_its_terms_in_order_scaled_and_clipped(tmp_path):
     terms = [ObservationTerm(name=name) for name in TERMS]
     terms[0].scale, terms[4].clip = [0.25], 3.5
@@ -69,6 +71,7 @@ def test_the_observation_has_its_terms_in_order_scaled_and_clipped(tmp_path):
     np.testing.assert_allclose(observation, expected)
 
 
+@pytest.mark.train
 def test_gravity_and_velocities_do_not_depend_on_the_heading(tmp_path):
     made = policy(tmp_path)
     tilted = RotationMatrix.MakeXRotation(0.3)
@@ -83,6 +86,7 @@ def test_gravity_and_velocities_do_not_depend_on_the_heading(tmp_path):
     np.testing.assert_allclose(results[0][3:6], [0, -math.sin(0.3), -math.cos(0.3)])
 
 
+@pytest.mark.train
 def test_history_is_oldest_first_and_begins_with_what_is_seen_first(tmp_path):
     path = saved(tmp_path, 6)
     terms = [ObservationTerm(name="last_action", history=3)]
@@ -95,6 +99,7 @@ def test_history_is_oldest_first_and_begins_with_what_is_seen_first(tmp_path):
     np.testing.assert_allclose(made.observe(seen, history), [3, 4, 3, 4, 5, 6])
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("history", "first", "second"),
     [
@@ -136,6 +141,7 @@ def test_histories_that_cannot_be_kept_are_refused(tmp_path):
         )
 
 
+@pytest.mark.train
 def test_the_gait_clock_runs_once_a_period_and_rests_while_standing(tmp_path):
     made = policy(tmp_path, gait=GaitClock(period_s=1.0))
     walking, standing = np.array([0.5, 0, 0]), np.zeros(3)
@@ -147,6 +153,7 @@ def test_the_gait_clock_runs_once_a_period_and_rests_while_standing(tmp_path):
     np.testing.assert_allclose(made.next_phases(phases, standing), [math.pi, math.pi])
 
 
+@pytest.mark.train
 def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
     made = policy(tmp_path, command=CommandLimits(change=[0.05, 0.04, 0.1]))
     np.testing.assert_allclose(
@@ -154,6 +161,7 @@ def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
     )
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -174,12 +182,14 @@ def test_what_does_not_fit_is_refused_with_what_was_expected(tmp_path, changed, 
         policy(tmp_path, **changed)
 
 
+@pytest.mark.train
 def test_a_network_with_another_number_of_actions_is_refused(tmp_path):
     path = saved(tmp_path, 13, 5)
     with pytest.raises(ValueError, match="returns 5 actions, expected one for each of 2 joints"):
         policy(tmp_path, network=str(path))
 
 
+@pytest.mark.train
 def test_files_that_are_no_networks_are_named(tmp_path):
     for name, text, message in (
         ("a.onnx", "no network", "not an ONNX network"),
@@ -200,6 +210,7 @@ def test_a_policy_of_a_missing_package_says_how_to_install_it():
         network_file(stated)
 
 
+@pytest.mark.train
 def test_a_term_of_ones_own_is_one_function(tmp_path):
     observation_term("test_twice_the_height")(lambda seen: 2.0 * seen.action)
     terms = [ObservationTerm(name="test_twice_the_height")]

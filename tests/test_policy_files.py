@@ -12,6 +12,8 @@ from drake_safety.control.policy import Policy
 from drake_safety.control.policy_files import load_policy, read_policy_file
 from policy_networks import save_network
 
+pytestmark = pytest.mark.train
+
 JOINTS = ["tail", "hip", "knee"]  # The robot's.
 
 # The network's joints are hip and knee; the robot's motors are knee, tail, hip.

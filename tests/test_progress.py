@@ -3,6 +3,7 @@
 import io
 import time
 
+import pytest
 from rich.console import Console
 
 from drake_safety import SafetyAssessment, run_episodes
@@ -79,6 +80,7 @@ def test_a_callback_is_used_as_it_is_and_false_is_none():
             assert given is None
 
 
+@pytest.mark.train
 def test_true_shows_the_progress_of_episodes_and_of_learning(capsys, tmp_path):
     scenario = parse_scenario(SCENARIO, name="gliding", folder=tmp_path)
     episodes = run_episodes(scenario, 12, num_workers=1, progress=True)

@@ -24,6 +24,7 @@ def region(assessment):
     )
 
 
+@pytest.mark.train
 def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(region):
     for fine, coarse, low, high in (
         (region.y_m, region.simulated_y_m, *BOX[:, 1]),
@@ -37,6 +38,7 @@ def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(r
     assert region.calibrated.shape == (len(region.z_m), len(region.y_m))
 
 
+@pytest.mark.train
 def test_the_truth_is_what_the_simulation_says_of_each_target(region):
     y = np.broadcast_to(region.simulated_y_m, region.outcomes.shape)
     # From the origin a mass that is carried beyond y = 1 leaves through the flank.
@@ -44,6 +46,7 @@ def test_the_truth_is_what_the_simulation_says_of_each_target(region):
     np.testing.assert_array_equal(region.outcomes == SAFE, y <= 1.0)
 
 
+@pytest.mark.train
 def test_beyond_a_wall_the_truth_is_that_wall(assessment):
     region = reachable_region(
         shuttling(), assessment, threshold=0.5, x_m=1.2, step_m=0.6, num_workers=1
@@ -52,6 +55,7 @@ def test_beyond_a_wall_the_truth_is_that_wall(assessment):
     assert region.estimates()["share_safe"].value == 0.0
 
 
+@pytest.mark.train
 def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
     loop = shuttling().make_loop()
     context = loop.CreateDefaultContext()
@@ -65,6 +69,7 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
     assert region.calibrated[row, column] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.train
 def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
     estimates = region.estimates()
     verdict = region.calibrated >= region.threshold
@@ -99,6 +104,7 @@ def test_a_plane_that_cannot_be_is_refused(x, step, message):
         plane_of(shuttling().make_loop(), x, step)
 
 
+@pytest.mark.train
 def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(region):
     figure = region_figure(region, ["front", "flank"])
     (axes,) = figure.axes
@@ -113,6 +119,7 @@ def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(regi
     assert any("don't know" in label for label in labels) == bool(np.isnan(region.calibrated).any())
 
 
+@pytest.mark.train
 def test_what_is_not_known_is_hatched_and_not_accepted(region):
     probability = np.full_like(region.calibrated, 0.9)
     probability[: len(probability) // 2] = np.nan

@@ -198,6 +198,7 @@ def assessment():
     return SafetyAssessment(scenario.assessment).fit(episodes)
 
 
+@pytest.mark.train
 def test_one_assessment_serves_both_hands(assessment):
     probabilities = []
     for hand in ("left", "right"):
@@ -211,6 +212,7 @@ def test_one_assessment_serves_both_hands(assessment):
     assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-4)
 
 
+@pytest.mark.train
 def test_an_assessment_of_another_scenario_is_refused(assessment):
     scenario = load_scenario(porter_path())
     scenario.parameters.safe_set.joint_margin_rad = 0.04

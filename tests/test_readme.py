@@ -3,8 +3,10 @@
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,9 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
 OWN_DIAGRAM = (ROOT / "docs/own_diagram.md").read_text(encoding="utf-8")
+CARDS = "".join(
+    path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("assessments/*/README.md"))
+)
 
 
 def blocks(language, text=README):
@@ -74,10 +79,10 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     assert belief.sum() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_every_command_of_the_readme_and_of_the_command_line_page_parses():
+def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():
     for program, commands in (("drake-safety", app), ("python -m studies", studies)):
         group = typer.main.get_command(commands)
-        calls = shell_commands(program, README + COMMANDS)
+        calls = shell_commands(program, README + COMMANDS + CARDS)
         assert {call[0] for call in calls} == set(group.commands)
         for name, *arguments in calls:
             # Parses and validates; nothing is run.
@@ -89,6 +94,23 @@ def test_every_make_target_of_the_readme_is_in_the_makefile():
     targets = set(re.findall(r"^([a-z]+):.*## ", makefile, flags=re.MULTILINE))
     named = {call[0] for call in shell_commands("make")}
     assert {"demo", "test"} <= named <= targets
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_help_lists_every_target_that_is_no_file():
+    makefile = (ROOT / "Makefile").read_text()
+    named = " ".join(re.findall(r"^\.PHONY: (.*)$", makefile, flags=re.MULTILINE)).split()
+    command = ["make", "--no-print-directory", "help"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = re.findall(r"^  make (\S+) +\S", printed, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(named)
+
+
+def test_the_citation_is_of_this_version_and_licence():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    stated = ("name", "version", "license", "keywords")
+    assert [cited[key] for key in ("title", *stated[1:])] == [project[key] for key in stated]
 
 
 def test_what_is_said_of_the_demo_is_what_it_does():
@@ -138,8 +160,9 @@ def test_the_numbers_in_the_readmes_prose_are_the_programs_defaults():
 
 def test_the_versions_in_the_readme_are_those_of_the_constraints():
     constraints = (ROOT / "constraints.txt").read_text()
-    (drake,) = re.findall(r"^drake==(\S+)$", constraints, flags=re.MULTILINE)
-    assert f"Drake {drake} (" in README
+    pinned = re.findall(r"^drake==([^\s;]+);", constraints, flags=re.MULTILINE)
+    assert len(pinned) == 2
+    assert [version for version in pinned if f"with Drake {version}" not in README] == []
     assert "!=1.52.0" in (ROOT / "pyproject.toml").read_text()
 
 

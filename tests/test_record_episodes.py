@@ -106,6 +106,7 @@ def test_the_bits_do_not_depend_on_the_number_of_workers():
     assert_identical(record(num_workers=2), record())
 
 
+@pytest.mark.train
 def test_a_folder_goes_on_with_its_own_set_and_refuses_others(tmp_path):
     record(4, path=tmp_path)
     assert completed(tmp_path) == {0, 1, 2, 3}
@@ -207,6 +208,7 @@ def test_a_drake_plant_that_diverges_is_no_mistake():
     assert record(1, make=make, reset=reset, parameters={"force": np.nan}).num_diverged == 1
 
 
+@pytest.mark.train
 def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
     assert len(Path(quadrotor_file.__file__).read_text().splitlines()) <= 60
     assessment = quadrotor_file.learn(
@@ -225,6 +227,7 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
     assert gamma[0] > 0.6 > gamma[1]
 
 
+@pytest.mark.train
 def test_an_assessor_refuses_ports_that_its_assessment_does_not_know():
     assessment = SafetyAssessment(
         AssessmentParameters(horizon=5, epochs=2, ensemble_size=1, hidden_sizes=[8], perplexity=5)
@@ -245,6 +248,7 @@ def test_an_assessor_refuses_ports_that_its_assessment_does_not_know():
     )
 
 
+@pytest.mark.train
 def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
     """Its functions, the systems that they make, and what pydrake binds without a module."""
     script = tmp_path / "mine.py"

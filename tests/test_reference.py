@@ -2,10 +2,15 @@
 
 import ast
 import importlib.util
+import shlex
+import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).resolve().parents[1]
 SYSTEMS = sorted((ROOT / "drake_safety" / "systems").glob("*.py"))
@@ -83,12 +88,21 @@ def test_every_port_that_a_docstring_lists_is_declared_in_its_module(path):
             assert ports - words == set()
 
 
+def test_hosted_pages_are_built_with_what_the_extra_docs_installs_alone():
+    hosted = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (ROOT / hosted["mkdocs"]["configuration"]).is_file()
+    assert hosted["build"]["tools"]["python"] in SpecifierSet(project["requires-python"])
+    (install,) = hosted["build"]["jobs"]["install"]
+    (_, *listing) = shlex.split(install.partition("$(")[2].removesuffix(")"))
+    printed = subprocess.run([sys.executable, *listing], cwd=ROOT, capture_output=True, text=True)
+    assert printed.stdout.split() == project["optional-dependencies"]["docs"]
+
+
 @pytest.mark.slow
 def test_the_reference_builds_without_a_warning(tmp_path):
     commands = pytest.importorskip("mkdocs.commands.build", reason="extra 'docs' not installed")
     pytest.importorskip("mkdocstrings", reason="extra 'docs' not installed")
-    import subprocess
-
     del commands
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)

@@ -26,6 +26,8 @@ from report_runs import (
     write_run,
 )
 
+pytestmark = pytest.mark.train
+
 EMPTY_TAGS = {"meta", "link", "img", "br", "hr", "input", "rect", "path", "line", "col"}
 
 

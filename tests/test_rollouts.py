@@ -228,6 +228,7 @@ class Interruption:
 
 
 # joblib tells of the tasks that it cancelled, which is what was asked for.
+@pytest.mark.train
 @pytest.mark.filterwarnings("ignore:.*still being processed by the workers:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*have been successfully executed:UserWarning")
 @pytest.mark.parametrize("num_workers", [1, 2])
@@ -250,6 +251,7 @@ def test_an_interrupted_run_keeps_what_was_finished_and_goes_on_to_the_same_set(
     assert_identical(load_episodes(tmp_path), uninterrupted)
 
 
+@pytest.mark.train
 def test_a_finished_set_on_disk_is_read_not_simulated(tmp_path):
     first = run_episodes(gliding(), 6, num_workers=1, path=tmp_path)
     seen = []
@@ -260,6 +262,7 @@ def test_a_finished_set_on_disk_is_read_not_simulated(tmp_path):
     assert_identical(again, first)
 
 
+@pytest.mark.train
 def test_a_folder_of_another_set_is_refused(tmp_path):
     run_episodes(gliding(), 3, num_workers=1, path=tmp_path)
     with pytest.raises(ValueError, match="seed"):
@@ -423,6 +426,7 @@ def test_an_episode_from_the_standing_posture_starts_there_whatever_its_number()
         run_episode(shuttling().make_loop(), is_standing=True)
 
 
+@pytest.mark.train
 def test_an_episode_counts_the_failures_of_its_controller(tmp_path):
     goals = np.array([[0.9, 0.2, 0.5], [0.9, 0.2, 0.99]])
     episodes = run_episodes(shuttling(), 2, goals=goals, is_standing=True, num_workers=1)
@@ -433,6 +437,7 @@ def test_an_episode_counts_the_failures_of_its_controller(tmp_path):
     assert run_episode(gliding().make_loop()).num_controller_failures == 0
 
 
+@pytest.mark.train
 def test_what_a_loops_options_make_is_another_set(tmp_path):
     left, right = (
         run_episodes(shuttling(), 2, side=side, num_workers=1, path=tmp_path / side)

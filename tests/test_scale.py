@@ -8,6 +8,8 @@ from shuttle_task import shuttling
 from studies.scale import counts_for, learned_row
 from studies.scale_figure import STAGES, scale_figure
 
+pytestmark = pytest.mark.train
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

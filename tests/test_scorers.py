@@ -67,6 +67,7 @@ def test_gamma_scores_by_any_of_its_forms_on_what_its_mode_sees(episodes, uses_f
     assert not np.isnan(score).any()
 
 
+@pytest.mark.train
 def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(episodes):
     reports = []
     scorers = classifier_scorers(episodes, lambda *report: reports.append(report))
@@ -78,6 +79,7 @@ def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(ep
         assert score[segments.is_unsafe].mean() > score[~segments.is_unsafe].mean()
 
 
+@pytest.mark.train
 def test_direct_classifiers_learn_from_the_segments_they_are_told_to(episodes):
     whole, short = (
         DirectClassifier("gradient_boosting", shortest=shortest).fit(episodes)

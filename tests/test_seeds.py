@@ -92,6 +92,7 @@ def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free()
         check_unused(spent, (4, 5), "who")
 
 
+@pytest.mark.train
 def test_an_assessment_knows_all_that_it_was_learned_calibrated_and_adapted_with(
     assessment, tmp_path
 ):
@@ -117,6 +118,7 @@ def test_an_assessment_knows_all_that_it_was_learned_calibrated_and_adapted_with
     again.check_unused(30)
 
 
+@pytest.mark.train
 def test_what_has_been_used_otherwise_is_neither_calibrated_nor_adapted_with(assessment):
     with pytest.raises(ValueError, match="episodes of its training"):
         assessment.adapt(paired(0))
@@ -129,6 +131,7 @@ def test_what_has_been_used_otherwise_is_neither_calibrated_nor_adapted_with(ass
         calibrated(assessment.adapt(paired(40)), 40)
 
 
+@pytest.mark.train
 def test_who_is_judged_has_not_seen_the_episodes(assessment):
     calibrated(assessment, 30)
     gamma = assessment_scorer("gamma", assessment, "calibrated")

@@ -192,6 +192,7 @@ def test_a_set_says_scenario_plant_and_counts(episodes):
     assert repr(episodes[:0]).endswith("0 episodes)")
 
 
+@pytest.mark.train
 def test_a_table_has_every_row_and_every_column_by_name(episodes):
     table = episodes.to_frame()
     info = episodes.info

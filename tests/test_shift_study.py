@@ -77,6 +77,7 @@ def told(state, preview, features, is_outside):
     return Verdicts(probability=np.where(is_unknown, 0.0, probability), is_unknown=is_unknown)
 
 
+@pytest.mark.train
 def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely(assessment):
     motions = [
         motion(10, 0.95, is_unsafe=True),  # sure and wrong
@@ -96,6 +97,7 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely(a
     assert "monitor.delay_s" not in found
 
 
+@pytest.mark.train
 def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less(assessment):
     rng = np.random.default_rng(0)
     is_unsafe = rng.random(400) < 0.5
@@ -111,6 +113,7 @@ def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less(assessme
     assert found["adaptive.missed"].n == pytest.approx(is_unsafe.sum() / 2, abs=1)
 
 
+@pytest.mark.train
 def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assessment, nominal):
     rows = nominal.motions[0]
     given = (rows.state, rows.desired_preview, rows.features)
@@ -122,6 +125,7 @@ def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assess
     )
 
 
+@pytest.mark.train
 def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     found = junk(nominal.motions[:20], seed=3)
     assert set(found) == {
@@ -147,6 +151,7 @@ def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     assert result["gamma.confident_error"].value < 0.05
 
 
+@pytest.mark.train
 def test_a_steady_push_is_noticed_and_the_same_plant_is_not(assessment, nominal):
     assert false_alarms(nominal.motions, assessment).value == 0.0
     pushed = [
@@ -162,6 +167,7 @@ def test_a_steady_push_is_noticed_and_the_same_plant_is_not(assessment, nominal)
     assert false_alarms(pushed, assessment).value > 100.0
 
 
+@pytest.mark.train
 def test_published_detectors_refuse_about_as_many_safe_episodes(assessment, training, nominal):
     judges = detector_judges(assessment, training)
     assert set(judges) == {"isolation_forest", "deep_knn"}
@@ -197,6 +203,7 @@ def test_a_plant_of_its_own_has_the_scenarios_variations_alone():
     assert run_changed_starts(scenario, 2, seed=1) == {}
 
 
+@pytest.mark.train
 def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessment):
     # The only known safe motion lies above both unsafe ones; the unknown ones are safe.
     motions = [
@@ -232,6 +239,7 @@ def test_postures_and_falls_are_never_called_safe():
                 assert verdicts.is_unknown.all(), name
 
 
+@pytest.mark.train
 def test_the_picture_has_a_row_for_each_shift(assessment, nominal):
     judges = {
         "gamma": assessment_judge(assessment),

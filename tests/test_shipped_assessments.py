@@ -19,8 +19,9 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
+from studies.cards import CARD_FILE, card_text
 from studies.shipping import NUM_EPISODES, check_shipped
-from studies.stored_results import read_results
+from studies.stored_results import EVALUATION_FILE, read_results
 
 NAME = "shuttling"
 MEGABYTE = 1e6
@@ -36,6 +37,25 @@ def test_what_is_shipped_is_what_was_evaluated(name):
     assert {"command", "train_command", "seed", "versions"} <= set(results.entries)
     assert any(key.endswith(".sharpened.unsafe_recall") for key in results.estimates)
     assert load_assessment(name).info_.scenario == name
+
+
+@pytest.mark.parametrize("name", assessed_scenarios())
+def test_a_card_is_what_shipping_would_write_now(name):
+    folder = shipped_folder(name)
+    card = (folder / CARD_FILE).read_text(encoding="utf-8")
+    assert card == card_text(folder, load_scenario(name)), "`python -m studies readme` writes it"
+
+
+@pytest.mark.parametrize("missed", [0.2, 0.0])
+def test_a_card_says_so_where_fresh_episodes_break_a_promise(tmp_path, missed):
+    name = assessed_scenarios()[0]
+    folder = shutil.copytree(shipped_folder(name), tmp_path / name)
+    content = json.loads((folder / EVALUATION_FILE).read_text())
+    content["figures"]["calibration.sharpened.plan.miss_rate"] = [missed, missed, missed, 100]
+    (folder / EVALUATION_FILE).write_text(json.dumps(content))
+    card = card_text(folder, load_scenario(name))
+    broken = "`sharpened`, before the motion, calls 20.0 % (20.0–20.0) of 100 unsafe episodes safe"
+    assert (broken in card) == (missed > 0.0)
 
 
 @pytest.mark.parametrize("name", assessed_scenarios())
@@ -120,7 +140,8 @@ def other_assessment(run, like):
 def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped, scenario):
     results = check_shipped(shipped / NAME, scenario, num_workers=1)
     written = {path.name for path in (shipped / NAME).iterdir()}
-    assert written == {"sharpened.safetensors", "paper.safetensors", "evaluation.json"}
+    assert written == {"sharpened.safetensors", "paper.safetensors", EVALUATION_FILE, CARD_FILE}
+    assert f'load_assessment("{NAME}")' in (shipped / NAME / CARD_FILE).read_text()
     entries = results.entries
     for mode in MODES:
         files = [assessment_file(folder, mode) for folder in (run[1], shipped / NAME)]

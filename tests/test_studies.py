@@ -139,6 +139,7 @@ def test_adaptation_is_judged_on_several_pools_beside_its_baselines(monkeypatch,
         assert (study / f"{picture}.png").is_file()
 
 
+@pytest.mark.train
 def test_what_has_no_state_planes_has_no_truth_to_be_simulated(monkeypatch, capsys, run):
     file, folder = run
     assert call(monkeypatch, "truth", file, "--assessment", folder) == 2

@@ -4,6 +4,7 @@ import pytest
 from drake_safety.evaluation.throws_figure import throws_figure
 
 
+@pytest.mark.train
 def test_every_throw_is_drawn_once_and_counted_by_its_outcome():
     speed = np.array([3.0, 5.0, 9.0, 10.0])
     direction = np.array([0.0, 1.0, 2.0, -2.0])

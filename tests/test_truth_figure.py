@@ -16,6 +16,8 @@ from drake_safety.learning.segments import DIVERGED, Episodes
 from lip_assessments import quick_assessment
 from lip_episodes import make_episodes
 
+pytestmark = pytest.mark.train
+
 ROOT = Path(__file__).resolve().parents[1]
 FRESH = 20
 

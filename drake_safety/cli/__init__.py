@@ -21,6 +21,7 @@ from drake_safety.cli import (
     calibrate,
     compare,
     evaluate,
+    export,
     play,
     prepare,
     report,
@@ -44,6 +45,7 @@ _COMMANDS = (
     evaluate.evaluate,
     compare.compare,
     adapt.adapt,
+    export.export,
     report.report,
 )
 

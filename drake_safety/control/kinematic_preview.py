@@ -14,6 +14,7 @@ from drake_safety.control.kinematics import (
 )
 from drake_safety.control.whole_body_model import Hand, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
+from drake_safety.learning.blas_threads import one_blas_thread
 
 _FOOT_WEIGHT = 1e4  # Task weights are at most some hundreds, so feet move by micrometres.
 _MAX_ITERATIONS = 4
@@ -48,6 +49,7 @@ class KinematicPreview:
         self.model = model
         self.hand = model.hand
 
+    @one_blas_thread
     def follow(self, q: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Follows a path of the hand.
 

@@ -19,6 +19,7 @@ from drake_safety.control.whole_body_model import (
     WholeBodyModel,
     WholeBodyReference,
 )
+from drake_safety.learning.blas_threads import one_blas_thread
 
 SOLVED = 0
 """Status of a solved program; other values are daqp's negative exit flags."""
@@ -273,6 +274,7 @@ def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _Task
     tasks.follow(_LAST, reference.reaching, model.hand.present_position(model.kinematics))
 
 
+@one_blas_thread
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     """Solves the program by daqp's dual active-set method, deterministically without warm start."""
     n_v = len(qp.bias)

@@ -17,6 +17,7 @@ from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
     AssessmentParameters,
 )
+from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.feedback import (
     FeedbackSegments,
@@ -33,7 +34,6 @@ from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit,
 from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
-from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for
 
 __all__ = [
@@ -321,6 +321,8 @@ class SafetyAssessment:
     def _or_own(
         self, beliefs: np.ndarray | None, correction: Correction | None
     ) -> tuple[np.ndarray, Correction]:
+        if beliefs is None and correction is None:
+            return self.beliefs_, self.correction_
         beliefs = self.beliefs_ if beliefs is None else beliefs
         correction = self.correction_ if correction is None else correction
         prediction.check_shapes((beliefs, correction), (self.beliefs_, self.correction_))
@@ -348,23 +350,31 @@ class SafetyAssessment:
 
         Returns:
             The assessments. Novel inputs and those that are not finite get the empty belief, where
-            Γ is 0 in all its forms.
+            Γ is 0 in all its forms. A row has the same bits whatever the others are.
 
         Raises:
             ValueError: A width or a shape is wrong, or the assessment is not fitted.
         """
         self._check_fitted()
-        beliefs, correction = self._or_own(beliefs, correction)
         x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(
                 f"SafetyAssessment of '{self.info_.scenario}': state has the shape "
                 f"{np.shape(state)}, expected (N, n_s); predict_one assesses a single input"
             )
-        with np.errstate(over="ignore", invalid="ignore"):
-            is_usable = np.einsum("ij,ij->i", x, x) < INPUT_LIMIT
+        return self._predict(x, beliefs, correction, novelty)
+
+    @one_blas_thread
+    def _predict(
+        self,
+        x: np.ndarray,
+        beliefs: np.ndarray | None,
+        correction: Correction | None,
+        novelty: Novelty | None,
+    ) -> Assessments:
+        beliefs, correction = self._or_own(beliefs, correction)
         return prediction.predict(
-            np.where(is_usable[:, None], x, np.nan),
+            x,
             embedding=self.embedding_,
             grid=self.grid_,
             beliefs=beliefs,
@@ -385,16 +395,18 @@ class SafetyAssessment:
         correction: Correction | None = None,
         novelty: Novelty | None = None,
     ) -> Assessment:
-        """Assesses one input; the arguments are those of `predict` without the axis N."""
-        result = self.predict(
-            np.asarray(state)[None],
-            np.asarray(desired_preview)[None],
-            None if features is None else np.asarray(features)[None],
-            beliefs=beliefs,
-            correction=correction,
-            novelty=novelty,
-        )
-        return result.one(0)
+        """Assesses one input; the arguments are those of `predict` without the axis N.
+
+        The result has the same bits as that of `predict` in a row.
+        """
+        self._check_fitted()
+        x = self.inputs_of(state, desired_preview, features)
+        if x.ndim != 1:
+            raise ValueError(
+                f"SafetyAssessment of '{self.info_.scenario}': state has the shape "
+                f"{np.shape(state)}, expected (n_s,); predict assesses many inputs"
+            )
+        return self._predict(x[None], beliefs, correction, novelty).one(0)
 
     def strangest_input(
         self,
@@ -440,6 +452,35 @@ class SafetyAssessment:
         self._check_fitted()
         learned = {name: value for name, value in vars(self).items() if name.endswith("_")}
         assessment_file.write(Path(path), self.parameters, learned)
+
+    def to_onnx(self, path: str | os.PathLike[str]) -> None:
+        """Writes `predict` as one ONNX graph, atomically; see docs/export.md.
+
+        It is that of the present beliefs, correction and novelty, and its metadata say what its
+        inputs are, what its thresholds promise and for which plant.
+
+        Args:
+            path: The file.
+
+        Raises:
+            ValueError: The package `onnx` is not installed, or the assessment is not fitted.
+        """
+        from drake_safety.learning import onnx_graph
+
+        self._check_fitted()
+        onnx_graph.write(
+            Path(path),
+            info=self.info_,
+            parameters=self.parameters,
+            embedding=self.embedding_,
+            grid=self.grid_,
+            beliefs=self.beliefs_,
+            correction=self.correction_,
+            base_logit=self.base_logit_,
+            novelty=self.novelty_,
+            calibrations=list(self.calibrations_.values()),
+            adaptation=self.adaptation_,
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:

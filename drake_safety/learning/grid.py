@@ -46,6 +46,10 @@ class Grid:
         """Largest coordinate of the grid."""
         return 0.5 * self.resolution * self.cell_length
 
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        return np.arange(self.resolution, dtype=float)
+
     @property
     def centres(self) -> np.ndarray:
         """Centre of every cell, (R*R, 2)."""
@@ -76,34 +80,43 @@ class Grid:
         cells = index[..., 0] * self.resolution + index[..., 1]
         return np.where(is_inside[..., 0], cells, OUTSIDE)
 
-    def bilinear(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns bilinear weights between the centres of the four cells around each point.
+    def interpolate(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Interpolates values of the cells bilinearly between the cells' centres.
 
         Between the outermost centres and the grid's edge only the nearest existing centres count.
+        A point has the same bits whatever the others are.
 
         Args:
-            points: (..., 2).
+            points: (K, N, 2).
+            values: Values of every cell of K grids, (K, R*R, C).
 
         Returns:
-            Cells (..., 4) and their weights (..., 4), which sum to one; outside the grid the cells
-            are `OUTSIDE` and the weights zero.
+            The values at the points, (K, N, C), zero outside the grid, and whether each point is
+            inside, (K, N).
         """
-        position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
-        is_inside = _is_within(position, self.resolution)
-        last = self.resolution - 1
-        position = np.where(is_inside, position - 0.5, 0.0).clip(0.0, last)
-        lower = np.minimum(position.astype(int), max(last - 1, 0))
-        fraction = position - lower
-        # Two neighbours along each axis give four cells.
-        index = np.stack([lower, np.minimum(lower + 1, last)], axis=-2)
-        weight = np.stack([1.0 - fraction, fraction], axis=-2)
-        cells = index[..., :, None, 0] * self.resolution + index[..., None, :, 1]
-        weights = weight[..., :, None, 0] * weight[..., None, :, 1]
-        shape = (*is_inside.shape[:-1], 4)
-        return (
-            np.where(is_inside, cells.reshape(shape), OUTSIDE),
-            np.where(is_inside, weights.reshape(shape), 0.0),
-        )
+        last = self.resolution - 1.0
+        position = points / self.cell_length
+        position += 0.5 * last
+        is_within = (position >= -0.5) & (position < last + 0.5)
+        is_inside = is_within[..., 0] & is_within[..., 1]
+        # These choose the number of a number and NaN.
+        np.fmin(np.fmax(position, 0.0, out=position), last, out=position)
+        # The weight of a row or column of cells falls linearly with the distance from its centre.
+        weight = position[..., None] - self._rows
+        np.subtract(1.0, np.abs(weight, out=weight), out=weight)
+        np.maximum(weight, 0.0, out=weight)
+        weight *= is_inside[..., None, None]
+        num_grids, width = len(values), values.shape[2]
+        table = values.reshape(num_grids, 1, self.resolution, self.resolution * width)
+        columns = (weight[..., :1, :] @ table).reshape(*is_inside.shape, self.resolution, width)
+        return (weight[..., 1:, :] @ columns)[..., 0, :], is_inside
+
+    def look_up(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Reads values of the cells that contain points; see `interpolate`."""
+        cells = self.locate(points)
+        is_inside = cells != OUTSIDE
+        found = np.take_along_axis(values, np.maximum(cells, 0)[..., None], axis=1)
+        return found * is_inside[..., None], is_inside
 
 
 def _is_within(position: np.ndarray, resolution: int) -> np.ndarray:

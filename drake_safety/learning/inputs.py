@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
@@ -16,7 +18,14 @@ def is_rate(name: str) -> bool:
 def used_states(info: EpisodesInfo, parameters: AssessmentParameters) -> np.ndarray:
     """Returns which states are columns of x, (n_s,)."""
     has_rates = parameters.is_sharpened or parameters.paper.velocities
-    return np.array([has_rates or not is_rate(name) for name in info.state_names], dtype=bool)
+    return _used_states(tuple(info.state_names), has_rates)
+
+
+@functools.cache
+def _used_states(names: tuple[str, ...], has_rates: bool) -> np.ndarray:
+    is_used = np.array([has_rates or not is_rate(name) for name in names], dtype=bool)
+    is_used.setflags(write=False)
+    return is_used
 
 
 def plan_columns(info: EpisodesInfo, parameters: AssessmentParameters) -> slice:
@@ -45,40 +54,45 @@ def inputs(
         ValueError: One of them has another width or number of rows, is missing, or is no number.
     """
     is_used = used_states(info, parameters)
-    widths = {
-        "state": (state, len(is_used)),
-        "desired_preview": (desired_preview, info.horizon * len(info.output_names)),
-    }
-    who = f"SafetyAssessment of '{info.scenario}'"
+    given = [("state", state, len(is_used))]
+    given.append(("desired_preview", desired_preview, info.horizon * len(info.output_names)))
     if parameters.is_sharpened and info.feature_names:
         if features is None:
             raise ValueError(
-                f"{who}: features are missing, expected {len(info.feature_names)} columns: "
+                f"{_who(info)}: features are missing, expected {len(info.feature_names)} columns: "
                 f"{info.feature_names}"
             )
-        widths["features"] = (features, len(info.feature_names))
+        given.append(("features", features, len(info.feature_names)))
     parts: list[np.ndarray] = []
-    for name, (values, width) in widths.items():
+    for name, values, width in given:
         try:
             part = np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{who}: {name} must be an array of numbers: {error}") from error
+            raise ValueError(
+                f"{_who(info)}: {name} must be an array of numbers: {error}"
+            ) from error
         if part.shape[-1:] != (width,):
             rows = parts[0].shape[:-1] if parts else part.shape[:1] if part.ndim > 1 else ()
             expected = (*rows, width)
-            raise ValueError(f"{who}: {name} has the shape {part.shape}, expected {expected}")
+            raise ValueError(
+                f"{_who(info)}: {name} has the shape {part.shape}, expected {expected}"
+            )
         if parts and part.shape[:-1] != parts[0].shape[:-1]:
             expected = (*parts[0].shape[:-1], width)
             raise ValueError(
-                f"{who}: {name} has the shape {part.shape}, expected {expected}, as state has the "
-                f"shape {parts[0].shape}"
+                f"{_who(info)}: {name} has the shape {part.shape}, expected {expected}, as state "
+                f"has the shape {parts[0].shape}"
             )
         parts.append(part)
-    if not is_used.all():
+    if parts[0].shape[-1] != np.count_nonzero(is_used):
         parts[0] = parts[0][..., is_used]
     if len(parts) == 3 and parameters.feature_unit:
         parts.append(np.arcsinh(parts[2] / parameters.feature_unit))
     return np.concatenate(parts, axis=-1)
+
+
+def _who(info: EpisodesInfo) -> str:
+    return f"SafetyAssessment of '{info.scenario}'"
 
 
 def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:

@@ -47,34 +47,78 @@ class Moments:
         between = share * (1.0 - share) * np.outer(shift, shift)
         return Moments(count=count, mean=self.mean + share * shift, covariance=within + between)
 
-    def whitenings(self, plan: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns W with (x - mean) W of unit covariance: range, redundancies and plan.
+    @property
+    def scale(self) -> np.ndarray:
+        """Standard deviations of the columns, with a lower bound, (n_x,)."""
+        return np.maximum(np.sqrt(np.diag(self.covariance)), _SMALLEST_SPREAD)
 
-        The variance along the axes of the standardised inputs has a lower bound.
+    def axes(self, columns: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Returns variances (n,) and axes (n, n) of n standardised columns of x."""
+        scale = self.scale[columns]
+        variance, axes = np.linalg.eigh(self.covariance[columns, columns] / np.outer(scale, scale))
+        return variance, axes
 
-        Args:
-            plan: The plan's columns of x, n_p of them.
 
-        Returns:
-            (n_x, n_x) for all axes, (n_x, m) for the m redundancies, and (n_x, n_p) for the axes of
-            the plan alone.
-        """
-        scale = np.maximum(np.sqrt(np.diag(self.covariance)), _SMALLEST_SPREAD)
-        variance, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        axes = axes / scale[:, None]
+class Distances:
+    """Squared Mahalanobis distances whose variances have a lower bound along each axis.
+
+    Axes with less than the bound v share it, so their part of a distance is what the others leave
+    of the standardised offset z: Σ (aᵢ·z)²/max(vᵢ, v) = |z|²/v - Σ (aᵢ·z)² (1/v - 1/vᵢ) over the
+    axes with vᵢ > v. That takes a third of the products.
+
+    Attributes:
+        mean: Mean of the known inputs, (n_x,).
+        axes: Axes along which offsets from it are projected, (n_x, m).
+        terms: Weights of the squares of an offset's entries and of its projections, (n_x + m, 3).
+    """
+
+    def __init__(self, known: Moments, plan: slice):
+        variance, axes = known.axes(slice(None))
         is_redundant = variance < _REDUNDANT_VARIANCE
         redundant = np.maximum(variance[is_redundant], _LEAST_REDUNDANT_VARIANCE)
-        planned = np.zeros((len(scale), len(scale[plan])))
-        own_variance, own_axes = np.linalg.eigh(
-            self.covariance[plan, plan] / np.outer(scale[plan], scale[plan])
-        )
-        own_axes = own_axes / scale[plan][:, None]
-        planned[plan] = own_axes / np.sqrt(np.maximum(own_variance, _LEAST_PLAN_VARIANCE))
-        return (
-            axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE)),
+        own_variance, own_axes = known.axes(plan)
+        planned = np.zeros((len(axes), len(own_axes)))
+        planned[plan] = own_axes
+        parts = [
+            _above(variance, axes, _LEAST_VARIANCE),
             axes[:, is_redundant] / np.sqrt(redundant),
-            planned,
-        )
+            _above(own_variance, planned, _LEAST_PLAN_VARIANCE),
+        ]
+        self.mean = known.mean
+        self.axes = np.concatenate(parts, axis=1) / known.scale[:, None]
+        # The distances are sums of squares of the offset's entries and of those along the axes.
+        num_inputs, squared_scale = len(axes), known.scale**2
+        self.terms = np.zeros((num_inputs + self.axes.shape[1], NUM_DISTANCES))
+        self.terms[:num_inputs, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
+        self.terms[plan, 2] = 1.0 / (_LEAST_PLAN_VARIANCE * squared_scale[plan])
+        start = num_inputs
+        for distance, (part, sign) in enumerate(zip(parts, (-1.0, 1.0, -1.0), strict=True)):
+            self.terms[start : start + part.shape[1], distance] = sign
+            start += part.shape[1]
+
+    def squared(self, x: np.ndarray) -> np.ndarray:
+        """Those of inputs (N, n_x): all of it, redundancies, plan, (N, 3).
+
+        One product for each row: those of many rows at once would round differently.
+        """
+        num_inputs = len(self.mean)
+        entries = np.empty((len(x), 1, len(self.terms)))
+        offset = np.subtract(x, self.mean, out=entries[:, 0, :num_inputs])
+        np.matmul(offset[:, None], self.axes, out=entries[:, :, num_inputs:])
+        np.multiply(entries, entries, out=entries)
+        found: np.ndarray = (entries @ self.terms)[:, 0]
+        return found
+
+    def precision(self) -> np.ndarray:
+        """The matrix of the sum of the three as a quadratic form of the offset, (n_x, n_x)."""
+        of_entries, of_axes = np.split(self.terms.sum(axis=1), [len(self.mean)])
+        return np.diag(of_entries) + (self.axes * of_axes) @ self.axes.T
+
+
+def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
+    is_above = variance > least
+    above: np.ndarray = axes[:, is_above] * np.sqrt(1.0 / least - 1.0 / variance[is_above])
+    return above
 
 
 class Novelty:
@@ -108,7 +152,10 @@ class Novelty:
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         self.plan = plan
         known = training if feedback is None else training.joined(feedback)
-        self._mean, self._whitenings = known.mean, known.whitenings(plan)
+        self._known, self.quadratic = known, Distances(known, plan)
+        # Without other episodes to choose them from, the limits are infinite: nothing is novel that
+        # is finite.
+        self.inverse_limits = 1.0 / np.square(self.limits)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Novelty:
         return self
@@ -154,10 +201,10 @@ class Novelty:
             np.maximum.at(farthest, position, distances[~is_unsafe])
             of_safe = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
             limits = np.maximum(limits, of_safe)
-        whole = cls(training=Moments.of(x), limits=np.ones(NUM_DISTANCES), plan=plan)
-        num_redundancies = whole._whitenings[1].shape[1]
+        training = Moments.of(x)
+        num_redundancies = np.sum(training.axes(slice(None))[0] < _REDUNDANT_VARIANCE)
         least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
-        return cls(training=whole.training, limits=np.maximum(limits, least), plan=plan)
+        return cls(training=training, limits=np.maximum(limits, least), plan=plan)
 
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
@@ -181,26 +228,23 @@ class Novelty:
 
         Those of an input that is not finite are infinite.
         """
-        offset = x - self._mean
-        found = []
-        for whitening in self._whitenings:
-            with np.errstate(invalid="ignore"):
-                whitened = offset @ whitening
-            squared = np.einsum("ij,ij->i", whitened, whitened)
-            found.append(np.sqrt(np.where(np.isnan(squared), np.inf, squared)))
-        return np.stack(found, axis=1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            squared = self.quadratic.squared(x)
+            # Rounding may make a small square negative. `fmin` chooses the number beside NaN.
+            distances: np.ndarray = np.fmin(np.sqrt(np.maximum(squared, 0.0)), np.inf)
+        return distances
 
     def of(self, x: np.ndarray) -> np.ndarray:
         """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
 
         An input is novel above 1; that of an input that is not finite is infinite.
         """
-        distances = self.distances(x)
-        # Without other episodes to choose them from, the limits are infinite as well.
-        share = np.divide(
-            distances, self.limits, out=np.full_like(distances, np.inf), where=distances < np.inf
-        )
-        return share.max(axis=1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            squared = self.quadratic.squared(x)
+            squared *= self.inverse_limits
+            found = np.maximum.reduce(squared, axis=1)
+            distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
+        return distance
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each column is from what the other columns say, (n_x,).
@@ -210,6 +254,5 @@ class Novelty:
         Args:
             x: One input, (n_x,).
         """
-        whitening = np.concatenate(self._whitenings, axis=1)
-        precision = whitening @ whitening.T
-        return precision @ (x - self._mean) / np.sqrt(np.diag(precision))
+        precision = self.quadratic.precision()
+        return precision @ (x - self._known.mean) / np.sqrt(np.diag(precision))

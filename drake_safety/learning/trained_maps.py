@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-INPUT_LIMIT = 1e30
-"""Squared norm above which an input counts as not finite."""
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
+
+INPUT_LIMIT = 1e15
+"""Magnitude from which on an entry of an input counts as not finite."""
 
 _CHUNK = 8192
 
@@ -36,6 +39,10 @@ class Embedding:
     with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
     (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them. They are copied to
     single precision.
+
+    Attributes:
+        centre: What is subtracted from inputs before they are multiplied, (n_x,).
+        centred_bias: Bias of the first layer for these inputs, (K, out).
 
     Args:
         weights: The arrays.
@@ -84,8 +91,6 @@ class Embedding:
                 f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
                 f"{2 + num_margins} for {num_margins} margins"
             )
-        if self.has_safety_head:
-            self._safety_layers = [self._layer(f"safety.{i}") for i in range(2)]
         self.input_range = np.full((2, self.num_inputs), np.inf, dtype=np.float32)
         self.input_range[0] = -np.inf
         if input_range is not None:
@@ -96,6 +101,30 @@ class Embedding:
                 )
             self.input_range[:] = input_range
         self.input_range.setflags(write=False)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Sets what `evaluate` multiplies, each with an axis for the rows of x."""
+        (weight, bias), *others = self._layers
+        # A column's spread may be a thousandth of its values, which single precision would lose.
+        self.centre = np.zeros(self.num_inputs)
+        self._range = self.input_range.astype(float)
+        self._is_clipping = bool(np.isfinite(self._range).any())
+        if np.isfinite(self.input_range).all():
+            self.centre = self.input_range.mean(axis=0, dtype=float)
+            bias = (bias + (self.centre @ weight.astype(float))[:, None]).astype(np.float32)
+        self.centred_bias = bias[:, 0]
+        layers = [(w[:, None], b[:, None]) for w, b in ((weight, bias), *others)]
+        *self._trunk, self._readout = layers
+        if self.has_safety_head:
+            # The safety head reads y, so its first layer is a part of the output layer.
+            (weight, bias), (head, head_bias) = self._layers[-1], self._layer("safety.0")
+            y = [part[..., :2].astype(float) for part in (weight, bias)]
+            columns = (weight, y[0] @ head), (bias, y[1] @ head + head_bias)
+            weight, bias = (np.concatenate(c, axis=2).astype(np.float32)[:, None] for c in columns)
+            self._readout = weight, bias
+            weight, bias = self._layer("safety.1")
+            self._logit = weight[:, None], bias[:, None]
 
     def _layer(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Weights (K, in, out) and biases (K, 1, out)."""
@@ -128,30 +157,43 @@ class Embedding:
         return Embedding(weights, num_margins=self.num_margins, input_range=self.input_range)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
-        """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN."""
-        x = self._checked(x)
-        shape = (self.num_members, len(x))
-        output = EmbeddingOutput(
-            np.empty((*shape, 2)),
-            np.full(shape, np.nan),
-            np.empty((*shape, self.num_margins)),
-        )
-        weight, bias = self._layers[-1]
-        for start in range(0, len(x), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            is_finite = np.isfinite(x[rows]).all(axis=1)
-            chunk = np.where(is_finite[:, None], x[rows], np.float32(0.0))
-            z = self._hidden(chunk) @ weight + bias
-            z[:, ~is_finite] = np.nan
-            output.embedding[:, rows] = z[..., :2]
-            output.margins[:, rows] = z[..., 2:]
-            if self.has_safety_head:
-                output.unsafe_logit[:, rows] = self._logit(z[..., :2])
+        """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN.
+
+        A row has the same bits whatever the others are.
+        """
+        self._check(x)
+        is_usable = np.abs(x) < INPUT_LIMIT  # False for NaN.
+        if np.count_nonzero(is_usable) == is_usable.size:
+            return self._outputs(self._clipped(x))
+        is_usable = is_usable.all(axis=1)
+        output = self._outputs(self._clipped(np.where(is_usable[:, None], x, 0.0)))
+        for values in output:
+            values[:, ~is_usable] = np.nan
         return output
+
+    def _outputs(self, x: np.ndarray) -> EmbeddingOutput:
+        """Outputs at finite inputs, given as `_clipped` returns them."""
+        if len(x) > _CHUNK:
+            parts = (self._outputs(x[i : i + _CHUNK]) for i in range(0, len(x), _CHUNK))
+            return EmbeddingOutput(*map(partial(np.concatenate, axis=1), zip(*parts, strict=True)))
+        with ONE_BLAS_THREAD:
+            weight, bias = self._readout
+            z = self._hidden(x) @ weight
+            z += bias
+            width = 2 + self.num_margins
+            if self.has_safety_head:
+                weight, bias = self._logit
+                logit = (np.maximum(z[..., width:], 0.0) @ weight)[..., 0, 0] + bias[:, 0, 0]
+            else:
+                logit = np.full(z.shape[:2], np.nan)
+        found = z[:, :, 0, :width].astype(float)
+        return EmbeddingOutput(found[..., :2], logit.astype(float), found[..., 2:])
 
     def activations(self, x: np.ndarray) -> np.ndarray:
         """Returns the last hidden layers at finite inputs (N, n_x), (K, N, num_activations)."""
-        return self._hidden(self._checked(x))
+        self._check(x)
+        with ONE_BLAS_THREAD:
+            return self._hidden(self._clipped(x))[:, :, 0]
 
     def embed(self, x: np.ndarray) -> np.ndarray:
         """Applies Psi to inputs (N, n_x), (K, N, 2)."""
@@ -189,21 +231,28 @@ class Embedding:
             gradient += back * (clipped == x)
         return logit / self.num_members, gradient / self.num_members
 
-    def _checked(self, x: np.ndarray) -> np.ndarray:
-        x = np.asarray(x, dtype=np.float32)
-        if x.ndim != 2 or x.shape[1] != self.num_inputs:
+    def _check(self, x: np.ndarray) -> None:
+        if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
             raise ValueError(
-                f"Embedding: inputs have shape {x.shape}, expected (N, {self.num_inputs})"
+                f"Embedding: inputs have shape {np.shape(x)}, expected (N, {self.num_inputs})"
             )
-        return np.clip(x, *self.input_range)
+
+    def _clipped(self, x: np.ndarray) -> np.ndarray:
+        """Inputs clipped to the range, from its centre, in single precision."""
+        if not self._is_clipping:
+            return np.asarray(x, dtype=np.float32)
+        least, largest = self._range
+        offset = np.minimum(np.maximum(np.asarray(x, dtype=float), least), largest)
+        return (offset - self.centre).astype(np.float32)
 
     def _hidden(self, x: np.ndarray) -> np.ndarray:
-        for weight, bias in self._layers[:-1]:
-            x = x @ weight
-            x += bias
-            np.maximum(x, 0.0, out=x)
-        return x
+        """The last hidden layers, (K, N, 1, num_activations), at inputs of `_clipped`.
 
-    def _logit(self, y: np.ndarray) -> np.ndarray:
-        (first, first_bias), (second, second_bias) = self._safety_layers
-        return (np.maximum(y @ first + first_bias, 0.0) @ second + second_bias)[..., 0]
+        One product for each row: those of many rows at once would round differently.
+        """
+        z = x[None, :, None]
+        for weight, bias in self._trunk:
+            z = z @ weight
+            z += bias
+            np.maximum(z, 0.0, out=z)
+        return z

@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 import tempfile
+import warnings
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -128,7 +129,10 @@ def _scene(path: Path) -> trimesh.Scene:
     import trimesh
 
     try:
-        scene = trimesh.load_scene(path)
+        with warnings.catch_warnings():
+            # The reader of COLLADA sets shapes of arrays, which NumPy deprecates from 2.5 on.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            scene = trimesh.load_scene(path)
     except Exception as error:  # trimesh's readers raise many kinds of exceptions.
         raise ValueError(f"mesh '{path}' cannot be read: {error}") from error
     if scene.bounds is None:

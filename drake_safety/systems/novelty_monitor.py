@@ -9,6 +9,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.innovation import KINDS, describe
 from drake_safety.systems.float_system import FloatSystem
 
@@ -103,6 +104,7 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
         initial[self._places["x"]] = np.nan
         state.SetFromVector(initial)
 
+    @one_blas_thread
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         innovation = context.get_abstract_parameter(self._parameter).get_value()
         values = context.get_discrete_state_vector().get_value().copy()

@@ -1,0 +1,100 @@
+"""One thread for BLAS around a tick, whatever the user's settings.
+
+A product or a triangular solve of a few dozen rows takes microseconds. Handed to a pool of threads
+it takes no less, and the idle threads spin for milliseconds after it: a whole-body controller costs
+several times its own CPU time then.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from threading import Lock
+from types import TracebackType
+from typing import Any, ParamSpec, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+class OneBlasThread:
+    """A context in which BLAS runs in the calling thread; the settings are restored after it.
+
+    Contexts may be nested, and entered by several threads at once: BLAS has one setting for the
+    whole process, which the first context changes and the last one restores. A setting that
+    somebody else changes meanwhile stays. It costs about two microseconds.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._depth = 0
+        self._changed: list[tuple[Callable[[int], Any], Callable[[], int], int]] = []
+
+    def __enter__(self) -> OneBlasThread:
+        with self._lock:
+            self._depth += 1
+            if self._depth == 1:
+                # Its import loads a BLAS of its own.
+                for get, set_to in _libraries("scipy.linalg" in sys.modules):
+                    if (number := get()) != 1:
+                        set_to(1)
+                        self._changed.append((set_to, get, number))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with self._lock:
+            self._depth -= 1
+            if self._depth == 0:
+                for set_to, get, number in self._changed:
+                    if get() == 1:
+                        set_to(number)
+                self._changed.clear()
+
+
+ONE_BLAS_THREAD = OneBlasThread()
+"""The one of this process."""
+
+
+def one_blas_thread(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorates a function that runs with one BLAS thread."""
+
+    @functools.wraps(function)
+    def limited(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with ONE_BLAS_THREAD:
+            return function(*args, **kwargs)
+
+    return limited
+
+
+@functools.cache
+def _libraries(has_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int], Any]]]:
+    """Functions that get and set the number of threads, of every loaded BLAS."""
+    del has_scipy
+    found = []
+    for library in ThreadpoolController().select(user_api="blas").lib_controllers:
+        functions = (library.get_num_threads, library.set_num_threads)
+        if library.internal_api == "openblas" and library.threading_layer == "pthreads":
+            # threadpoolctl looks the symbols up anew at each call, ten times the cost of it.
+            functions = _openblas_functions(library.dynlib) or functions
+        found.append(functions)
+    return found
+
+
+def _openblas_functions(library: Any) -> tuple[Callable[[], int], Callable[[int], Any]] | None:
+    for prefix in ("", "scipy_"):
+        for suffix in ("", "64_", "_64"):
+            get, set_to = (
+                getattr(library, f"{prefix}openblas_{verb}_num_threads{suffix}", None)
+                for verb in ("get", "set")
+            )
+            if get is not None and set_to is not None:
+                return get, set_to
+    return None

@@ -1,0 +1,90 @@
+"""No tick of ours spins BLAS' threads, and the user's settings are left as they are."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from drake_safety import load_assessment, load_scenario
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD, one_blas_thread
+
+
+def num_threads():
+    return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    with threadpool_limits(2, user_api="blas"):
+        yield
+
+
+def test_within_the_context_there_is_one_thread_and_after_it_as_many_as_before():
+    before = num_threads()
+    assert set(before) == {2}
+    with ONE_BLAS_THREAD:
+        with ONE_BLAS_THREAD:
+            assert set(num_threads()) == {1}
+        assert set(num_threads()) == {1}
+    assert num_threads() == before
+
+
+def test_an_error_within_the_context_restores_the_settings():
+    @one_blas_thread
+    def fail():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert set(num_threads()) == {2}
+
+
+def test_a_setting_that_somebody_changes_meanwhile_stays():
+    with ONE_BLAS_THREAD:
+        limits = threadpool_limits(3, user_api="blas")
+    assert set(num_threads()) == {3}
+    limits.restore_original_limits()
+    with threadpool_limits(2, user_api="blas"):
+        assert set(num_threads()) == {2}
+
+
+def test_ticks_of_several_threads_restore_the_settings_after_the_last_one():
+    barrier = Barrier(4, timeout=30.0)
+
+    def tick():
+        with ONE_BLAS_THREAD:
+            barrier.wait()  # All are within it.
+            found = set(num_threads())
+            barrier.wait()
+        return found
+
+    with ThreadPoolExecutor(4) as pool:
+        found = [one.result() for one in [pool.submit(tick) for _ in range(4)]]
+    assert found == [{1}] * 4
+    assert set(num_threads()) == {2}
+
+
+@pytest.mark.parametrize("name", ["atlas_reaching", "laikago_balancing"])
+def test_a_simulation_with_gamma_uses_no_cpu_time_in_threads_of_blas(name):
+    loop = load_scenario(name).make_loop(assessment=load_assessment(name))
+    simulator = Simulator(loop)
+    loop.reset(simulator.get_mutable_context(), np.random.default_rng(0))
+    simulator.Initialize()
+    simulator.AdvanceTo(0.1)
+    # A product that is threaded: its threads spin for a while after it.
+    started = time.process_time() - time.thread_time()
+    deadline = time.monotonic() + 5.0
+    while time.process_time() - time.thread_time() - started < 0.01:
+        assert time.monotonic() < deadline, "BLAS has no threads here, so this shows nothing"
+        np.ones((400, 400)) @ np.ones((400, 400))
+    time.sleep(0.5)
+    process_s, thread_s = time.process_time(), time.thread_time()
+    simulator.AdvanceTo(0.6)
+    thread_s = time.thread_time() - thread_s
+    process_s = time.process_time() - process_s
+    assert thread_s > 0.01
+    assert process_s - thread_s < 0.05 * thread_s
