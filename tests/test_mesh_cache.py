@@ -57,6 +57,8 @@ def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
         ('<unit meter="0.01"/><up_axis>Z_UP</up_axis>', [0.01, 0.02, 0.04]),
     ],
 )
+# The writer of COLLADA sets shapes of arrays, which NumPy deprecates from 2.5 on.
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
 def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
     path = tmp_path / "tower.dae"
     trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
