@@ -74,18 +74,21 @@ $(DEVELOPED): $(INSTALLED) $(WALKING)
 
 $(WALKING): $(INSTALLED) policies.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[robots,walking]"
-	$(BIN)/python -m pip install --no-deps --require-hashes --requirement policies.txt
+	$(BIN)/python -m pip install --no-deps --ignore-requires-python --require-hashes \
+		--requirement policies.txt
 	touch $@
 
 $(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 	$(PYTHON) -m venv $(LIGHT)
 	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
 		".[live,mujoco,onnx,report,robots,test,walking]"
-	$(LIGHT)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
+	$(LIGHT)/bin/python -m pip install --no-deps --ignore-requires-python --require-hashes \
+		--requirement policies.txt
 	touch $@
 
 $(LOWEST)/.installed: pyproject.toml lowest.txt
 	python3.11 -m venv $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --constraint lowest.txt --editable \
 		".[cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
+	$(LOWEST)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
