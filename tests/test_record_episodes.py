@@ -178,7 +178,8 @@ def test_what_does_not_fit_is_refused_with_what_there_is(options, message):
 
 def test_a_function_without_source_text_is_refused():
     made = {}
-    exec("def reset(diagram, context, rng):\n    pass", made)
+    # From Python 3.13 on, "<string>" is the text of `python -c`.
+    exec(compile("def reset(diagram, context, rng):\n    pass", "<typed>", "exec"), made)
     given = {"ports": {"state": "position_and_speed"}, "duration_s": 1.0, "step_s": STEP_S}
     with pytest.raises(ValueError, match=r"source of <function reset .* cannot be read, expected"):
         record_episodes(make_glider, 1, reset=made["reset"], **given)
