@@ -463,24 +463,13 @@ class SafetyAssessment:
             path: The file.
 
         Raises:
-            ValueError: The package `onnx` is not installed, or the assessment is not fitted.
+            MissingExtraError: The extra "onnx" is not installed.
+            ValueError: The assessment is not fitted.
         """
         from drake_safety.learning import onnx_graph
 
         self._check_fitted()
-        onnx_graph.write(
-            Path(path),
-            info=self.info_,
-            parameters=self.parameters,
-            embedding=self.embedding_,
-            grid=self.grid_,
-            beliefs=self.beliefs_,
-            correction=self.correction_,
-            base_logit=self.base_logit_,
-            novelty=self.novelty_,
-            calibrations=list(self.calibrations_.values()),
-            adaptation=self.adaptation_,
-        )
+        onnx_graph.write(Path(path), self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:

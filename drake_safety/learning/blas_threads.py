@@ -25,7 +25,7 @@ class OneBlasThread:
 
     Contexts may be nested, and entered by several threads at once: BLAS has one setting for the
     whole process, which the first context changes and the last one restores. A setting that
-    somebody else changes meanwhile stays. It costs about two microseconds.
+    somebody else changes meanwhile stays. It costs some microseconds.
     """
 
     def __init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,10 +13,8 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.assessment_parameters import AssessmentParameters
-from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import used_states
 from drake_safety.learning.novelty import Novelty
@@ -26,6 +24,8 @@ from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 
 if TYPE_CHECKING:
     import onnx
+
+    from drake_safety.learning.assessment import SafetyAssessment
 
 SCHEMA_VERSION = 1
 """Version of the graph's ports and of its metadata."""
@@ -49,36 +49,14 @@ _UNITS = (
 )
 
 
-def write(
-    path: Path,
-    *,
-    info: EpisodesInfo,
-    parameters: AssessmentParameters,
-    embedding: Embedding,
-    grid: Grid,
-    beliefs: np.ndarray,
-    correction: Correction,
-    base_logit: BaseLogit | None,
-    novelty: Novelty,
-    calibrations: Sequence[Calibration],
-    adaptation: Adaptation | None,
-) -> None:
-    """Writes `prediction.predict` of an assessment as one ONNX file, atomically.
+def write(path: Path, assessment: SafetyAssessment) -> None:
+    """Writes `SafetyAssessment.predict` as one ONNX file, atomically.
 
     The same assessment gives the same bytes.
 
     Args:
         path: The file.
-        info: Metadata of the training episodes.
-        parameters: The assessment's parameters.
-        embedding: The maps.
-        grid: The grid.
-        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        correction: Correction of the base logit by feedback.
-        base_logit: The base logit; None without heads.
-        novelty: Says which inputs are novel.
-        calibrations: Thresholds with a promised miss rate.
-        adaptation: The adaptation to feedback, if any.
+        assessment: A fitted assessment, adapted or not.
 
     Raises:
         MissingExtraError: The extra `onnx` is not installed.
@@ -86,20 +64,23 @@ def write(
     require_extra("onnx", f"export to '{path}'")
     import onnx
 
+    info, parameters = assessment.info_, assessment.parameters
+    embedding, grid, correction = assessment.embedding_, assessment.grid_, assessment.correction_
+    base_logit = assessment.base_logit_
     nodes = _Nodes()
     inputs = {name: info.widths[name] for name in ("state", "desired_preview")}
     if parameters.is_sharpened and info.feature_names:
         inputs["features"] = info.widths["features"]
     x, is_usable = _inputs(nodes, inputs, info, parameters)
     y, logit, margins, activations = _maps(nodes, nodes("Where", is_usable, x, 0.0), embedding)
-    share = _novelty(nodes, x, novelty)
+    share = _novelty(nodes, x, assessment.novelty_)
     is_known = nodes("And", is_usable, nodes("LessOrEqual", share, 1.0))
     weights, inside = _cell_weights(nodes, y, grid, parameters.is_sharpened)
     num_causes = len(info.constraint_names)
     empty = np.zeros(3 + num_causes)
     empty[belief_masses.UNCERTAINTY] = 1.0
     # Relative to the empty belief, which a map contributes whose output lies outside its grid.
-    relative = (beliefs - empty) / embedding.num_members
+    relative = (assessment.beliefs_ - empty) / embedding.num_members
     masses = nodes("Add", _read_grid(nodes, weights, relative), empty)
     masses = nodes("Where", is_known, masses, empty, output="masses")
     nodes.columns(masses, 0, 3, output="belief")
@@ -141,7 +122,7 @@ def write(
         "novelty": None,
         "embedding": 2,
     }
-    contract = _contract(info, parameters, inputs, calibrations, adaptation)
+    contract = _contract(assessment, inputs)
     graph = onnx.helper.make_graph(
         nodes.nodes,
         "gamma",
@@ -162,14 +143,10 @@ def write(
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
-def _contract(
-    info: EpisodesInfo,
-    parameters: AssessmentParameters,
-    ports: Iterable[str],
-    calibrations: Sequence[Calibration],
-    adaptation: Adaptation | None,
-) -> dict[str, Any]:
+def _contract(assessment: SafetyAssessment, ports: Iterable[str]) -> dict[str, Any]:
     """What the file is, by the name of the entry of its metadata."""
+    info, parameters = assessment.info_, assessment.parameters
+    adaptation, calibrations = assessment.adaptation_, assessment.calibrations_.values()
     preview = [f"{name} [{k}]" for k in range(info.horizon) for name in info.output_names]
     columns = {
         "state": info.state_names,

@@ -311,8 +311,7 @@ def predict(
     found, is_inside = read(output.embedding, table)
     summed = np.add.reduce(found, axis=0)
     masses = summed[:, :num_columns] / num_members
-    is_any_outside = np.count_nonzero(is_inside) < is_inside.size
-    if is_any_outside:
+    if np.count_nonzero(is_inside) < is_inside.size:
         # A map whose output lies outside its grid contributes the empty belief.
         share_inside = np.add.reduce(is_inside, axis=0) / num_members
         masses[:, belief_masses.UNCERTAINTY] += 1.0 - share_inside

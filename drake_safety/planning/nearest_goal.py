@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.planning.goal_verdict import (
     GoalVerdict,
     assess_goals,
@@ -42,6 +42,7 @@ _SPREAD = 0.25  # Radius of the candidates about the best goal, by its distance 
 _NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Of candidates about the best goal.
 
 
+@one_blas_thread
 def nearest_accepted_goal(
     loop: ClosedLoop,
     assessment: SafetyAssessment,
@@ -104,12 +105,10 @@ def nearest_accepted_goal(
         return _nearest((verdict for verdict in verdicts if verdict.is_accepted), goal)
 
     best: GoalVerdict | None = None
-    # One thread multiplies matrices this small faster than several.
-    with threadpool_limits(1):
-        if method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head):
-            best = _descend(loop, assessment, goal, box, stricter, nearest_of, resolution_m)
-        if method != "gradient":
-            best = _search(goal, box, nearest_of, best, rng, num_candidates, resolution_m)
+    if method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head):
+        best = _descend(loop, assessment, goal, box, stricter, nearest_of, resolution_m)
+    if method != "gradient":
+        best = _search(goal, box, nearest_of, best, rng, num_candidates, resolution_m)
     return None if best is None else replace(best, threshold=threshold)
 
 
