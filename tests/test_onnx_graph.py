@@ -138,21 +138,6 @@ def test_the_graph_of_a_shipped_assessment_says_what_predict_says_of_every_kind_
     assert np.ptp(expected.calibrated) > 0.5
 
 
-def test_what_is_not_finite_is_dont_know_and_never_safe(tmp_path):
-    assessment = load_assessment(assessed_scenarios()[0])
-    runtime = exported(assessment, tmp_path / "gamma.onnx")
-    ports = {
-        name: np.full((2, port.shape[1]), np.nan)
-        for port in runtime.session.get_inputs()
-        for name in [port.name]
-    }
-    said = runtime(ports)
-    np.testing.assert_array_equal(said["belief"], [[0.0, 0.0, 1.0]] * 2)
-    np.testing.assert_array_equal(said["safety_probability"], 0.0)
-    np.testing.assert_array_equal(said["novelty"], np.inf)
-    assert np.isnan(said["predicted_margins"]).all()
-
-
 def with_maps(assessment, weights, num_margins):
     """The same with other maps."""
     changed = copy.copy(assessment)

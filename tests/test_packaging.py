@@ -93,20 +93,24 @@ def wheel(sdist, tmp_path_factory):
     return call_backend("build_wheel", source, work / "wheel")
 
 
-@pytest.fixture(scope="module")
-def clean_environment(wheel, tmp_path_factory):
-    """An environment with the wheel; the dependencies are this environment's, read in place."""
-    folder = tmp_path_factory.mktemp("clean") / "environment"
+def environment_of(wheel, folder):
+    """Makes an environment with the wheel alone; returns its site-packages."""
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
     python = folder / "bin" / "python"
     install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
     run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
-    site_packages = run(
-        python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd="/"
-    )
+    code = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    return Path(run(python, "-c", code, cwd="/").strip())
+
+
+@pytest.fixture(scope="module")
+def clean_environment(wheel, tmp_path_factory):
+    """An environment with the wheel; the dependencies are this environment's, read in place."""
+    folder = tmp_path_factory.mktemp("clean") / "environment"
     # Only a path: a .pth file inside that folder, an editable install's say, is not followed.
     dependencies = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    (Path(site_packages.strip()) / "dependencies.pth").write_text("\n".join(dependencies) + "\n")
+    paths = environment_of(wheel, folder) / "dependencies.pth"
+    paths.write_text("\n".join(dependencies) + "\n")
     return folder
 
 
@@ -127,12 +131,7 @@ def needed_by(*names):
 def light_environment(wheel, tmp_path_factory):
     """An environment with the wheel and what pip installs with it, this one's, and no extra."""
     folder = tmp_path_factory.mktemp("light") / "environment"
-    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd="/")
-    python = folder / "bin" / "python"
-    install = ["install", "--quiet", "--no-index", "--no-deps", wheel]
-    run(sys.executable, "-m", "pip", "--python", python, *install, cwd="/")
-    code = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    site_packages = Path(run(python, "-c", code, cwd="/").strip())
+    site_packages = environment_of(wheel, folder)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for name in needed_by(*(Requirement(line).name for line in project["dependencies"])):
         distribution = importlib.metadata.distribution(name)
