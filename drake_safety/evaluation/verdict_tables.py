@@ -118,7 +118,7 @@ _SET_TITLES = {
     "plans.other_hand": "the other hand",
     "plans.other_hand.fair": "the other hand, fair",
     "calibration.plan": "before the motion",
-    "calibration.motion": "alarm during it",
+    "calibration.motion": "during the motion",
 }
 
 
