@@ -280,7 +280,6 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
         viewer=None,
         start=lambda: started.append(True),
         save=lambda timeline, events, threshold: None,
-        save_animation=lambda *arguments: None,
     )
     monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
     monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)
