@@ -19,7 +19,7 @@ INPUTS = (
     "features; paper uses its next H steps and no features."
 )
 """Note beside every table that compares them."""
-_SCORES = "Modes are judged by calibrated Γ, classifiers by their probability."
+_SCORES = "Modes and classifiers are judged by their probability."
 _SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
 _SET_TITLES = {
     "plans": "all targets",
@@ -84,7 +84,7 @@ def verdict_tables(results: Results) -> list[Table]:
             results,
             "calibration",
             "Stored calibrations on fresh motions",
-            "Promised and observed rates of the thresholds of calibrated Γ.",
+            "Promised and observed rates of the thresholds of the probability.",
             columns_of("calibrations"),
             key="calibrations",
         ),
@@ -202,10 +202,7 @@ def _triggers(results: Results) -> Table:
 
 def alarm_table(results: Results) -> Table:
     """Detection rate, lead time and false-alarm rate of alarms on pushed motions."""
-    meaning = (
-        "Thresholds are chosen for the same share of false alarms on calibration motions; those of "
-        "sharpened and paper apply to normalised Γ, unless a row names another."
-    )
+    meaning = "Thresholds are chosen for the same share of false alarms on calibration motions."
     refused = results.estimates.get("monitoring.motions.refused")
     if refused is not None and refused.n:
         meaning += (
