@@ -229,7 +229,7 @@ def converged_text(results: Results) -> str:
     if len(brier) == 3:
         before, after, prior_alone = brier
         parts.append(
-            f"Brier score of safe share on every segment, without a gap: {before} before "
+            f"Brier score of the safe share on every segment, without a gap: {before} before "
             f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, "
             "without feedback beliefs."
         )
