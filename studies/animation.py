@@ -1,4 +1,4 @@
-"""``python -m studies animation``: a GIF of a run, for README: the robot, and Γ below it."""
+"""``python -m studies animation``: a GIF of a run, for README: the robot, and the probability below it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
 )
 from drake_safety.evaluation.stills import StillCamera, stack_positions
-from drake_safety.learning.prediction import CALIBRATED, PORTS
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.scenario import load_scenario
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
 _WIDTH, _PICTURE_HEIGHT, _GAMMA_HEIGHT = 5.6, 3.5, 1.1  # [inches]
 _DOTS_PER_INCH = 100
 _FRAMES_PER_SECOND = 10
+_PORT = "safety_probability"
 _COLOURS, _PALETTE_FRAMES = 127, 8
 
 
@@ -64,23 +64,22 @@ def animation(
     if target is None:
         loop = loaded.make_loop(variation, assessment=gamma, ball=True)
         throws = parse_pushes(loaded, push or [])
-        ports = (loop.trigger_port, "ball_state")
-        log = run_throw(loop, 0, throws=throws, ports=ports, **options)
+        log = run_throw(loop, 0, throws=throws, ports=(_PORT, "ball_state"), **options)
         states = {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}
-        values, threshold = log.extra[loop.trigger_port], loaded.parameters.recovery.threshold
+        threshold = loaded.parameters.recovery.threshold
         events = [start for start, _ in log.recovery_intervals_s]
     else:
         loop = loaded.make_loop(variation, assessment=gamma)
-        goal, port = parse_target(loop, target), PORTS[CALIBRATED]
-        log = run_to_goal(loop, goal, push=named_push(loop, push or []), ports=(port,), **options)
-        states, values = {loop.robot.name: log.plant_state}, log.extra[port]
+        goal, pushed = parse_target(loop, target), named_push(loop, push or [])
+        log = run_to_goal(loop, goal, push=pushed, ports=(_PORT,), **options)
+        states = {loop.robot.name: log.plant_state}
         threshold = goal_threshold(folder, gamma).threshold
         if "motion" in gamma.calibrations_:
             threshold = gamma.calibrations_["motion"].threshold
         alarm = alarm_row(log, threshold)
         events = [] if alarm is None else [float(log.time_s[alarm])]
-    positions = stack_positions(loop, states)
-    save_animation(loop, log.time_s, positions, values[:, 0], threshold, out, events)
+    probability, positions = log.extra[_PORT][:, 0], stack_positions(loop, states)
+    save_animation(loop, log.time_s, positions, probability, threshold, out, events)
     print_path("animation", out)
 
 
@@ -88,7 +87,7 @@ def save_animation(
     loop: LeggedLoop,
     time_s: np.ndarray,
     positions: np.ndarray,
-    gamma: np.ndarray,
+    probability: np.ndarray,
     threshold: float,
     path: Path,
     event_times_s: Sequence[float],
@@ -99,8 +98,8 @@ def save_animation(
         loop: The closed loop that was simulated, or one with the same plant.
         time_s: Instants of the log [s], (N,), increasing.
         positions: All of the plant's positions at these instants, (N, n_q).
-        gamma: Γ as triggers or alarms take it, (N,).
-        threshold: Threshold on Γ of triggers or alarms.
+        probability: As triggers or alarms take it, (N,).
+        threshold: Threshold of triggers or alarms.
         path: Path of the GIF.
         event_times_s: Times of triggers or alarms, marked on the curve [s].
     """
@@ -123,7 +122,7 @@ def save_animation(
         words = picture_axes.text(0.02, 0.95, "", transform=picture_axes.transAxes, va="top")
         axes = fig.add_axes((0.09, 0.34 * share, 0.88, 0.58 * share))
         axes.set(xlim=(time_s[0], time_s[-1]), ylim=(-0.05, 1.05), yticks=[0.0, 1.0])
-        axes.set_ylabel("Γ", rotation=0, labelpad=8)
+        axes.set_ylabel("probability", fontsize=8)
         axes.set_xlabel("time [s]", labelpad=0)
         axes.axhline(threshold, color=FAINT_INK, linewidth=1.0, linestyle=(0, (4, 3)))
         (curve,) = axes.plot([], [], color=INK, linewidth=1.6)
@@ -137,9 +136,9 @@ def save_animation(
             words.set_text(
                 f"the camera does not turn; the robot turned by {round(math.degrees(turn))}°"
             )
-            curve.set_data(time_s[: row + 1], gamma[: row + 1])
-            dot.set_data([time_s[row]], [gamma[row]])
-            dot.set_color(SAFE_COLOUR if gamma[row] >= threshold else UNSAFE_COLOUR)
+            curve.set_data(time_s[: row + 1], probability[: row + 1])
+            dot.set_data([time_s[row]], [probability[row]])
+            dot.set_color(SAFE_COLOUR if probability[row] >= threshold else UNSAFE_COLOUR)
             for event, mark in marks:
                 mark.set_visible(bool(event <= time_s[row]))
             canvas.draw()

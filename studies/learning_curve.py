@@ -206,7 +206,7 @@ def learning_curve(
     estimates: dict[str, Estimate] = {}
     miss_rate = promised_miss_rate(calibration)
     for size in wanted:
-        rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
+        rule = scorer_rule(assessment_scorer("sharpened", learned[size]))
         threshold = score_threshold(
             rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate
         )
