@@ -1,4 +1,4 @@
-"""``python -m studies animation``: a GIF of a run, for README: the robot, and the probability below it."""
+"""``python -m studies animation``: a GIF of a run: the robot, and the probability below it."""
 
 from __future__ import annotations
 
