@@ -118,8 +118,9 @@ class Results(Mapping[str, Result]):
         Numbers have six significant digits; what is not finite becomes null.
         """
         figures = ",\n".join(
-            f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (r.value, r.low, r.high)), r.n])}"
-            for key, r in self.items()
+            f"    {json.dumps(key)}: "
+            f"{json.dumps([*map(_rounded, (row.value, row.low, row.high)), int(row.n)])}"
+            for key, row in self.items()
         )
         entries = json.dumps(self.entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
         head = f'  "schema": "{SCHEMA}",\n  "schema_version": {SCHEMA_VERSION},\n'
