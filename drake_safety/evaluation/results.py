@@ -109,7 +109,8 @@ class Results(Mapping[str, Result]):
             return cls(figures, content["entries"])
         except _DAMAGES as error:
             raise ValueError(
-                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: {error!r}"
+                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: "
+                f"{type(error).__name__}: {str(error)[:200]}"
             ) from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
