@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -40,11 +41,13 @@ class Estimate:
         return cls(value, value, value, n)
 
     @classmethod
-    def from_json(cls, fields: Mapping[str, float | int | None]) -> Estimate:
+    def from_json(cls, fields: Mapping[str, Any]) -> Estimate:
         """The inverse of :meth:`to_json`."""
-        ends = (fields[name] for name in ("value", "low", "high"))
-        n = int(fields["n"] or 0)
-        return cls(*(math.nan if end is None else float(end) for end in ends), n)
+        value, low, high = (
+            math.nan if fields[name] is None else float(fields[name])
+            for name in ("value", "low", "high")
+        )
+        return cls(value, low, high, int(fields["n"]))
 
     def to_json(self) -> dict[str, float | int | None]:
         """The estimate as JSON types; non-finite numbers become None."""

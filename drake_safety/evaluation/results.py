@@ -16,6 +16,7 @@ from drake_safety.learning.assessment_file import replacing
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
+_NUMBERS = ("value", "low", "high", "n")
 _NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
 _DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
 _DAMAGES = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
@@ -50,7 +51,7 @@ class Result(Estimate):
             )
         *rest, metric = _DOT.split(key)
         method = rest.pop() if len(rest) > 1 else ""
-        ends = {name: getattr(estimate, name) for name in ("value", "low", "high", "n")}
+        ends = {name: getattr(estimate, name) for name in _NUMBERS}
         return cls(**ends, set=".".join(rest), method=method, metric=metric)
 
 
@@ -103,8 +104,8 @@ class Results(Mapping[str, Result]):
             if found != (SCHEMA, SCHEMA_VERSION):
                 raise ValueError(f"schema and version are {found}")
             figures = {
-                key: Estimate(*(math.nan if end is None else float(end) for end in ends), int(n))
-                for key, (*ends, n) in content["figures"].items()
+                key: Estimate.from_json(dict(zip(_NUMBERS, row, strict=True)))
+                for key, row in content["figures"].items()
             }
             return cls(figures, content["entries"])
         except _DAMAGES as error:
