@@ -182,11 +182,11 @@ def test_goals_need_no_legs(shuttle_loop, meshcat):
 def test_ports_that_are_not_exported_are_named(meshcat):
     scenario = quick(gliding())
     loop = FewPorts(scenario, assessment=learned(scenario))
-    message = r"'FewPorts' exports no port \['safety_probability'"
+    message = r"'FewPorts' exports no port \['cause_probability', "
     with pytest.raises(ValueError, match=message):
         LiveEpisodes(loop, meshcat, threshold=0.5)
     with pytest.raises(ValueError, match=message):
-        run_free(loop, seed=0, duration_s=0.4, ports=("safety_probability",))
+        run_free(loop, seed=0, duration_s=0.4, ports=("cause_probability", "predicted_margins"))
 
 
 @pytest.fixture(scope="module")
