@@ -10,7 +10,6 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.segments import RECORDED
-from drake_safety.systems.float_system import FloatSystem
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -68,7 +67,7 @@ class LoopScenario(Protocol):
         """A digest of the code that simulates."""
 
 
-class ClosedLoop(FloatSystem, Diagram):
+class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
     The contract consists of the output ports below, :meth:`reset`, and the names of the ports'

@@ -7,10 +7,8 @@ import math
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
 
-from drake_safety.systems.float_system import FloatSystem
 
-
-class RecoveryTrigger(FloatSystem, LeafSystem):
+class RecoveryTrigger(LeafSystem):
     """Switches to recovery when Γ < Γ_thre, and back when the recovery is done.
 
     .. pydrake_system::
