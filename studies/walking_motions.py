@@ -12,8 +12,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.walking_parameters import profile
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import replacing
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop

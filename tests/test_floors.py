@@ -32,8 +32,9 @@ ALLOWED["planning"] = {*ALLOWED["simulation"], "simulation"}
 ALLOWED["diagrams"] = ALLOWED["logs"] = ALLOWED["planning"]
 ALLOWED["evaluation"] = ALLOWED["live"] = {*ALLOWED["planning"], "planning"}
 ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessments"}
-# Every room may name the extra that it needs.
-ALLOWED["extras"] = set()
+# Every room may name the extra that it needs, and write files.
+EVERYWHERE = ("extras", "files")
+ALLOWED |= {"extras": set(), "files": set()}
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "pyarrow", "matplotlib"}
@@ -150,7 +151,7 @@ def upward_imports(source, name):
         if target is not None and target not in ALLOWED:
             if target != "__version__":
                 offences.append(f"{name}:{line} imports {dotted}: import it from its own room")
-        elif target not in {None, room, "extras"} | ALLOWED.get(room, set()):
+        elif target not in {None, room, *EVERYWHERE} | ALLOWED.get(room, set()):
             offences.append(f"{name}:{line} in {room} imports {dotted}")
     return offences
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.cli.console import open_stages as open_stages_of_commands
-from drake_safety.learning.progress import open_stages, shown
+from drake_safety.files.progress import open_stages, shown
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO
 

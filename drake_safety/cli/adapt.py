@@ -95,7 +95,7 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.learning.assessment_file import replacing
+    from drake_safety.files.atomic import replacing
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)

@@ -15,8 +15,8 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from drake_safety.learning import progress
-from drake_safety.learning.progress import Stages
+from drake_safety.files import progress
+from drake_safety.files.progress import Stages
 
 if TYPE_CHECKING:
     import numpy as np

@@ -129,7 +129,8 @@ def evaluate(
     from drake_safety.evaluation.report.results import Results
     from drake_safety.evaluation.report.verdicts import verdict_tables
     from drake_safety.evaluation.scorers import classifier_scorers
-    from drake_safety.learning.assessment_file import file_hash, replacing
+    from drake_safety.files.atomic import replacing
+    from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.capabilities import (
         CanBePushed,
         HasBall,

@@ -78,7 +78,8 @@ def evaluate_shifts_command(
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.evaluation.shift_study import evaluate_shifts, false_alarms
     from drake_safety.evaluation.shifts_figure import shifts_figure
-    from drake_safety.learning.assessment_file import file_hash, replacing
+    from drake_safety.files.atomic import replacing
+    from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.dataset import load_episodes
 
     gamma = load_assessment(assessment, "sharpened")

@@ -17,10 +17,10 @@ from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
+from drake_safety.files.atomic import replacing
+from drake_safety.files.progress import shown
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
 from drake_safety.simulation.capabilities import HasBall, judging_options

@@ -11,9 +11,9 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
+from drake_safety.files.progress import shown
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import LITERAL, NORMALIZED
-from drake_safety.learning.progress import shown
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.progress import shown
 from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
@@ -31,7 +32,6 @@ from drake_safety.learning.innovation import Innovation
 from drake_safety.learning.inputs import input_names, inputs, plan_columns, used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for

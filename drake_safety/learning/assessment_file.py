@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import UnionType
@@ -15,6 +13,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
@@ -110,37 +109,6 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     content = save(arrays, {SCHEMA: text})
     with replacing(path) as temporary:
         temporary.write_bytes(content)
-
-
-@contextlib.contextmanager
-def replacing(final: Path) -> Iterator[Path]:
-    """A temporary file beside a final one, renamed to it on success and removed on any exception.
-
-    What a killed process left of the same file is removed.
-
-    Args:
-        final: Path of the complete file.
-
-    Raises:
-        OSError: It cannot be written; the message names the file.
-    """
-    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
-    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
-    try:
-        for left in final.parent.glob(f".{final.name}.*.tmp"):
-            left.unlink(missing_ok=True)
-        yield temporary
-        # The bytes reach the disk before the name does.
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(final)
-    except OSError as error:
-        why = str(error) if error.errno is None else os.strerror(error.errno)
-        raise OSError(
-            f"{final} cannot be written: {why}; what had been written before is kept"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:

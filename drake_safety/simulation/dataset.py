@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.learning.assessment_file import replacing
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.robots.reading import reading, shortened
 from drake_safety.simulation.episode_shards import (

@@ -13,8 +13,8 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.files.progress import shown
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require

@@ -19,7 +19,7 @@ from typing import Any
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
-from drake_safety.learning.progress import shown
+from drake_safety.files.progress import shown
 
 _BATCH = 4  # Episodes, or throws, per call of a worker.
 _WATCH_PERIOD_S = 1.0
