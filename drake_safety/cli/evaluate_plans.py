@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -57,16 +57,10 @@ def check_options(loop: ClosedLoop, options: PlanOptions) -> None:
                 "evaluate: leave out --other-hand, --plane-x and --plane-step",
             )
         return
-    if options.other_hand and not _mirror_options(loop):
+    if options.other_hand and not loop.mirror_options:
         raise ValueError(f"evaluate: {loop.scenario.task} has no other hand: pass --other-hand 0")
     if options.plane_step and goal_words(loop).is_point:
         plane_of(loop, options.plane_x, options.plane_step)
-
-
-def _mirror_options(loop: ClosedLoop) -> dict[str, Any]:
-    from drake_safety.simulation.capabilities import HasMirrorImage
-
-    return loop.mirror_options if isinstance(loop, HasMirrorImage) else {}
 
 
 def evaluate_plans(
@@ -94,7 +88,7 @@ def evaluate_plans(
     scenario, sharpened = judged.scenario, judged.sharpened
     loop = scenario.make_loop()
     words = goal_words(require(loop, HasGoals))
-    mirror = _mirror_options(loop)
+    mirror = loop.mirror_options
     test = plans_of(loop, judged.test_set)
     calibration = plans_of(loop, judged.calibration_set)
     sets = {"plans": test}

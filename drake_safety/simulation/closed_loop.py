@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -12,9 +12,12 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from drake_safety.learning.segments import RECORDED
 
 if TYPE_CHECKING:
+    from drake_safety.control.kinematics import RobotKinematics
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.assessment_parameters import AssessmentParameters
     from drake_safety.robots.robot import PlantVariation
+    from drake_safety.simulation.contract import Finding
+    from drake_safety.simulation.episode_start import StatePlane
     from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
@@ -62,9 +65,6 @@ class LoopScenario(Protocol):
 
     def simulation_hash(self, variation: str = "nominal") -> str:
         """A digest of all parameters that determine a rollout."""
-
-    def code_digest(self) -> str:
-        """A digest of the code that simulates."""
 
 
 class ClosedLoop(Diagram):
@@ -130,6 +130,25 @@ class ClosedLoop(Diagram):
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
+
+    @classmethod
+    def check_files(cls, scenario: LoopScenario, kinematics: RobotKinematics) -> Iterable[Finding]:
+        """Findings about the task's own files, which ``check`` checks before the diagram."""
+        del scenario, kinematics
+        return ()
+
+    @property
+    def mirror_options(self) -> dict[str, Any]:
+        """Options of the mirrored diagram; empty without a mirror image."""
+        return {}
+
+    @property
+    def state_planes(self) -> Mapping[str, StatePlane]:
+        """Planes of starts on which the true safe set can be simulated, by name of the plan."""
+        return {}
+
+    def remove_visuals(self, context: Context) -> None:
+        """Removes shapes that only pictures need from the Context of a simulation without them."""
 
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
         """Finds this diagram's Context in that of the outermost diagram.

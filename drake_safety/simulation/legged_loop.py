@@ -284,7 +284,7 @@ class LeggedLoop(PlannedLoop):
         return assessor
 
     def remove_visuals(self, context: Context) -> None:
-        """Removes the visual shapes, unless the diagram has a visualiser; see `HasVisuals`."""
+        """Removes the visual shapes, unless the diagram has a visualiser."""
         if not self._is_shown:
             remove_visuals(self.plant, self.scene_graph, context)
 
