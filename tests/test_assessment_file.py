@@ -169,7 +169,6 @@ def rename_tensor(name, new):
         (set_entry("parameters.resolution", "3"), "its parameters.resolution is '3'"),
         (set_entry("parameters.paper.stride", 1.5), "its paper.stride is 1.5"),
         (set_entry("info.state_names", [1, 2]), r"its info.state_names is \[1, 2\]"),
-        (set_entry("info.surplus", 1), "its info has no field 'surplus'"),
         (set_entry("parameters", 3), "damaged"),
         (set_entry("numbers", None), "damaged"),
     ],

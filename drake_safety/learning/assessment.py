@@ -138,7 +138,7 @@ class SafetyAssessment:
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, base_logit, target = learned_maps(
+        self.embedding_, base_logit = learned_maps(
             segments, has_target, x, self.grid_, parameters, progress
         )
         if parameters.is_sharpened:
@@ -163,10 +163,9 @@ class SafetyAssessment:
             progress("innovation", 1.0)
         output = self.embedding_.evaluate(x)
         self.base_logit_: BaseLogit | None = base_logit
-        is_placed = not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
-        self.training_ = TrainingScores.of(
-            segments, output, base_logit, target if is_placed else None
-        ).thinned(self.grid_, parameters.seed)
+        self.training_ = TrainingScores.of(segments, output, base_logit).thinned(
+            self.grid_, parameters.seed
+        )
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
         self.used_ = [UsedEpisodes.of("training", info, len(episodes))]

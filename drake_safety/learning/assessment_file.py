@@ -43,12 +43,11 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "cause": (np.int16, np.int64),
     "heads": (np.float32, float),
     "nearest": (np.int16, np.int64),
-    "target": (np.float32, np.float32),
     "multiplicity": (np.float32, float),
     "count": (np.int32, np.int64),
 }
 """Arrays of `TrainingScores`: the type on disk and in memory."""
-_OPTIONAL = ("heads", "nearest", "target", "multiplicity", "count")
+_OPTIONAL = ("heads", "nearest", "multiplicity", "count")
 _INFINITE = ("innovation.chart_limits", "innovation.sums")
 """Arrays with limits, which are infinite if training had too little motion."""
 _MASS_TOLERANCE = 1e-6
@@ -178,14 +177,13 @@ def _digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> st
 
 
 def _typed(made: type[_T], entries: Mapping[str, Any], where: str) -> _T:
-    """Makes a dataclass of JSON values of its fields' types."""
+    """Makes a dataclass of JSON values of its fields' types, without fields of earlier versions."""
     hints = get_type_hints(made)
-    for name, value in entries.items():
-        if name not in hints:
-            raise ValueError(f"its {where} has no field '{name}'")
+    known = {name: value for name, value in entries.items() if name in hints}
+    for name, value in known.items():
         if not _is_of(value, hints[name]):
             raise ValueError(f"its {where}.{name} is {value!r}, expected {hints[name]}")
-    return made(**entries)
+    return made(**known)
 
 
 def _is_of(value: Any, hint: Any) -> bool:
