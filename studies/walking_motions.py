@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -215,12 +216,8 @@ def run_motions(
     if progress is not None:
         progress(done, len(indices))
     for motion in run_batches(
-        _batch,
+        partial(_batch, scenario, variation, assessment, options or {}, kind, seed, duration_s),
         wanted,
-        lambda batch: (
-            *(scenario, variation, assessment, options or {}),
-            *(kind, seed, duration_s, batch),
-        ),
         progress=progress,
         num_done=done,
     ):

@@ -59,12 +59,13 @@ EXTRAS = {
     "walking": ("drake_safety/control/policy_network.py",),
 }
 ONLY_IN = {
+    "cloudpickle": ("drake_safety/simulation/worker_processes.py",),
     "torch": ("drake_safety/learning/embedding.py", "drake_safety/control/policy_network.py"),
     "tslearn": ("drake_safety/learning/distance.py",),
     "dtaidistance": ("drake_safety/learning/distance.py",),
     "mujoco": ("drake_safety/plants/mujoco_model.py",),
 }
-PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
+PICKLING = {"pickle", "cPickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}
 PORT_WORDS = re.compile(r"LeafSystem|VectorSystem|Declare\w*Port|Export(In|Out)put")
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "manager", "managers", "data"}

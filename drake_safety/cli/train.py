@@ -48,13 +48,6 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue with the episodes in OUT.")
     ] = False,
-    accept_code_change: Annotated[
-        bool,
-        typer.Option(
-            "--accept-code-change",
-            help="Resume although the source code has changed since.",
-        ),
-    ] = False,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
 ) -> None:
@@ -92,7 +85,6 @@ def train(
                 path=folder,
                 progress=partial(stages, f"nominal {folder.name.replace('_', ', ')}"),
                 extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
-                accept_code_change=accept_code_change,
                 **options,
             )
         # The modes are independent: the first is trained here, the others in worker processes.

@@ -187,9 +187,8 @@ def run_twins(
     # pydrake never frees a system in Python: one loop serves every call.
     info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(
-        _twin_batch,
-        list(range(len(windows))),
-        lambda batch: (scenario, seed, [windows[i] for i in batch]),
+        partial(_twin_batch, scenario, seed),
+        list(windows),
         num_workers=num_workers,
         progress=progress,
         stage="nominal twins",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from os import PathLike
 
 from drake_safety.simulation.capabilities import (
@@ -97,9 +98,8 @@ def run_pushed_motions(
         pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
     remaining = [index for index in range(num_motions) if index not in pairs]
     results = run_batches(
-        _motion_batch,
+        partial(_motion_batch, scenario, variation, seed),
         remaining,
-        lambda batch: (scenario, variation, seed, batch),
         num_workers=num_workers,
         progress=progress,
         num_done=len(pairs),
