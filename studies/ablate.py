@@ -13,7 +13,7 @@ from rich.table import Table
 
 from drake_safety.cli.console import (
     ScenarioArgument,
-    Stages,
+    StageProgress,
     TrainingOption,
     WorkersOption,
     console,
@@ -177,7 +177,7 @@ def _sets(
     num_calibration: int,
     seeds: dict[str, int],
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
 ) -> AblationSets:
     """The training episodes and fresh ones, which are simulated and kept as needed."""
     from drake_safety.simulation.capabilities import judging_options

@@ -40,7 +40,8 @@ from drake_safety.evaluation.plan_study import (
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Table
 from drake_safety.evaluation.report.verdicts import columns_of, estimate_rows
-from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import assessment_scorer
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import score_threshold

@@ -23,8 +23,9 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import MODES, episodes_folder, load_assessment
 from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.scorers import StageProgress, classifier_scorers
+from drake_safety.evaluation.scorers import classifier_scorers
 from drake_safety.files.atomic import replacing
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes

@@ -14,7 +14,7 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ClusterOption,
     ScenarioArgument,
-    Stages,
+    StageProgress,
     WorkersOption,
     command_line,
     console,
@@ -178,7 +178,7 @@ def paired_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
 ) -> EpisodePairs:
     """Simulates pairs of actual episodes and nominal twins, and keeps them in the folder.
 
@@ -212,7 +212,7 @@ def fresh_actual_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
     what: str = "fresh actual episodes",
 ) -> Episodes:
     """Simulates other episodes of the actual plant, and keeps them in the folder.

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from drake_safety.files import progress
-from drake_safety.files.progress import Stages
+from drake_safety.files.progress import StageProgress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -200,7 +200,7 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def open_stages() -> Iterator[Stages]:
+def open_stages() -> Iterator[StageProgress]:
     """Shows progress while the block runs: bars on a terminal, a line every 10 s elsewhere."""
     with progress.open_stages(console) as stages:
         yield stages

@@ -27,7 +27,7 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import SHIFTS
 
 if TYPE_CHECKING:
-    from drake_safety.cli.console import Stages
+    from drake_safety.cli.console import StageProgress
     from drake_safety.evaluation.shift_study import ShiftResult
     from drake_safety.evaluation.shifted_motions import ShiftedSet
     from drake_safety.simulation.closed_loop import ClosedLoop
@@ -127,7 +127,7 @@ def _shifted_sets(
     num_motions: int,
     num_nominal: int,
     seed: int,
-    stages: Stages,
+    stages: StageProgress,
     workers: int | None,
 ) -> dict[str, ShiftedSet]:
     from drake_safety.evaluation.shifted_motions import (

@@ -16,7 +16,7 @@ import typer
 from drake_safety.cli.console import (
     ClusterOption,
     ScenarioArgument,
-    Stages,
+    StageProgress,
     WorkersOption,
     command_line,
     console,
@@ -133,7 +133,7 @@ def _learn(
     scenario: Scenario,
     mode: str,
     out: Path,
-    stages: Stages | None = None,
+    stages: StageProgress | None = None,
 ) -> tuple[int, str, float]:
     """Trains and saves one mode.
 
@@ -150,9 +150,9 @@ def _learn(
     from drake_safety.learning.training import segments_for
     from drake_safety.simulation.dataset import load_episodes
 
-    def report(stage: str, share: float) -> None:
+    def report(stage: str, done: int, wanted: int) -> None:
         if stages is not None:
-            stages(f"{mode}: {stage}", round(100 * share), 100)
+            stages(f"{mode}: {stage}", done, wanted)
 
     started = time.process_time()
     scenario.assessment.mode = mode

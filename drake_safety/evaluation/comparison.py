@@ -15,10 +15,10 @@ from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.evaluation.report.tables import Column, Row, Table
-from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.files.atomic import replacing
-from drake_safety.files.progress import shown
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.seeds import EVALUATION

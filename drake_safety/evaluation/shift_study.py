@@ -13,10 +13,10 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.monitoring_study import rate_per_hour
-from drake_safety.evaluation.scorers import Scorer, StageProgress
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shifted_motions import Motion, ShiftedSet
 from drake_safety.extras import require_extra
-from drake_safety.files.progress import shown
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
@@ -29,7 +30,6 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _logger = logging.getLogger("drake_safety")
 
-StageProgress = Callable[[str, float], None]
 """Called with a stage and the fraction done."""
 
 
@@ -103,14 +103,14 @@ def learned_maps(
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
         parameters: The assessment's parameters.
-        progress: Called with "distances", "t-SNE", "training" and the fraction done.
+        progress: Called with "distances", "t-SNE", "training", the percentage done and 100.
 
     Returns:
         The maps, and the base logit of their heads; None without heads.
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
-        return None if progress is None else lambda fraction: progress(name, fraction)
+        return None if progress is None else lambda done: progress(name, round(100 * done), 100)
 
     targeted = segments.take(has_target)
     num_neighbours = int(3 * parameters.perplexity)
