@@ -2,8 +2,7 @@
 
 import math
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -50,7 +49,7 @@ class Balancing(LeggedLoop):
 
     Parameters = BalancingParameters
     # "We also add a random offset to the initial state to simulate the disturbances": no ball.
-    paper_options = MappingProxyType({"ball": False})
+    paper_options: ClassVar[dict[str, Any]] = {"ball": False}
     online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 

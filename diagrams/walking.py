@@ -1,10 +1,9 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -66,7 +65,7 @@ class Walking(LeggedLoop):
     Parameters = WalkingParameters
     angular_constraints = WalkingSafeSet.angular_names
     # Commands are judged before the robot walks, and pushes are those of a run.
-    judging_options: Mapping[str, Any] = MappingProxyType({"disturbed": False})
+    judging_options: ClassVar[dict[str, Any]] = {"disturbed": False}
     online_parameters = (
         "guard",
         "recovery",

@@ -13,10 +13,6 @@ from drake_safety.simulation.capabilities import (
     HasBall,
     HasGoals,
     OffersPlans,
-    angular_constraints,
-    judging_options,
-    pairing_options,
-    rate_names,
     require,
 )
 from drake_safety.simulation.rollouts import run_episode
@@ -89,10 +85,10 @@ def test_every_required_capability_has_a_description():
 
 def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
     loop = Gliding(gliding())
-    assert angular_constraints(loop) == ()
-    assert rate_names(loop) == []
-    assert judging_options(Gliding) == {}
-    assert pairing_options(gliding(), "actual") == {}
+    assert loop.angular_constraints == ()
+    assert loop.rate_names == []
+    assert Gliding.judging_options == {}
+    assert gliding().task_class().pairing_options(gliding(), "actual") == {}
     assert loop.mirror_options == loop.state_planes == {}
     assert list(loop.check_files(loop.scenario, None)) == []
     assert run_episode(loop).num_controller_failures == 0

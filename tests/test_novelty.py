@@ -9,7 +9,6 @@ from drake_safety import SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.inputs import input_names
 from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.simulation.capabilities import judging_options
 
 ROWS, EPISODES = 20, 200
 NO_PLAN = slice(0)
@@ -182,7 +181,7 @@ def test_what_an_actual_robot_did_is_known_after_adaptation(novelty):
 @pytest.fixture(scope="module", params=["laikago_balancing", "atlas_reaching"])
 def robot(request):
     scenario = load_scenario(request.param)
-    loop = scenario.make_loop(**judging_options(scenario.task_class()))
+    loop = scenario.make_loop(**scenario.task_class().judging_options)
     context = loop.CreateDefaultContext()
     rng = np.random.default_rng(5)
     rows = []

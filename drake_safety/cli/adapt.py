@@ -227,7 +227,6 @@ def fresh_actual_episodes(
         stages: Progress bars.
         what: Name of the stage.
     """
-    from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.rollouts import run_episodes
 
     return run_episodes(
@@ -239,7 +238,7 @@ def fresh_actual_episodes(
         path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
         progress=partial(stages, what),
         extra={"command": command_line()},
-        **pairing_options(scenario, variation),
+        **scenario.task_class().pairing_options(scenario, variation),
     )
 
 

@@ -153,13 +153,12 @@ def cause_words(
         margins: Predicted margins, (n_c,) [m, rad].
     """
     from drake_safety.learning.causes import describe_margin, likely_cause
-    from drake_safety.simulation.capabilities import angular_constraints
 
     names = loop.constraint_names
     cause = likely_cause(names, masses, margins, assessment.parameters.margin_unit)
     if not cause:
         return "unknown"
-    return describe_margin(cause, margins[names.index(cause)], angular_constraints(loop))
+    return describe_margin(cause, margins[names.index(cause)], loop.angular_constraints)
 
 
 def print_path(what: str, path: Path) -> None:

@@ -81,7 +81,6 @@ def evaluate_plans(
     from drake_safety.simulation.capabilities import (
         HasGoals,
         goal_words,
-        judging_options,
         require,
     )
 
@@ -99,7 +98,7 @@ def evaluate_plans(
         # The same random draws, mirrored.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
         sets["plans.other_hand"] = plans_of(
-            scenario.make_loop(**judging_options(type(loop)), **mirror), episodes
+            scenario.make_loop(**type(loop).judging_options, **mirror), episodes
         )
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     twins = [key for key in sets if key != "plans"]

@@ -137,7 +137,6 @@ def _shifted_sets(
         shifted_scenario,
     )
     from drake_safety.evaluation.shifts import plant_shifts
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
 
     nominal = run_fresh_episodes(
@@ -146,7 +145,7 @@ def _shifted_sets(
     sets = {"nominal": of_episodes("nominal", nominal)}
     loop: ClosedLoop = scenario.make_loop()
     shifts = plant_shifts(scenario, loop)
-    options = judging_options(scenario.task_class())
+    options = scenario.task_class().judging_options
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)

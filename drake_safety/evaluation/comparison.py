@@ -23,7 +23,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
-from drake_safety.simulation.capabilities import HasBall, judging_options
+from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
@@ -100,7 +100,7 @@ def compare_scenario(
     run = partial(run_episodes, scenario, num_workers=num_workers)
     seed, robot = effort.seed, scenario.robot
     seeds = EVALUATION.seeds(EVALUATION.first + seed)
-    judging = judging_options(scenario.task_class())
+    judging = scenario.task_class().judging_options
     with shown(progress, lambda stages: stages) as given:
         report = given or (lambda stage, done, total: None)
         training = run(

@@ -16,14 +16,10 @@ from pydrake.systems.framework import Context
 # Those of Python 3.11 evaluate properties when a loop is asked for a protocol.
 from typing_extensions import Protocol, runtime_checkable
 
-from drake_safety.learning.inputs import is_rate
-from drake_safety.simulation.planned_loop import PlannedLoop
-
 if TYPE_CHECKING:
     from drake_safety.learning.segments import Episode
     from drake_safety.plants.balls import Throw
     from drake_safety.plants.pushes import Push
-    from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.episode_start import EpisodeStart
 
 _Capability = TypeVar("_Capability")
@@ -246,46 +242,6 @@ def require(loop: object, capability: type[_Capability], who: str = "") -> _Capa
         f"{who + ': ' if who else ''}task '{type(loop).__name__}' has no {missing}; "
         f"it has {', '.join(present) or 'no optional features'}"
     )
-
-
-def judging_options(task: type) -> dict[str, Any]:
-    """Options of a task's diagram for evaluation, if they differ from those of training."""
-    return dict(task.judging_options) if issubclass(task, PlannedLoop) else {}
-
-
-def paper_options(task: type) -> dict[str, Any]:
-    """Options of a task's diagram for training episodes of the paper's mode."""
-    return dict(task.paper_options) if issubclass(task, PlannedLoop) else {}
-
-
-def pairing_options(scenario: Any, variation: str) -> dict[str, Any]:
-    """Options with which a variation and its nominal twin can start alike.
-
-    Args:
-        scenario: The scenario.
-        variation: The actual plant.
-    """
-    task = scenario.task_class()
-    return task.pairing_options(scenario, variation) if issubclass(task, PlannedLoop) else {}
-
-
-def angular_constraints(loop: object) -> tuple[str, ...]:
-    """Constraints of a loop whose margins are angles [rad]; the others are lengths [m]."""
-    return tuple(getattr(loop, "angular_constraints", ()))
-
-
-def monitor_period_s(loop: ClosedLoop) -> float:
-    """Sampling period of a loop's port ``safe`` [s]; the control period by default."""
-    if isinstance(loop, PlannedLoop):
-        return loop.monitor_period_s
-    return loop.scenario.control_period_s
-
-
-def rate_names(loop: ClosedLoop) -> list[str]:
-    """States and features of a loop that depend on velocities."""
-    if isinstance(loop, PlannedLoop):
-        return loop.rate_names
-    return [*filter(is_rate, loop.state_names)]
 
 
 def goal_words(loop: HasGoals) -> GoalWords:

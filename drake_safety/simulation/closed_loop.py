@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.segments import RECORDED
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class ClosedLoop(Diagram):
         scenario: The scenario.
         variation_name, variation: The plant variation.
         assessment: The assessment, or None.
+        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
@@ -112,6 +114,16 @@ class ClosedLoop(Diagram):
 
     online_parameters: tuple[str, ...] = ()
     """Parameters on which no episode depends; the scenario's hash leaves them out."""
+
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; the others are lengths [m]."""
+
+    judging_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for evaluation, if they differ from training's."""
+
+    paper_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for training episodes of the paper's mode, which has no disturbances
+    but the offsets of the initial state."""
 
     state_names: list[str]
     output_names: list[str]
@@ -124,6 +136,19 @@ class ClosedLoop(Diagram):
         self.variation_name = variation
         self.variation = scenario.variation(variation)
         self.assessment = assessment
+        self.monitor_period_s = scenario.control_period_s
+
+    @classmethod
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
+        del robot
+        return stated
+
+    @classmethod
+    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+        """Options with which an actual variation and its nominal twin can start alike."""
+        del scenario, variation
+        return {}
 
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
@@ -136,6 +161,11 @@ class ClosedLoop(Diagram):
         """Findings about the task's own files, which ``check`` checks before the diagram."""
         del scenario, kinematics
         return ()
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that depend on velocities."""
+        return [*filter(is_rate, self.state_names)]
 
     @property
     def mirror_options(self) -> dict[str, Any]:

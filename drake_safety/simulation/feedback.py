@@ -17,7 +17,7 @@ from drake_safety.files.progress import shown
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require
+from drake_safety.simulation.capabilities import CanStartAnywhere, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
@@ -80,12 +80,12 @@ def run_pairs(
         progress: Called with the number of episodes done and in all, two per pair; True shows it.
         extra: Stored with the episodes' info.
         **loop_options: Options of the task; they replace those of
-            :func:`~drake_safety.simulation.capabilities.pairing_options`.
+            ``pairing_options`` of the task.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
     """
-    loop_options = pairing_options(scenario, variation) | loop_options
+    loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
     with shown(progress, lambda stages: partial(stages, "episodes and their twins")) as report:
 

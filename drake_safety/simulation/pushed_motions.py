@@ -9,7 +9,6 @@ from os import PathLike
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     HasGoals,
-    judging_options,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -92,7 +91,7 @@ def run_pushed_motions(
     pairs: dict[int, Pair] = {}
     folder = None
     if path is not None:
-        options = judging_options(scenario.task_class())
+        options = scenario.task_class().judging_options
         loop = scenario.make_loop(variation, **options)
         folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
         pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
@@ -114,5 +113,5 @@ def run_pushed_motions(
 
 
 def _motion_batch(scenario: Scenario, variation: str, seed: int, indices: list[int]) -> list[Pair]:
-    loop = worker_loop(scenario, variation, judging_options(scenario.task_class()))
+    loop = worker_loop(scenario, variation, scenario.task_class().judging_options)
     return [run_pushed_motion(loop, index, seed=seed) for index in indices]

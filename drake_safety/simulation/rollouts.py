@@ -26,7 +26,6 @@ from drake_safety.simulation.capabilities import (
     CanStartAnywhere,
     HasGoals,
     OffersPlans,
-    monitor_period_s,
     require,
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
@@ -138,7 +137,7 @@ def run_episode(
         EpisodeTiming(
             step_s=scenario.step_s,
             num_steps=scenario.num_steps,
-            monitor_period_s=monitor_period_s(loop),
+            monitor_period_s=loop.monitor_period_s,
         ),
         constraint_names=loop.constraint_names,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",

@@ -23,7 +23,6 @@ from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.planned_loop import PlannedLoop
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -376,7 +375,7 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
     scenario, parameters = _parsed(text, name, folder)
     scenario.folder = task_folder
     task = scenario.task_class()
-    if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
+    if isinstance(parameters, dict):
         parameters = task.complete_parameters(scenario.robot, parameters)
     scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
     return scenario

@@ -105,9 +105,9 @@ def parallel_map(
             "on the command line --workers"
         )
     num_workers = num_workers or joblib.cpu_count()
-    calls = [(_called, (function, args, _versions()), {}) for args in arguments]
-    if is_local and (num_workers == 1 or len(calls) <= 1):
-        yield from (call(*args) for call, args, _ in calls)
+    call = partial(_called, _versions(), function)
+    if is_local and (num_workers == 1 or len(arguments) <= 1):
+        yield from (call(*args) for args in arguments)
         return
     local = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
     with (
@@ -115,7 +115,9 @@ def parallel_map(
         if is_local
         else nullcontext()
     ):
-        results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
+        results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
+            joblib.delayed(call)(*args) for args in arguments
+        )
         try:
             for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
                 yield result
@@ -138,7 +140,7 @@ def parallel_map(
             raise
 
 
-def _called(function: Callable[..., Any], arguments: tuple, versions: dict[str, str]) -> Any:
+def _called(versions: dict[str, str], function: Callable[..., Any], *arguments: Any) -> Any:
     from threadpoolctl import threadpool_limits
 
     here = _versions()
