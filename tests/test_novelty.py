@@ -137,15 +137,6 @@ def test_inputs_that_are_all_alike_are_known_and_others_are_not():
     assert alike.of(np.array([[1.0, 3.0]]))[0] > 1.0
 
 
-@pytest.mark.parametrize("limits", [[1.0], [1.0, 1.0, 0.0], [1.0, 1.0, float("nan")]])
-def test_a_file_whose_limits_are_none_is_refused(robot, limits, tmp_path):
-    assessment = load_assessment(robot[0], "paper")
-    assessment.novelty_.limits = np.array(limits)
-    assessment.save(tmp_path / "forged.safetensors")
-    with pytest.raises(ValueError, match=r"limits of novelty are .* expected 3 positive numbers"):
-        SafetyAssessment.load(tmp_path / "forged.safetensors")
-
-
 def test_the_entry_that_contradicts_the_others_is_named(novelty):
     x = np.array([0.5, 50.0, 1.0, 7.0])
     assert np.abs(novelty.contradictions(x)).max() < 3.0
