@@ -12,7 +12,7 @@ from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 
 class RecoverySwitch(Diagram):
-    """Passes the nominal set point until Γ falls below its threshold, then recovery steps.
+    """Passes the nominal set point until the probability is below a threshold, then recovery steps.
 
     .. pydrake_system::
 
@@ -40,12 +40,12 @@ class RecoverySwitch(Diagram):
     Args:
         kinematics: The controller's model of the robot.
         parameters: Parameters of the recovery steps.
-        threshold: Γ_thre, of what ``safety_probability`` is connected to; see
-            :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
-        persistence_s: Time for which Γ must have been below it while nothing is known [s].
+        threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
+        persistence_s: See there.
+        initial_uncertainty: See there.
         period_s: Period of trigger and step planner [s].
-        offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].
-            Simultaneous discrete updates would add a period of delay each.
+        offset_s: Delay of the trigger after the assessor, and of the step planner after the
+            trigger [s]. Simultaneous discrete updates would add a period of delay each.
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """
@@ -57,6 +57,7 @@ class RecoverySwitch(Diagram):
         *,
         threshold: float,
         persistence_s: float = 0.0,
+        initial_uncertainty: float = 0.3,
         period_s: float,
         offset_s: float,
         horizon: int,
@@ -69,6 +70,7 @@ class RecoverySwitch(Diagram):
             RecoveryTrigger(
                 threshold=threshold,
                 persistence_s=persistence_s,
+                initial_uncertainty=initial_uncertainty,
                 period_s=period_s,
                 offset_s=offset_s,
             ),
