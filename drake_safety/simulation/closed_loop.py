@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
@@ -15,10 +15,9 @@ from drake_safety.learning.segments import RECORDED
 if TYPE_CHECKING:
     from drake_safety.control.kinematics import RobotKinematics
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.assessment_parameters import AssessmentParameters
-    from drake_safety.robots.robot import PlantVariation
     from drake_safety.simulation.contract import Finding
     from drake_safety.simulation.episode_start import StatePlane
+    from drake_safety.simulation.scenario import Scenario
     from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
@@ -37,35 +36,6 @@ _SIZED_BY = {
     "features": "feature_names",
     "margins": "constraint_names",
 }
-
-
-class LoopScenario(Protocol):
-    """The part of a :class:`~drake_safety.simulation.scenario.Scenario` that a loop reads."""
-
-    name: str
-    task: str
-    robot: str
-    episode_duration_s: float
-    step_s: float
-    time_step_s: float
-    control_period_s: float
-    on_alarm: str
-    assessment: AssessmentParameters
-    parameters: Any
-
-    @property
-    def num_steps(self) -> int:
-        """Rows after the first one of a whole episode."""
-
-    @property
-    def preview_step_s(self) -> float:
-        """Time between two samples of the preview [s]."""
-
-    def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name."""
-
-    def simulation_hash(self, variation: str = "nominal") -> str:
-        """A digest of all parameters that determine a rollout."""
 
 
 class ClosedLoop(Diagram):
@@ -130,7 +100,7 @@ class ClosedLoop(Diagram):
     feature_names: list[str]
     constraint_names: list[str]
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
         self.scenario = scenario
         self.variation_name = variation
@@ -145,19 +115,19 @@ class ClosedLoop(Diagram):
         return stated
 
     @classmethod
-    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Options with which an actual variation and its nominal twin can start alike."""
         del scenario, variation
         return {}
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
 
     @classmethod
-    def check_files(cls, scenario: LoopScenario, kinematics: RobotKinematics) -> Iterable[Finding]:
+    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterable[Finding]:
         """Findings about the task's own files, which ``check`` checks before the diagram."""
         del scenario, kinematics
         return ()
