@@ -122,7 +122,7 @@ def compare_scenario(
         )
         assessment = SafetyAssessment(scenario.assessment).fit(
             training,
-            lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
+            lambda stage, done, total: report(f"{scenario.name}: {stage}", done, total),
         )
         assessment.save(folder / "sharpened.safetensors")
         scorer = assessment_scorer("sharpened", assessment)
