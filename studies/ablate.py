@@ -13,7 +13,6 @@ from rich.table import Table
 
 from drake_safety.cli.console import (
     ScenarioArgument,
-    StageProgress,
     TrainingOption,
     WorkersOption,
     console,
@@ -30,6 +29,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from studies import command_line
 

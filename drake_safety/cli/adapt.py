@@ -14,7 +14,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ClusterOption,
     ScenarioArgument,
-    StageProgress,
     WorkersOption,
     command_line,
     console,
@@ -35,6 +34,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:

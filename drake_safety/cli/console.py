@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shlex
 import sys
-from collections.abc import Iterator
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +15,6 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from drake_safety.files import progress
-from drake_safety.files.progress import StageProgress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -177,8 +175,5 @@ def versions() -> dict[str, str]:
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
-@contextlib.contextmanager
-def open_stages() -> Iterator[StageProgress]:
-    """Shows progress while the block runs: bars on a terminal, a line every 10 s elsewhere."""
-    with progress.open_stages(console) as stages:
-        yield stages
+open_stages = partial(progress.open_stages, console)
+"""Shows progress while a block runs: bars on a terminal, a line every 10 s elsewhere."""

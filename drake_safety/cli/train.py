@@ -16,7 +16,6 @@ import typer
 from drake_safety.cli.console import (
     ClusterOption,
     ScenarioArgument,
-    StageProgress,
     WorkersOption,
     command_line,
     console,
@@ -31,6 +30,7 @@ from drake_safety.cli.training_folder import (
     episodes_folder,
     training_options,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import TRAINING
 
 if TYPE_CHECKING:

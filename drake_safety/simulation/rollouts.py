@@ -244,14 +244,7 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    Args:
-        info: Metadata of the set.
-        num_episodes: Size of the set.
-        simulate: Simulates the episodes of some indices; called in worker processes.
-        num_workers: See :func:`run_episodes`, as for all that follow.
-        path: The folder.
-        progress: The callback.
-        extra: Stored with the info.
+    ``simulate`` returns the episodes of some indices; for the rest see :func:`run_episodes`.
     """
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
