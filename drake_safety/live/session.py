@@ -24,7 +24,6 @@ from drake_safety.simulation.capabilities import (
     CanFall,
     HasBall,
     HasGoals,
-    angular_constraints,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
@@ -391,7 +390,7 @@ class LiveGoals(LiveSession):
         first = f"refused: probability {verdict.probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
-        cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))
+        cause = describe_margin(verdict.cause, verdict.cause_margin, self.loop.angular_constraints)
         note = "" if cause else verdict.reason
         if is_thorough:
             found = "nothing near is accepted"
