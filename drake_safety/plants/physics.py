@@ -39,7 +39,6 @@ from drake_safety.plants.obstacles import (
     collision_geometries,
     filter_collisions,
 )
-from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot import (
     PlantVariation,
@@ -94,7 +93,7 @@ class DrakePhysics:
         )
         plant, scene_graph = AddMultibodyPlant(config, builder)
         instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
-        self._robot, self._variation, self._time_step_s = robot, variation, time_step_s
+        self._robot, self._variation = robot, variation
         self.plant: MultibodyPlant = plant
         self.scene_graph: SceneGraph = scene_graph
         self.instance = instance
@@ -111,7 +110,6 @@ class DrakePhysics:
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
         """Connects torques in actuator order to a robot without servos."""
-        torques = self._delayed(builder, torques)
         builder.Connect(torques, self.plant.get_actuation_input_port(self.instance))
         if self._variation.joint_friction_nm:
             # Without a desired state Drake deactivates the servos that model dry friction.
@@ -126,24 +124,12 @@ class DrakePhysics:
 
         Actuators that model dry friction get a desired velocity of zero.
         """
-        desired_joint_state = self._delayed(builder, desired_joint_state)
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
         builder.Connect(
             servos.get_output_port(), self.plant.get_desired_state_input_port(self.instance)
         )
-
-    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
-        """Adds the variation's delay of the command."""
-        delay_s = 0.0 if self._variation.shift is None else self._variation.shift.command_delay_s
-        if not delay_s:
-            return command
-        delay = builder.AddNamedSystem(
-            "command_delay", SampledDelay(command.size(), delay_s, period_s=self._time_step_s)
-        )
-        builder.Connect(command, delay.get_input_port())
-        return delay.get_output_port()
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
