@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -59,7 +60,7 @@ class LivePanel:
     """What every viewer of a session sees and controls; the session and a page share it.
 
     The session runs in one thread and the page in another. Each of them replaces whole values,
-    which needs no lock.
+    which needs no lock; only a click is taken by the one and made by the other.
 
     Args:
         title: Title of the page.
@@ -87,6 +88,7 @@ class LivePanel:
         self._values: dict[str, float] = {}
         self.is_stopped = False
         self._clicks: set[str] = set()
+        self._clicking = threading.Lock()
         self._history: deque[tuple[float, float]] = deque()
 
     def add_button(self, name: str, key: str = "") -> None:
@@ -100,12 +102,14 @@ class LivePanel:
 
     def click(self, name: str) -> None:
         """Clicks a button; clicks before the next :meth:`take_click` count as one."""
-        self._clicks.add(name)
+        with self._clicking:
+            self._clicks.add(name)
 
     def take_click(self, name: str) -> bool:
         """Whether a button was clicked since the last call."""
-        is_clicked = name in self._clicks
-        self._clicks.discard(name)
+        with self._clicking:
+            is_clicked = name in self._clicks
+            self._clicks.discard(name)
         return is_clicked
 
     def set_value(self, name: str, value: Any) -> None:
