@@ -65,7 +65,7 @@ class Scene:
 
 
 class DrakePhysics:
-    """Physics by a MultibodyPlant; see :func:`add_physics`.
+    """Physics by a MultibodyPlant; :func:`add_physics` makes it.
 
     Attributes:
         plant, scene_graph, instance: The plant, its scene graph and the robot's model instance.
@@ -133,22 +133,14 @@ class DrakePhysics:
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """Context manager for writing the plant's Context, with the variation's masses set.
-
-        Args:
-            context: The root Context of the diagram.
-        """
+        """Context manager for writing the plant's part of a root Context, masses set."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         apply_masses(self.plant, plant_context, self._robot, self._variation)
         yield plant_context
 
 
 class MujocoPhysics:
-    """Physics by MuJoCo, with the interface of DrakePhysics; see :func:`add_physics`.
-
-    Raises:
-        ValueError: The scene has a ball, or MuJoCo cannot simulate the robot or its scene.
-    """
+    """Physics by MuJoCo, with the interface of DrakePhysics; no balls and no shifts."""
 
     def __init__(
         self,
@@ -206,11 +198,7 @@ class MujocoPhysics:
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """Context manager for writing a Context of the Drake plant, copied to MuJoCo's state.
-
-        Args:
-            context: The root Context of the diagram.
-        """
+        """Context manager for writing a Context of the Drake plant, copied to MuJoCo's state."""
         system_context = self._system.GetMyMutableContextFromRoot(context)
         plant_context = self.plant.CreateDefaultContext()
         state = self.state.Eval(system_context)
@@ -223,10 +211,6 @@ class MujocoPhysics:
 Physics = DrakePhysics | MujocoPhysics
 ENGINES_WITH_BALLS = ("drake",)
 """Engines that can simulate a thrown ball."""
-_ENGINES: dict[str, type[DrakePhysics] | type[MujocoPhysics]] = {
-    "drake": DrakePhysics,
-    "mujoco": MujocoPhysics,
-}
 
 
 def add_physics(
@@ -248,24 +232,16 @@ def add_physics(
         time_step_s: Step of the discrete plant [s].
         servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
 
-    Returns:
-        The plant and its ports.
-
     Raises:
         ValueError: A body, joint or file does not exist, a leg or an arm has no motors, a
             decoration has collision geometry, or the engine cannot simulate the scene.
     """
-    physics = _ENGINES[variation.engine]
-    return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
+    engine = {"drake": DrakePhysics, "mujoco": MujocoPhysics}[variation.engine]
+    return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
 
 
 def add_ground(plant: MultibodyPlant, friction: float) -> None:
-    """Adds level ground at z = 0 to a plant that is not finalised.
-
-    Args:
-        plant: The plant.
-        friction: Friction coefficient, static and dynamic.
-    """
+    """Adds level ground at z = 0, with a friction coefficient, to a plant not yet finalised."""
     # The URDF is the visual; the collision shape is an infinite half space.
     package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ground.urdf")
     plant.RegisterCollisionGeometry(
@@ -275,10 +251,6 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
         "ground",
         CoulombFriction(friction, friction),
     )
-
-
-def _friction(robot: RobotModel, variation: PlantVariation) -> float:
-    return variation.foot_friction or robot.foot_friction
 
 
 def _incline(plant: MultibodyPlant, shift: Shift) -> None:
@@ -299,8 +271,7 @@ def _dig_holes(
     friction: float,
 ) -> None:
     """Lowers the ground under some feet."""
-    if not depths_m:
-        return
+    material = CoulombFriction(friction, friction)
     holes = {}
     for name, depth_m in depths_m.items():
         if name not in robot.feet:
@@ -308,10 +279,8 @@ def _dig_holes(
                 f"robot '{robot.name}' has no foot '{name}' for a hole; it has {list(robot.feet)}"
             )
         X_WH = RigidTransform([0.0, 0.0, -depth_m])
-        material = CoulombFriction(friction, friction)
-        shape = f"hole_{name}"
         holes[name] = plant.RegisterCollisionGeometry(
-            plant.world_body(), X_WH, HalfSpace(), shape, material
+            plant.world_body(), X_WH, HalfSpace(), f"hole_{name}", material
         )
     # After the registrations, which invalidate earlier lists of identifiers.
     everything = plant.GetCollisionGeometriesForBody(plant.world_body())
@@ -344,10 +313,12 @@ def _furnish(
     config.default_proximity_properties.resolution_hint = None
     scene_graph.set_config(config)
     instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
-    add_ground(plant, _friction(robot, variation))
+    friction = variation.foot_friction or robot.foot_friction
+    add_ground(plant, friction)
     ball = add_ball(plant) if scene.has_ball else None
     shift = variation.shift or Shift()
-    _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, _friction(robot, variation))
+    if shift.holes_m:
+        _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
     if shift.slope_rad:
         _incline(plant, shift)
     obstacles = add_obstacles(plant, list(scene.obstacles or ()))
