@@ -26,14 +26,7 @@ _UNKNOWN = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Status:
-    """The text of a page.
-
-    Attributes:
-        state: What the robot does.
-        cause: The expected violation; "" for none.
-        note: A remark, such as the last ball; "" for none.
-        tone: A key of `COLOURS`.
-    """
+    """What the robot does, the expected violation, a remark, and a key of `COLOURS`."""
 
     state: str = ""
     cause: str = ""
@@ -43,13 +36,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Slider:
-    """Range of a slider.
-
-    Attributes:
-        low: Lowest value.
-        high: Highest value.
-        step: Distance of neighbouring values.
-    """
+    """Range of a slider, and the distance of neighbouring values."""
 
     low: float
     high: float
@@ -121,14 +108,7 @@ class LivePanel:
         return self._values[name]
 
     def show(self, state: str, *, cause: str = "", note: str = "", tone: str = "plain") -> None:
-        """Shows text.
-
-        Args:
-            state: See :class:`Status`, as the others.
-            cause: See there.
-            note: See there.
-            tone: See there.
-        """
+        """Shows text; see `Status`."""
         self.status = Status(state, cause, note, tone)
 
     def show_belief(
