@@ -159,6 +159,7 @@ class Walking(LeggedLoop):
                 measured=measured,
                 command=desired["desired_output"],
             )
+        joint_state = self._delayed(builder, joint_state)
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
         self._watch(

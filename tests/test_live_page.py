@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 
@@ -39,6 +40,23 @@ def test_a_click_counts_once_whoever_clicked(panel):
     assert not panel.take_click("Stop")
     assert panel.take_click("Throw")
     assert not panel.take_click("Throw")
+
+
+def test_a_click_while_the_session_looks_is_not_lost(panel):
+    clicking = threading.Thread(target=panel.click, args=("Throw",))
+
+    class SlowlyRead(set):
+        def __contains__(self, name):
+            is_in = super().__contains__(name)
+            if not clicking.ident:
+                clicking.start()
+                clicking.join(0.2)
+            return is_in
+
+    panel._clicks = SlowlyRead()
+    assert not panel.take_click("Throw")
+    clicking.join()
+    assert panel.take_click("Throw")
 
 
 @pytest.mark.parametrize("sent", [-1.0, math.nan, math.inf, 1e308, None, "2", [2.0]])
