@@ -37,23 +37,6 @@ def problems(scenario, **options):
     return {f.item: f for f in check_scenario(scenario, **options) if not f.is_ok}
 
 
-def stated_values(remedy):
-    """The entries that a remedy says to write."""
-    entries = re.search(
-        r"(?:write|such as|try under 'start':) (.*?)(?: \[rad| \[N|; if|$)", remedy
-    )[1]
-    return yaml.safe_load("{" + entries + "}")
-
-
-def follow(file, key, remedy):
-    """Writes under a key of robot.yaml what a remedy says."""
-    kept = yaml.safe_load(file.read_text())[key]
-    replaced = re.search(r"in place of (\[.*?\])", remedy)
-    for pattern in yaml.safe_load(replaced[1]) if replaced else []:
-        del kept[pattern]
-    edited(file, **{key: kept | stated_values(remedy)})
-
-
 def test_what_new_writes_passes_its_check_as_it_is(spider):
     assert problems(spider.folder / "balancing.yaml", num_episodes=4) == {}
 
@@ -113,23 +96,63 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "item", "message"),
+    ("change", "item", "message", "remedy"),
     [
-        ({"base": "trunk"}, "bodies and joints", "has no body 'trunk'"),
-        ({"urdf": "gone.urdf"}, "files", "not found"),
-        ({"feed": {}}, "robot.yaml", "unknown key 'feed'"),
-        ({"posture": {"lift_0": 0.9}}, "feet level", "hang up to"),
-        ({"joint_gains": {"lift_.*": {"stiffness": 50.0}}}, "servo gains", "'swing_0'"),
-        ({"effort_limits": {".*": 0.01}}, "effort against gravity", "of 0.0 N·m"),
-        ({"effort_limits": {}}, "motors", "have none"),
-        ({"effort_limits": {}}, "diagram", "have no motor: 'spider.urdf' has no transmission"),
+        ({"base": "trunk"}, "bodies and joints", "has no body 'trunk'", "the message"),
+        ({"urdf": "gone.urdf"}, "files", "not found", "'urdf'"),
+        ({"feed": {}}, "robot.yaml", "unknown key 'feed'", "the message"),
+        (
+            {"posture": {"knee_.*": 1.6, "knee_0": 9.0}},
+            "bodies and joints",
+            "matches ['knee_.*', 'knee_0']",
+            "the message",
+        ),
+        (
+            {"posture": {"knee_0": 9.0}},
+            "joint stops",
+            "knee_0 at 9, between -2.5 and 2.5",
+            "'posture' in robot.yaml [rad]",
+        ),
+        ({"posture": {"lift_0": 0.9}}, "feet level", "hang up to", "'posture' in robot.yaml [rad]"),
+        (
+            {"joint_gains": {"lift_.*": {"stiffness": 50.0}}},
+            "servo gains",
+            "'swing_0'",
+            "'joint_gains'",
+        ),
+        ({"effort_limits": {".*": 0.01}}, "effort against gravity", "of 0.0 N·m", "limits"),
+        ({"effort_limits": {}}, "motors", "have none", "'effort_limits' in robot.yaml [N·m]"),
+        (
+            {"effort_limits": {}},
+            "diagram",
+            "have no motor: 'spider.urdf' has no transmission",
+            "the message",
+        ),
+        (
+            {"joint_gains": {".*": {"stiffness": 0.05, "damping": 0.05}}},
+            "stands for 1 s",
+            "it has sunk",
+            "raise 'joint_gains' in robot.yaml",
+        ),
     ],
 )
-def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(own, change, item, message):
+def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(
+    own, change, item, message, remedy
+):
     edited(own / "robot.yaml", **change)
-    found = problems(own / "balancing.yaml")
-    assert message in found[item].message
-    assert found[item].remedy
+    found = problems(own / "balancing.yaml")[item]
+    assert message in found.message
+    assert remedy in found.remedy
+
+
+def test_feet_that_do_not_surround_the_centre_of_mass_are_found(own):
+    robot = yaml.safe_load((own / "robot.yaml").read_text())
+    names = list(robot["feet"])
+    # On one line.
+    edited(own / "robot.yaml", feet={name: robot["feet"][name] for name in (names[0], names[3])})
+    found = problems(own / "balancing.yaml")["centre of mass over the feet"]
+    assert "outside their polygon, at (" in found.message
+    assert "'contact_points' under 'feet' [m]" in found.remedy
 
 
 def test_a_base_that_no_ball_can_hit_is_found_before_one_is_thrown(own):
@@ -292,11 +315,6 @@ def test_a_contact_point_without_its_sphere_is_found(own):
     )
 
 
-def test_servos_that_are_too_soft_show_in_the_simulation(own):
-    edited(own / "robot.yaml", joint_gains={".*": {"stiffness": 0.05, "damping": 0.05}})
-    assert "it has sunk" in problems(own / "balancing.yaml")["stands for 1 s"].message
-
-
 def test_a_safe_set_of_another_size_is_found_before_any_episode(own):
     scenario = yaml.safe_load((own / "balancing.yaml").read_text())
     scenario["parameters"]["safe_set"] = {"height_m": [0.8, 0.9]}
@@ -318,8 +336,8 @@ def test_starts_without_danger_are_told_to_be_widened(own):
     edited(own / "balancing.yaml", **scenario)
     found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
     assert found.message.startswith("0 % of 2 episodes")
-    assert "widen the starts and plans" in found.remedy
-    assert stated_values(found.remedy) == {"velocity_std_m_s": [0.015, 0.015, 0.015]}
+    assert "expected 10 to 90 %" in found.message
+    assert "widen the ranges of starts and plans in the scenario" in found.remedy
 
 
 def test_a_scenario_that_is_no_yaml_or_does_not_exist_is_a_finding(tmp_path):
@@ -351,65 +369,3 @@ def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_mend_it(own)
     edited(own / "robot.yaml", base="trunk")
     result = CliRunner().invoke(app, ["check", str(own / "balancing.yaml"), "--episodes", "0"])
     assert result.exit_code == 1
-
-
-@pytest.mark.parametrize(
-    ("change", "item", "key"),
-    [
-        ({"posture": {"knee_0": 9.0, "lift_0": -0.4}}, "joint stops", "posture"),
-        ({"posture": {"knee_.*": 9.0, "lift_0": -0.4}}, "joint stops", "posture"),
-        ({"posture": {"lift_0": 0.9}}, "feet level", "posture"),
-        (
-            {"posture": {"lift_.*": -0.4, "knee_[0-4]": 1.6, "knee_5": 0.9}},
-            "feet level",
-            "posture",
-        ),
-        ({"effort_limits": {}}, "motors", "effort_limits"),
-        (
-            {"joint_gains": {".*": {"stiffness": 0.05, "damping": 0.05}}},
-            "stands for 1 s",
-            "joint_gains",
-        ),
-    ],
-)
-def test_the_values_of_a_remedy_are_keys_of_robot_yaml_and_mend_it(own, change, item, key):
-    edited(own / "robot.yaml", **change)
-    found = problems(own / "balancing.yaml")[item]
-    assert f"'{key}'" in found.remedy
-    for _ in range(12):  # Gains are doubled at each check.
-        follow(own / "robot.yaml", key, found.remedy)
-        found = problems(own / "balancing.yaml").get(item)
-        if found is None:
-            return
-    raise AssertionError(found.message)
-
-
-def test_feet_beside_the_centre_of_mass_come_with_a_posture_that_moves_them_below_it(tmp_path):
-    write_porter(tmp_path)
-    written = write_robot("carrier", tmp_path / "porter.urdf", "reaching", tmp_path / "carrier")
-    file = written.folder / "robot.yaml"
-    posture = yaml.safe_load(file.read_text())["posture"]
-    for side in ("left", "right"):  # The feet stay level, far ahead of the robot.
-        posture[f"{side}_hip_y"] -= 0.5
-        posture[f"{side}_ankle_y"] += 0.5
-    edited(file, posture=posture)
-    items = {"centre of mass over the feet", "base over the feet"}
-    found = problems(written.folder / "reaching.yaml")
-    assert items <= set(found)
-    (shift,) = {re.search(r"moves the feet by \((\S+), ", found[item].remedy)[1] for item in items}
-    assert float(shift) < -0.1
-    follow(file, "posture", found["base over the feet"].remedy)
-    assert problems(written.folder / "reaching.yaml") == {}
-
-
-def test_where_no_posture_is_found_a_remedy_says_what_to_look_at(own):
-    robot = yaml.safe_load((own / "robot.yaml").read_text())
-    names = list(robot["feet"])
-    feet = {name: robot["feet"][name] for name in (names[0], names[3])}  # On one line.
-    edited(own / "robot.yaml", feet=feet)
-    remedy = problems(own / "balancing.yaml")["centre of mass over the feet"].remedy
-    assert "no posture was found" in remedy and "'contact_points' under 'feet'" in remedy
-    robot["feet"][names[0]]["contact_points"] = [[3.0, 0.0, 0.0]]  # Too long a leg.
-    edited(own / "robot.yaml", feet=robot["feet"])
-    remedy = problems(own / "balancing.yaml")["feet level"].remedy
-    assert "no posture was found within the joint stops" in remedy and "'contact_points'" in remedy
