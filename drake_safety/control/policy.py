@@ -17,7 +17,7 @@ from drake_safety.control.policy_terms import (
     observation_term,
     registered_terms,
 )
-from drake_safety.robots.model_files import required_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, by_pattern
 
 __all__ = [
@@ -396,7 +396,7 @@ def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
     """
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
-    return required_file(parameters.network, folder, parameters.requires)
+    return model_file(parameters.network, folder, parameters.requires)
 
 
 def _wrapped(phases: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from drake_safety.control.policy import (
 )
 from drake_safety.control.policy_network import load_network
 from drake_safety.control.rl_sar_policy import from_rl_sar, is_rl_sar
-from drake_safety.robots.model_files import required_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.reading import parse_yaml, reading
 from drake_safety.robots.robot_model import RobotModel, by_pattern, load_typed
 
@@ -81,7 +81,7 @@ def read_policy_file(path: Path, joint_names: list[str] | None = None) -> Policy
     source = path if is_isaac_lab(raw) or is_rl_sar(raw) else None
     stated: Any = {} if source else raw
     if isinstance(stated, dict) and stated.get("read"):
-        source = required_file(str(stated["read"]), folder, str(stated.get("requires", "")))
+        source = model_file(str(stated["read"]), folder, str(stated.get("requires", "")))
         files.append(source)
     if source is not None:
         # Unknown keys and values of wrong types are told before anything is read.

@@ -50,15 +50,6 @@ def is_shown(path: Path) -> bool:
     return path.suffix.lower() != ".obj" or not _is_transparent(path.with_suffix(".mtl"))
 
 
-def has_own_colours(path: Path) -> bool:
-    """Whether a mesh that Drake renders without conversion has materials of its own.
-
-    Args:
-        path: The mesh.
-    """
-    return is_shown(path) and path.with_suffix(".mtl").is_file()
-
-
 @lru_cache(maxsize=1024)
 def _is_transparent(materials: Path) -> bool:
     """Whether all materials of an MTL file are fully transparent."""

@@ -161,10 +161,6 @@ class RobotModel:
     requires: str = ""
     """Requirement by which pip installs the package of ``urdf`` without its dependencies, if no
     extra does."""
-    visuals: str = ""
-    """``package://…`` of a URDF whose visuals replace those of links with the same names, if its
-    package is installed. Its frames must equal those of ``urdf``, itself a URDF. Simulations do not
-    depend on it."""
     base: str = ""
     """Floating base body."""
     posture: dict[str, float] = field(default_factory=dict)

@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.fitted_shapes import FittedShape
-from drake_safety.robots.mesh_cache import has_own_colours, is_shown, shown_mesh
+from drake_safety.robots.mesh_cache import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
 _DRAKE = "http://drake.mit.edu"
@@ -139,52 +139,6 @@ class UrdfCopy:
                 is_converted = Path(replacement).suffix != Path(url).suffix
                 if material is not None and is_converted:
                     visual.remove(material)
-
-    def take_visuals(self, other: UrdfCopy) -> None:
-        """Replaces the visuals of links by those of another URDF's links of the same name.
-
-        Links without visuals in the other URDF keep their own.
-
-        Args:
-            other: The other URDF, with the same frames.
-
-        Raises:
-            ValueError: The origins of a replaced link's joint differ.
-        """
-        own_joints, their_joints = (
-            {
-                child.get("link"): origin_of(joint)
-                for joint in urdf.root.findall("joint")
-                if (child := joint.find("child")) is not None
-            }
-            for urdf in (self, other)
-        )
-        for colour in other.root.iter("material"):
-            # Both URDFs may use one name for different colours.
-            if colour.get("name"):
-                colour.set("name", f"visuals_{colour.get('name')}")
-        self.root.extend(other.root.findall("material"))
-        links = {link.get("name", ""): link for link in self.root.findall("link")}
-        for theirs in other.root.findall("link"):
-            name, visuals = theirs.get("name", ""), theirs.findall("visual")
-            if name not in links or not visuals:
-                continue
-            here, there = own_joints.get(name), their_joints.get(name)
-            if here is not None and there is not None and not np.allclose(here, there, atol=1e-6):
-                raise ValueError(
-                    f"the visuals of link '{name}' in '{other.source}' do not fit '{self.source}': "
-                    f"its joint's origin is {there}, expected {here}"
-                )
-            _remove(links[name], "visual")
-            for visual in visuals:
-                mesh, material = visual.find("geometry/mesh"), visual.find("material")
-                if mesh is not None:
-                    path = model_file(mesh.get("filename", ""), str(other.source.parent))
-                    mesh.set("filename", str(path.resolve()))
-                    # Drake warns of a second material.
-                    if material is not None and has_own_colours(path):
-                        visual.remove(material)
-                links[name].append(visual)
 
     def convert_visual_meshes(self) -> None:
         """Replaces visual meshes that Drake does not render by glTF files in the user's cache.

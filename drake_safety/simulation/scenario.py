@@ -5,7 +5,6 @@ import hashlib
 import importlib
 import inspect
 import math
-import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator
@@ -191,7 +190,7 @@ class Scenario:
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
-            digest.update(_LOOKS.sub(b"", Path(path).read_bytes()))
+            digest.update(Path(path).read_bytes())
         return digest.hexdigest()
 
     def code_digest(self) -> str:
@@ -238,10 +237,6 @@ def own_files(module: ModuleType) -> set[Path]:
         names = {getattr(value, "__module__", None) for value in vars(one).values()}
         waiting += [sys.modules[name] for name in names if name in sys.modules]
     return set(files)
-
-
-_LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
-"""Lines of a robot.yaml that do not affect a simulation."""
 
 
 def _takes(task: type[ClosedLoop], name: str) -> bool:
