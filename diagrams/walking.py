@@ -14,6 +14,7 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.policy import network_file
 from drake_safety.control.policy_files import (
     load_policy,
     missing_entries,
@@ -214,8 +215,9 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: LoopScenario) -> list[Path]:
         """The robot's files and those of the policy."""
-        policy = read_policy_file(policy_file(scenario))
-        return [*super().model_files(scenario), *policy.files, policy.network]
+        path = policy_file(scenario)
+        network = network_file(read_policy_file(path), str(path.parent))
+        return [*super().model_files(scenario), path, network]
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:

@@ -62,6 +62,13 @@ def new(
             dir_okay=False,
         ),
     ] = None,
+    motors: Annotated[
+        str | None,
+        typer.Option(
+            help="Joints in the order of the robot's motors, with commas, for a deploy.yaml, which "
+            "numbers them."
+        ),
+    ] = None,
     feet: Annotated[
         str | None,
         typer.Option(help="Links that touch the ground, with commas; the lowest by default."),
@@ -81,17 +88,14 @@ def new(
             f"policy {policy}"
         )
     # Before anything is written.
-    template = None if policy is None else survey_policy(policy)
-    moved: list[str] | None = []
-    if template is not None:
-        moved = template.joints or None
+    template = None if policy is None else survey_policy(policy, _names(motors))
     written = write_robot(
         name,
         urdf,
         task,
         Path(name) if out is None else out,
-        feet=None if feet is None else [link.strip() for link in feet.split(",")],
-        moved=moved,
+        feet=_names(feet) or None,
+        moved=() if template is None else template.joints or None,
     )
     files, asked = written.files, written.asked
     if template is not None:
@@ -131,6 +135,10 @@ def new(
     for what in asked:
         console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
     print_path("next: drake-safety check", written.files[-1])
+
+
+def _names(text: str | None) -> list[str]:
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def check(

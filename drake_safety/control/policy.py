@@ -113,11 +113,6 @@ class WholeHistory:
 class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
-    read: str = ""
-    """``deploy.yaml`` of unitree_rl_lab or ``config.yaml`` of rl_sar that has what is not stated:
-    ``package://…`` or a path relative to the YAML file."""
-    motors: list[str] = field(default_factory=list)
-    """Joints in the order of the robot's motors, for files that number them."""
     network: str = ""
     """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
     requires: str = ""
@@ -217,6 +212,10 @@ class Policy:
         still = self._still()
         widths = [np.asarray(term(still)).size for term, _ in self._terms]
         for (_, spec), width in zip(self._terms, widths, strict=True):
+            if not width:
+                raise ValueError(
+                    f"{who}: term '{spec.name}' needs a clock: state 'gait: {{period_s: ...}}' [s]"
+                )
             if len(spec.scale) not in (1, width):
                 raise ValueError(
                     f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
