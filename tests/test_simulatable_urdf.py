@@ -94,29 +94,21 @@ def test_a_mesh_of_an_installed_package_is_found(tmp_path):
     assert list(copy.meshes) == ["meshes/lowerleg.gltf"]
 
 
-def test_a_lost_collision_mesh_leaves_its_box_behind_turned_as_it_was(tmp_path):
-    stl(tmp_path / "foot.stl", TRIANGLE)
-    shape = mesh("collision", "foot.stl").replace(
-        "<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>'
-    )
-    links = LINK.format("foot", GOOD, shape), LINK.format("a", GOOD, "")
-    copy = simulatable_copy(written(tmp_path, *links))
-    (box,) = copy.lost_shapes["foot"]
-    # A quarter turn about z: x becomes y, and y becomes -x.
-    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 5]], atol=1e-12)
-    assert list(copy.root.iter("collision")) == []
-    assert copy.restore_boxes("foot") and not copy.restore_boxes("a")
-    assert copy.root.find(".//collision/geometry/box").get("size") == "1 2 4"
-    assert copy.root.find(".//collision/origin").get("xyz") == "-0.5 1 3"
-
-
-def test_the_box_of_another_format_is_the_same(tmp_path):
+@pytest.mark.parametrize("kind", ["stl", "ply"])
+def test_a_lost_collision_mesh_leaves_its_points_behind_turned_and_scaled(tmp_path, kind):
     trimesh = pytest.importorskip("trimesh")
-    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(tmp_path / "foot.ply")
-    shape = mesh("collision", "foot.ply")
+    trimesh.creation.box(bounds=[[0, 0, 0], [2, 1, 4]]).export(tmp_path / f"foot.{kind}")
+    shape = (
+        mesh("collision", f"foot.{kind}")
+        .replace("<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>')
+        .replace("/></geo", ' scale="1 1 2"/></geo')
+    )
     copy = simulatable_copy(written(tmp_path, LINK.format("foot", GOOD, shape)))
-    (box,) = copy.lost_shapes["foot"]
-    np.testing.assert_allclose(box, [[-0.5, -1, -2], [0.5, 1, 2]], atol=1e-6)
+    (points,) = copy.lost_meshes["foot"]
+    # A quarter turn about z: x becomes y, and y becomes -x.
+    box = [points.min(axis=0), points.max(axis=0)]
+    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
+    assert list(copy.root.iter("collision")) == [] and copy.bare_links() == ["foot"]
 
 
 def test_friction_and_impossible_inertias_are_mended_and_told(tmp_path):

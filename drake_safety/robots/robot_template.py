@@ -133,7 +133,7 @@ def _survey(
 ) -> _Findings:
     copy = simulatable_copy(urdf)
     copy.write(scratch)
-    survey = Survey(scratch, copy.lost_shapes)
+    survey = Survey(scratch, copy.lost_meshes)
     legs = survey.legs(feet)
     arms = survey.arms(legs)
     if task == "reaching" and not arms:
@@ -155,11 +155,6 @@ def _survey(
     survey = replace_lost_meshes(copy, survey, legs, posture, scratch)
     # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
-    if is_base_bare and any([copy.restore_boxes(link) for link in survey.welded(survey.base)]):
-        is_base_bare = False
-        copy.write(scratch)
-        survey = Survey(scratch)
-        survey.set_joints(posture)
     copy.ignore_collisions(survey.overlaps())
     found = _Findings(
         name=name,

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
@@ -207,9 +207,9 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
                 continue
             link.remove(shape)
             lost.append(url if file is None else file.name)
-            copy.lost_meshes.setdefault(link.get("name", ""), []).append(
-                _lost_mesh(file, shape, mesh)
-            )
+            points = copy.lost_meshes.setdefault(link.get("name", ""), [])
+            if file is not None:
+                points += _points(copy, file, shape, mesh)
     if lost:
         copy.notes.append(
             f"collision meshes that Drake cannot read, or that do not exist, are left out: "
@@ -231,15 +231,26 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _lost_mesh(file: Path | None, shape: ET.Element, mesh: ET.Element) -> LostMesh:
-    scale = np.array([float(value) for value in mesh.get("scale", "1 1 1").split()])
-    origin = origin_of(shape)
-    X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
-    box = None if file is None else _box(file)
-    if box is not None:
-        corners = X_LM @ np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1)
-        box = np.array([corners.min(axis=1), corners.max(axis=1)])
-    return LostMesh(file=file, scale=scale, X_LM=X_LM, box=box)
+def _points(copy: UrdfCopy, file: Path, shape: ET.Element, mesh: ET.Element) -> list[np.ndarray]:
+    """Vertices in the link's frame; none, with a note, if the mesh cannot be read."""
+    try:
+        points = mesh_points(file)
+    except MissingExtraError as error:
+        note = (
+            "no shapes are fitted to collision meshes that Drake does not read; install what does "
+            f"it by `pip install '{error.needs}'` and write the folder again"
+        )
+    except ValueError as error:
+        note = f"no shape is fitted to a collision mesh: {error}"
+    else:
+        scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
+        origin = origin_of(shape)
+        X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
+        return [(X_LM @ (points * scale).T).T]
+    if note not in copy.left_out:
+        copy.left_out.append(note)
+        copy.notes.append(note)
+    return []
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
@@ -260,26 +271,3 @@ def _mesh_file(url: str, source: Path) -> Path | None:
             with contextlib.suppress(ValueError):
                 candidates.append(model_file(url))
     return next((file for file in candidates if file.is_file()), None)
-
-
-def _box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a mesh, (2, 3); binary STL is read without trimesh."""
-    box = _stl_box(file)
-    if box is None:
-        with contextlib.suppress(ValueError):
-            points = mesh_points(file)
-            box = np.array([points.min(axis=0), points.max(axis=0)])
-    return box
-
-
-def _stl_box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a binary STL, (2, 3)."""
-    if file.suffix.lower() != ".stl":
-        return None
-    content = file.read_bytes()
-    count = int.from_bytes(content[80:84], "little")
-    if count == 0 or len(content) < 84 + 50 * count:
-        return None
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    corners = np.frombuffer(content, kind, count, 84)["corners"].reshape(-1, 3)
-    return np.array([corners.min(axis=0), corners.max(axis=0)], dtype=float)

@@ -20,24 +20,6 @@ from drake_safety.robots.model_files import model_file
 _DRAKE = "http://drake.mit.edu"
 
 
-@dataclass(frozen=True, kw_only=True)
-class LostMesh:
-    """A removed collision mesh.
-
-    Attributes:
-        file: The mesh; None if it does not exist.
-        scale: Factors on its coordinates, (3,).
-        X_LM: Its pose in the link's frame.
-        box: Box around it: lowest and highest corner in the link's frame, (2, 3) [m]; None if it
-            is not known.
-    """
-
-    file: Path | None
-    scale: np.ndarray
-    X_LM: RigidTransform
-    box: np.ndarray | None = None
-
-
 @dataclass(kw_only=True)
 class UrdfCopy:
     """An editable copy of a URDF file.
@@ -47,7 +29,8 @@ class UrdfCopy:
         root: The root element, which is edited.
         notes: Descriptions of the changes, one sentence each.
         left_out: Notes about visuals that were removed.
-        lost_meshes: Removed collision meshes by link.
+        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each;
+            none of those that cannot be read.
         fitted: Shapes in place of these meshes, by link.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
@@ -58,7 +41,7 @@ class UrdfCopy:
     root: ET.Element
     notes: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_meshes: dict[str, list[LostMesh]] = field(default_factory=dict)
+    lost_meshes: dict[str, list[np.ndarray]] = field(default_factory=dict)
     fitted: dict[str, list[FittedShape]] = field(default_factory=dict)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
@@ -79,14 +62,6 @@ class UrdfCopy:
     def link(self, name: str) -> ET.Element:
         """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
-
-    @property
-    def lost_shapes(self) -> dict[str, list[np.ndarray]]:
-        """Boxes around removed collision meshes by link, (2, 3) [m] each."""
-        return {
-            link: [mesh.box for mesh in meshes if mesh.box is not None]
-            for link, meshes in self.lost_meshes.items()
-        }
 
     def bare_links(self) -> list[str]:
         """Returns the links whose collision meshes were removed and that have no other shape."""
@@ -198,26 +173,6 @@ class UrdfCopy:
             f"the collision shapes of link '{link_name}' are replaced by {len(points)} spheres on "
             "the ground"
         )
-
-    def restore_boxes(self, link_name: str) -> bool:
-        """Adds boxes in place of a link's removed collision meshes.
-
-        Args:
-            link_name: The link.
-
-        Returns:
-            Whether the link had any.
-        """
-        boxes = self.lost_shapes.get(link_name, [])
-        link = self.link(link_name)
-        for index, (low, high) in enumerate(boxes):
-            name = f"{link_name}_box_{index}"
-            _add_collision(link, name, (low + high) / 2, "box", size=_numbers(high - low))
-        if boxes:
-            self.notes.append(
-                f"the collision meshes of link '{link_name}' are replaced by their bounding boxes"
-            )
-        return bool(boxes)
 
     def set_fitted(self, link_name: str, shapes: list[FittedShape]) -> None:
         """Sets the shapes that replace a link's removed collision meshes; earlier ones are removed.
