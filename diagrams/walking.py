@@ -14,10 +14,9 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import network_file
-from drake_safety.control.policy_files import (
+from drake_safety.control.policy import (
     load_policy,
-    missing_entries,
+    network_file,
     read_policy_file,
     with_policy,
 )
@@ -221,8 +220,17 @@ class Walking(LeggedLoop):
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
-        """Findings about the policy: what its files lack, and how to mend it."""
-        return _policy_findings(policy_file(scenario), kinematics)
+        """A finding about the policy: whether its file is complete and fits the robot."""
+        path = policy_file(scenario)
+        try:
+            policy = load_policy(path, kinematics)
+        except ValueError as error:
+            yield failed("policy", str(error), f"correct what the message names, or {path.name}")
+        else:
+            yield passed(
+                "policy",
+                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
+            )
 
     @property
     def target_box(self) -> np.ndarray:
@@ -381,19 +389,3 @@ class Walking(LeggedLoop):
 def policy_file(scenario: LoopScenario) -> Path:
     """The policy file of a scenario of the walking task, beside its robot's YAML file."""
     return Path(load_robot(scenario.robot).source_dir) / scenario.parameters.policy
-
-
-def _policy_findings(path: Path, kinematics: RobotKinematics) -> Iterator[Finding]:
-    """One finding for each entry that a policy's files lack, or one for all."""
-    try:
-        missing = list(missing_entries(path, kinematics.joint_names))
-        for what, remedy in missing:
-            yield failed("policy", what, remedy)
-        if not missing:
-            policy = load_policy(path, kinematics)
-            yield passed(
-                "policy",
-                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
-            )
-    except ValueError as error:
-        yield failed("policy", str(error), f"correct what the message names, or {path.name}")

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy_files import load_policy, read_policy_file
+from drake_safety.control.policy import load_policy, read_policy_file
 from drake_safety.control.policy_template import survey_policy
 from policy_networks import save_network
 
@@ -242,7 +242,7 @@ def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
     text, asked = survey_policy(path, MOTORS).yaml(JOINTS, {})
     assert "name: lidar" in text
     assert any("functions of the terms ['lidar']" in what for what in asked)
-    with pytest.raises(ValueError, match=r"unknown ones \['lidar'\]; registered are"):
+    with pytest.raises(ValueError, match=r"unknown terms \['lidar'\]; registered are"):
         loaded(path, MOTORS)
 
 
