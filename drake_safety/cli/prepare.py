@@ -102,39 +102,34 @@ def new(
         more, unknown = template.write(written.folder, written.joints, written.posture)
         files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
     sizes = written.sizes
-    console.print(
-        f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m "
-        "high",
-        highlight=False,
-        soft_wrap=True,
+    _say(
+        f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m high"
     )
     for path in files:
         print_path("wrote", path)
     if written.fitted:
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(written.fitted.items()))
-        console.print(
+        _say(
             f"fitted {sum(written.fitted.values())} shapes in place of collision meshes that Drake "
             f"does not read: {kinds}. Look at them: drake-safety check {written.files[-1]} "
-            "--picture FILE",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+            "--picture FILE"
         )
     for what in written.left_out:
-        console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        _say(f"note  {what}", "yellow")
     if written.bare:
-        console.print(
+        _say(
             f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
             "missing or cannot be read: everything passes through "
             f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
-            style="bold red",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+            "bold red",
         )
     for what in asked:
-        console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        _say(f"ask   {what}", "yellow")
     print_path("next: drake-safety check", written.files[-1])
+
+
+def _say(text: str, style: str | None = None) -> None:
+    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def _names(text: str | None) -> list[str]:

@@ -415,10 +415,6 @@ def read_policy_file(path: Path) -> PolicyParameters:
 def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
     """Loads a policy for a robot.
 
-    Args:
-        path: The ``policy.yaml``.
-        kinematics: The robot.
-
     Raises:
         MissingExtraError: The package that has the network is not installed.
         ValueError: The file does not fit the schema, the robot or the network.

@@ -41,11 +41,6 @@ class PolicyTemplate:
     ) -> tuple[list[Path], list[str]]:
         """Writes ``policy.yaml`` into a robot's folder, and copies the network there.
 
-        Args:
-            folder: The folder.
-            robot_joints: The robot's joints.
-            posture: Its standing posture [rad].
-
         Returns:
             The files, and what the user must supply.
         """
@@ -56,12 +51,7 @@ class PolicyTemplate:
         return [network, path], asked
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
-        """Returns the text of ``policy.yaml``, and what the user must supply.
-
-        Args:
-            robot_joints: The robot's joints.
-            posture: Its standing posture [rad].
-        """
+        """Returns the text of ``policy.yaml``, and what the user must supply."""
         metadata = self.network.metadata
         found = dict(self.found)
         lines: list[str] = []

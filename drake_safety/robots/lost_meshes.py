@@ -22,13 +22,6 @@ def replace_lost_meshes(
     spheres, which alone touch the ground. Where two links overlap in the standing posture, convex
     hulls replace primitives, which are larger.
 
-    Args:
-        copy: The URDF, to which shapes are added.
-        survey: The robot.
-        legs: Its legs.
-        posture: Its standing joint positions [rad].
-        scratch: File that the copy is written to.
-
     Returns:
         The robot with these shapes, standing.
     """

@@ -41,9 +41,6 @@ def is_shown(path: Path) -> bool:
     """Whether Drake renders a mesh without conversion.
 
     OBJ files by MeshLab may declare opaque materials fully transparent, and Drake renders them so.
-
-    Args:
-        path: The mesh.
     """
     if path.suffix.lower() not in SHOWN_FORMATS:
         return False
@@ -102,9 +99,6 @@ def _write(target: Path, content: bytes) -> None:
 
 def mesh_points(path: Path) -> np.ndarray:
     """Returns the vertices of a mesh, (n, 3), in the mesh's units.
-
-    Args:
-        path: The mesh.
 
     Raises:
         MissingExtraError: The packages that read it are not installed.

@@ -19,12 +19,7 @@ _EXTRAS = {"example-robot-data": "robots"}
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
-    """Adds ``package://drake_safety_models/…`` to a package map.
-
-    Args:
-        package_map: The package map, such as a parser's.
-        url: A ``package://NAME/…`` whose package, installed by pip, is added too.
-    """
+    """Adds ``package://drake_safety_models/…``, and a URL's package installed by pip, to a map."""
     if not package_map.Contains("drake_safety_models"):
         package_map.AddPackageXml(str(files("drake_safety.models") / "package.xml"))
     parts = urlparse(url)
@@ -38,10 +33,6 @@ def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
     """Returns a parser with the packages of :func:`add_to_package_map`.
 
     The parser renames models whose name the plant already has.
-
-    Args:
-        plant: A plant before ``Finalize``.
-        url: See :func:`add_to_package_map`.
     """
     parser = Parser(plant)
     parser.SetAutoRenaming(True)

@@ -75,10 +75,6 @@ def is_number(value: Any) -> bool:
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Says for an error message which known name is like an unknown one: `` (did you mean 'x'?)``.
 
-    Args:
-        name: The unknown name.
-        known: The known ones.
-
     Returns:
         The words, with a space before them; "" if none is like it.
     """

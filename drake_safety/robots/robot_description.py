@@ -92,11 +92,6 @@ def add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes.
 
-    Args:
-        plant: A plant before ``Finalize``, with a scene graph and the robot's bodies.
-        robot: The robot.
-        instance: Its model instance.
-
     Raises:
         ValueError: A pattern of ``shapes`` matches no body, or two match one.
     """
@@ -140,11 +135,6 @@ def ignore_neighbours(
     """Filters collisions of links connected by a joint, and of links welded to them.
 
     Drake filters the two bodies of a joint, but not bodies that are welded to them.
-
-    Args:
-        plant: A plant before ``Finalize``.
-        scene_graph: Its scene graph.
-        instance: The robot's model instance.
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     for joint in joints:

@@ -28,12 +28,7 @@ class Sizes(RobotSize):
 
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
-    """Writes the scenario of a task as commented YAML.
-
-    Args:
-        task: One of `TASKS`.
-        sizes: Sizes of the robot.
-    """
+    """Writes the scenario of a task as commented YAML."""
     return TASKS[task](sizes)
 
 

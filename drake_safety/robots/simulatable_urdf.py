@@ -27,9 +27,6 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     :func:`~drake_safety.robots.mesh_cache.shown_mesh`, or left out if that fails. Collision meshes
     that Drake does not read are left out.
 
-    Args:
-        path: The URDF.
-
     Raises:
         ValueError: The file does not exist or is not a URDF.
     """

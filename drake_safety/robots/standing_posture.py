@@ -29,10 +29,6 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used. If the
     centre of mass is then not amid the feet, all feet are moved under it.
 
-    Args:
-        survey: The robot.
-        legs: Its legs.
-
     Returns:
         Positions of all joints by name [rad]; those of no leg are as near to zero as their stops
         allow.

@@ -137,11 +137,7 @@ class UrdfCopy:
                 mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
     def fix_joints(self, names: Iterable[str]) -> None:
-        """Fixes joints at zero.
-
-        Args:
-            names: Names of the joints.
-        """
+        """Fixes joints at zero."""
         fixed = set(names)
         for joint in self.root.findall("joint"):
             if joint.get("name") in fixed:
@@ -175,12 +171,7 @@ class UrdfCopy:
         )
 
     def set_fitted(self, link_name: str, shapes: list[FittedShape]) -> None:
-        """Sets the shapes that replace a link's removed collision meshes; earlier ones are removed.
-
-        Args:
-            link_name: The link.
-            shapes: The shapes.
-        """
+        """Sets the shapes in place of a link's removed collision meshes; earlier ones go."""
         self.fitted[link_name] = shapes
         link = self.link(link_name)
         for collision in link.findall("collision"):
@@ -200,11 +191,7 @@ class UrdfCopy:
             ET.SubElement(geometry, tag, sizes)
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
-        """Filters collisions between pairs of links.
-
-        Args:
-            pairs: Names of links.
-        """
+        """Filters collisions between pairs of links."""
         for index, (one, other) in enumerate(sorted(pairs)):
             group = ET.SubElement(
                 self.root, f"{{{_DRAKE}}}collision_filter_group", name=f"overlap_{index}"
@@ -217,11 +204,7 @@ class UrdfCopy:
             self.notes.append(f"collisions of the overlapping links '{one}' and '{other}' are off")
 
     def write(self, path: Path) -> None:
-        """Writes the copy and its meshes.
-
-        Args:
-            path: The URDF to write.
-        """
+        """Writes the copy and its meshes."""
         tree = ET.ElementTree(self.root)
         ET.indent(tree)
         tree.write(path, encoding="utf-8", xml_declaration=True)
@@ -240,9 +223,6 @@ class UrdfCopy:
 
 def read_urdf(path: Path) -> UrdfCopy:
     """Reads a URDF as an editable copy.
-
-    Args:
-        path: The file.
 
     Raises:
         ValueError: The file does not exist, is not a URDF, or has a negative mass.

@@ -207,11 +207,7 @@ class Survey:
         return limbs
 
     def arms(self, legs: list[Limb]) -> list[Limb]:
-        """Returns other limbs of four joints or more; a hand's fingers are no limbs.
-
-        Args:
-            legs: The legs.
-        """
+        """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
         feet = {limb.body for limb in legs}
         chains = [
             (self.chain(group[0]), group)
