@@ -173,11 +173,8 @@ class Walking(LeggedLoop):
             )
             builder.Connect(self._features, guard_system.GetInputPort("features"))
         if trigger is not None and assessor is not None:
-            for name, port in (
-                ("safety_probability", "calibrated_safety_probability"),
-                ("belief", "belief"),
-            ):
-                builder.Connect(assessor.GetOutputPort(port), trigger.GetInputPort(name))
+            for name in ("safety_probability", "belief"):
+                builder.Connect(assessor.GetOutputPort(name), trigger.GetInputPort(name))
         elif trigger is not None:
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
@@ -194,6 +191,7 @@ class Walking(LeggedLoop):
             "recovery_trigger",
             RecoveryTrigger(
                 threshold=recovery.threshold,
+                initial_uncertainty=self.scenario.assessment.initial_uncertainty,
                 persistence_s=recovery.persistence_s,
                 period_s=self.scenario.control_period_s,
                 offset_s=offset_s,

@@ -74,7 +74,7 @@ robot: robot.yaml
     - {_ball(0.6, 2.0 * heavy, 3.5 * sideways, 1.5708)}
     - {_ball(1.68, 3.0 * heavy, 9.0 * sideways, -1.2)}
   recovery:
-    threshold: 0.4  # of normalised Γ, not tuned to this robot
+    threshold: 0.4  # of the probability, not tuned to this robot
     step:
       max_twist_rad: 0  # holds no heading; 0.3 does, if the feet do not slip under it [rad]
       min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]
