@@ -101,10 +101,8 @@ def new(
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)
         files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
-    sizes = written.sizes
-    _say(
-        f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m high"
-    )
+    mass_kg, height_m = written.sizes.mass_kg, written.sizes.height_m
+    _say(f"{name}: {mass_kg:.1f} kg, its base '{written.sizes.base}' stands {height_m:.3f} m high")
     for path in files:
         print_path("wrote", path)
     if written.fitted:
