@@ -150,36 +150,63 @@ def test_feet_that_do_not_surround_the_centre_of_mass_are_found(own):
     assert "'contact_points' under 'feet' [m]" in found.remedy
 
 
-def test_a_base_that_no_ball_can_hit_is_found_before_one_is_thrown(own):
+def edit_urdf(own, edit):
+    """Changes the element tree of the spider's URDF."""
     urdf = own / "spider.urdf"
     root = ElementTree.parse(urdf).getroot()
-    body = root.find("link[@name='body']")
-    body.remove(body.find("collision"))
+    edit(root)
     urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
-    found = problems(own / "balancing.yaml")
-    assert list(found) == ["shape of the base"]
-    assert "base 'body' has no collision geometry" in found["shape of the base"].message
-    assert "to link 'body' in spider.urdf" in found["shape of the base"].remedy
 
 
-def test_a_motor_without_a_limit_is_found(own):
-    robot = yaml.safe_load((own / "robot.yaml").read_text())
-    limits = {name: limit for name, limit in robot["effort_limits"].items() if name != "knee_2"}
-    urdf = own / "spider.urdf"
-    root = ElementTree.parse(urdf).getroot()
-    limit = root.find("joint[@name='knee_2']/limit")
-    limit.attrib.pop("effort")
+def bare_base(own):
+    def edit(root):
+        body = root.find("link[@name='body']")
+        body.remove(body.find("collision"))
+
+    edit_urdf(own, edit)
+
+
+def unlimited_motor(own):
     motor = (
         "<transmission><type>transmission_interface/SimpleTransmission</type>"
         '<joint name="knee_2"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>'
         '<actuator name="knee_2"/></transmission>'
     )
-    root.append(ElementTree.fromstring(motor))
-    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+
+    def edit(root):
+        root.find("joint[@name='knee_2']/limit").attrib.pop("effort")
+        root.append(ElementTree.fromstring(motor))
+
+    edit_urdf(own, edit)
+    limits = yaml.safe_load((own / "robot.yaml").read_text())["effort_limits"]
+    del limits["knee_2"]
     edited(own / "robot.yaml", effort_limits=limits)
-    found = problems(own / "balancing.yaml")
-    assert list(found) == ["effort limits"]
-    assert "['knee_2'] have none" in found["effort limits"].message
+
+
+def larger_foot(own):
+    feet = yaml.safe_load((own / "robot.yaml").read_text())["feet"]
+    next(iter(feet.values()))["radius_m"] = 0.03
+    edited(own / "robot.yaml", feet=feet)
+
+
+def higher_safe_set(own):
+    parameters = yaml.safe_load((own / "balancing.yaml").read_text())["parameters"]
+    parameters["safe_set"] = {"height_m": [0.8, 0.9]}
+    edited(own / "balancing.yaml", parameters=parameters)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "item", "message"),
+    [
+        (bare_base, "shape of the base", "base 'body' has no collision geometry"),
+        (unlimited_motor, "effort limits", r"\['knee_2'\] have none"),
+        (larger_foot, "contact spheres", "the model file has no such sphere"),
+        (higher_safe_set, "safe while it stands", r"violates \['height'"),
+    ],
+)
+def test_what_else_is_wrong_is_found_before_any_episode(own, spoil, item, message):
+    spoil(own)
+    assert re.search(message, problems(own / "balancing.yaml")[item].message)
 
 
 def urdf_of_spider(folder, change):
@@ -301,23 +328,6 @@ def test_new_says_which_visuals_it_left_out(tmp_path):
     assert "left out: gone.stl" in (out / "README.md").read_text()
 
 
-def test_a_contact_point_without_its_sphere_is_found(own):
-    robot = yaml.safe_load((own / "robot.yaml").read_text())
-    next(iter(robot["feet"].values()))["radius_m"] = 0.03
-    edited(own / "robot.yaml", feet=robot["feet"])
-    assert (
-        "the model file has no such sphere"
-        in problems(own / "balancing.yaml")["contact spheres"].message
-    )
-
-
-def test_a_safe_set_of_another_size_is_found_before_any_episode(own):
-    scenario = yaml.safe_load((own / "balancing.yaml").read_text())
-    scenario["parameters"]["safe_set"] = {"height_m": [0.8, 0.9]}
-    edited(own / "balancing.yaml", **scenario)
-    assert "violates ['height'" in problems(own / "balancing.yaml")["safe while it stands"].message
-
-
 def test_starts_without_danger_are_told_to_be_widened(own):
     scenario = yaml.safe_load((own / "balancing.yaml").read_text())
     calm = {
@@ -336,28 +346,34 @@ def test_starts_without_danger_are_told_to_be_widened(own):
     assert "'start' is {'foot_offset_m': " in found.remedy
 
 
-def test_a_scenario_that_is_no_yaml_or_does_not_exist_is_a_finding(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "does not exist"),
+        ("task: [", "is not YAML"),
+        ("task: os:path\nrobot: x", "has no task 'path'"),
+    ],
+)
+def test_a_scenario_that_is_none_is_a_finding(tmp_path, text, message):
     path = tmp_path / "odd.yaml"
-    assert "does not exist" in problems(path)["scenario"].message
-    path.write_text("task: [")
-    assert "is not YAML" in problems(path)["scenario"].message
-    path.write_text("task: os:path\nrobot: x")
-    assert "has no task 'path'" in problems(path)["scenario"].message
+    if text is not None:
+        path.write_text(text)
+    assert message in problems(path)["scenario"].message
 
 
-def test_new_refuses_what_it_cannot_write(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "task", "folder", "message"),
+    [
+        ("my robot", "balancing", "a", "a robot's name is letters"),
+        ("spider", "dancing", "a", r"task must be one of \['balancing', 'reaching', 'walking'\]"),
+        ("spider", "balancing", ".", "exists already"),
+        ("spider", "reaching", "a", "has no arm"),
+    ],
+)
+def test_new_refuses_what_it_cannot_write(tmp_path, name, task, folder, message):
     write_hexapod(tmp_path)
-    urdf = tmp_path / "hexapod.urdf"
-    with pytest.raises(ValueError, match="a robot's name is letters"):
-        write_robot("my robot", urdf, "balancing", tmp_path / "a")
-    with pytest.raises(
-        ValueError, match=r"task must be one of \['balancing', 'reaching', 'walking'\]"
-    ):
-        write_robot("spider", urdf, "dancing", tmp_path / "a")
-    with pytest.raises(ValueError, match="exists already"):
-        write_robot("spider", urdf, "balancing", tmp_path)
-    with pytest.raises(ValueError, match="has no arm"):
-        write_robot("spider", urdf, "reaching", tmp_path / "a")
+    with pytest.raises(ValueError, match=message):
+        write_robot(name, tmp_path / "hexapod.urdf", task, tmp_path / folder)
     assert not (tmp_path / "a").exists()
 
 

@@ -24,6 +24,15 @@ def meshes_of(path):
     return [element.get("filename") for element in ET.parse(path).getroot().iter("mesh")]
 
 
+def loaded_quietly(copy, folder, caplog):
+    """The plant of the written copy, of which Drake does not warn."""
+    copy.write(folder / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(folder / "copy.urdf"))
+    assert [record.getMessage() for record in caplog.records] == []
+    return plant
+
+
 def test_a_mesh_that_drake_shows_goes_along_as_it_is(tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
@@ -136,20 +145,14 @@ def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
         '<safety_controller k_velocity="1"/><calibration rising="0"/></joint>'
     )
     copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, ""), nothing, joint))
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert [record.getMessage() for record in caplog.records] == []
+    loaded_quietly(copy, tmp_path, caplog)
 
 
 def test_inertias_beyond_the_triangle_inequality_are_mended_and_drake_takes_them(tmp_path, caplog):
     odd = '<inertia ixx="0.001" iyy="0.001" izz="0.007" ixy="0.0005" ixz="0" iyz="0"/>'
     copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
     assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert [record.getMessage() for record in caplog.records] == []
+    loaded_quietly(copy, tmp_path, caplog)
 
 
 def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path, caplog):
@@ -173,14 +176,10 @@ def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path,
         )
     )
     assert [one.get("name") for one in copy.root.iter("actuator")] == ["m_j"]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert plant.num_actuators() == 1
-    assert [record.getMessage() for record in caplog.records] == []
+    assert loaded_quietly(copy, tmp_path, caplog).num_actuators() == 1
 
 
-def test_a_material_of_two_colours_becomes_two(tmp_path):
+def test_a_material_of_two_colours_becomes_two(tmp_path, caplog):
     black = '<material name="black"><color rgba="0 0 0 {}"/></material>'
     box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
     parts = [
@@ -191,7 +190,5 @@ def test_a_material_of_two_colours_becomes_two(tmp_path):
     ]
     copy = simulatable_copy(written(tmp_path, *parts))
     assert [one.get("name") for one in copy.root.iter("material")] == ["black", "black", "black_1"]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    loaded_quietly(copy, tmp_path, caplog)
     assert copy.notes == ["the material 'black' has 2 colours; now each has its own name"]
