@@ -112,7 +112,7 @@ def new(
             f"does not read: {kinds}. Look at them: drake-safety check {written.files[-1]} "
             "--picture FILE"
         )
-    for what in written.left_out:
+    for what in written.copy.left_out:
         _say(f"note  {what}", "yellow")
     if written.bare:
         _say(

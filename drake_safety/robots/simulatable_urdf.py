@@ -151,42 +151,36 @@ def _plain(value: str) -> str:
 
 
 def _gather_visual_meshes(copy: UrdfCopy) -> None:
-    missing: list[str] = []
-    wanting: list[str] = []  # Meshes whose converter is not installed.
-    unreadable: list[str] = []  # Error messages.
     converted: list[str] = []
+    lost: dict[str, list[str]] = {}  # By the reason.
 
     def shown(url: str, rgba: str) -> str:
         file = _mesh_file(url, copy.source)
         if file is None:
-            missing.append(url)
+            lost.setdefault(
+                "visual meshes that are not where the URDF says are left out: {}", []
+            ).append(url)
             return ""
         try:
             mesh = shown_mesh(file, rgba)
         except MissingExtraError:
-            wanting.append(file.name)
+            lost.setdefault(
+                "visual meshes that Drake does not render are left out: {}; install their "
+                "converter by `pip install 'drake_safety[robots]'` and write the folder again",
+                [],
+            ).append(file.name)
             return ""
         except ValueError as error:
-            unreadable.append(str(error))
+            lost.setdefault("a visual is left out: {}", []).append(str(error))
             return ""
         if mesh != file:
             converted.append(file.name)
-            return _gather(copy, mesh, f"{file.stem}.gltf")
-        return _gather(copy, mesh, file.name)
+        return _gather(copy, mesh, file.name if mesh == file else f"{file.stem}.gltf")
 
     copy.replace_visual_meshes(shown)
     if converted:
         copy.notes.append(f"visual meshes are converted to glTF: {_listed(converted)}")
-    if missing:
-        copy.left_out.append(
-            f"visual meshes that are not where the URDF says are left out: {_listed(missing)}"
-        )
-    if wanting:
-        copy.left_out.append(
-            f"visual meshes that Drake does not render are left out: {_listed(wanting)}; install "
-            "their converter by `pip install 'drake_safety[robots]'` and write the folder again"
-        )
-    copy.left_out += [f"a visual is left out: {why}" for why in dict.fromkeys(unreadable)]
+    copy.left_out += [reason.format(_listed(names)) for reason, names in lost.items()]
     copy.notes += copy.left_out
 
 
