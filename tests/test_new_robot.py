@@ -276,7 +276,7 @@ def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path
     result = CliRunner().invoke(app, ["check", str(file), "--quick"])
     assert result.exit_code == 0
     assert "warning  collision shapes: 2 links have none" in result.output
-    assert "mend: add a <collision> with a box, sphere or capsule [m]" in result.output
+    assert "fix: add a <collision> with a box, sphere or capsule [m]" in result.output
     urdf = written.files[0]
     box = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision></link>'
     head, found, tail = urdf.read_text().partition('<link name="femur_0"')
@@ -377,7 +377,8 @@ def test_new_refuses_what_it_cannot_write(tmp_path, name, task, folder, message)
     assert not (tmp_path / "a").exists()
 
 
-def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_mend_it(own):
+def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_fix_it(own):
     edited(own / "robot.yaml", base="trunk")
     result = CliRunner().invoke(app, ["check", str(own / "balancing.yaml"), "--episodes", "0"])
     assert result.exit_code == 1
+    assert "fix: correct what the message names" in result.output

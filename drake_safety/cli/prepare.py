@@ -180,7 +180,7 @@ def check(
             word, style = _WORDS[finding.is_ok, finding.is_warning]
             text = Text.assemble((word, style), f"  {finding.item}: {finding.message}")
             if finding.remedy:
-                text.append(f"\n         mend: {finding.remedy}")
+                text.append(f"\n         fix: {finding.remedy}")
             console.print(text, highlight=False, soft_wrap=True)
     if picture is not None:
         _draw(scenario, picture)

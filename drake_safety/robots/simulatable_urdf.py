@@ -39,7 +39,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     copy.free_fixed_joints()
     _drop_transmissions(copy)
     _drop_friction(copy)
-    _mend_inertias(copy)
+    _fix_inertias(copy)
     _tell_materials_apart(copy)
     _gather_visual_meshes(copy)
     _gather_collision_meshes(copy)
@@ -83,7 +83,7 @@ def _drop_friction(copy: UrdfCopy) -> None:
         )
 
 
-def _mend_inertias(copy: UrdfCopy) -> None:
+def _fix_inertias(copy: UrdfCopy) -> None:
     """Removes impossible products of inertia, and inertias of bodies without mass."""
     for link in copy.root.iter("link"):
         inertial, inertia = link.find("inertial"), link.find("inertial/inertia")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Generator, Iterator
-from dataclasses import asdict, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -415,7 +415,7 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
         ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
     )
     start = getattr(loop.scenario.parameters, "start", None)
-    present = f"; 'start' is {asdict(start)}" if is_dataclass(start) else ""
+    present = f"; 'start' is {vars(start)}" if is_dataclass(start) else ""
     change, other = ("widen", "narrow") if share < low else ("narrow", "widen")
     yield _judged(
         "share of unsafe episodes",
