@@ -148,9 +148,7 @@ def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
     loaded_quietly(copy, tmp_path, caplog)
 
 
-def test_inertias_beyond_the_triangle_inequality_are_corrected_and_drake_takes_them(
-    tmp_path, caplog
-):
+def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog):
     odd = '<inertia ixx="0.001" iyy="0.001" izz="0.007" ixy="0.0005" ixz="0" iyz="0"/>'
     copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
     assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
