@@ -7,8 +7,6 @@ from drake_safety.evaluation.stills import (
     stack_positions,
     still_times,
 )
-from drake_safety.robots import robot_description
-from drake_safety.robots.model_files import is_installed
 from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.scenario import load_scenario
 
@@ -17,10 +15,7 @@ SIZE = {"width": 96, "height": 72}
 
 @pytest.fixture(scope="module")
 def loop():
-    """Laikago in the package's own shapes: as published it is as orange as the ball."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robot_description, "is_installed", lambda url: False)
-        return load_scenario("laikago_balancing").make_loop(ball=True)
+    return load_scenario("laikago_balancing").make_loop(ball=True)
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +124,7 @@ def test_a_robot_that_is_nowhere_is_not_drawn(camera, standing):
 
 def test_meshes_that_are_shaded_physically_are_lit_as_brightly(camera, standing):
     pytest.importorskip("trimesh")
-    if not is_installed("package://example-robot-data/"):
-        pytest.skip("the extra 'robots' is not installed")
-    published = load_scenario("laikago_balancing").make_loop(ball=True)
+    published = load_scenario("a1_balancing").make_loop(ball=True)
     corner = np.s_[-8:, -8:]  # The ground.
     plain = camera.render(standing)[corner].mean()
     lit = StillCamera(published, standing, **SIZE).render(standing)[corner].mean()

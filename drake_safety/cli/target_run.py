@@ -150,7 +150,6 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     """
     from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
     from drake_safety.evaluation.timeline_figure import timeline_figure
-    from drake_safety.simulation.capabilities import angular_constraints
 
     positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
     events = [motion.leave_time_s] if motion.has_left else []
@@ -173,7 +172,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
         belief=motion.extra["belief"],
         margins=motion.margins,
         constraint_names=loop.constraint_names,
-        angular_constraints=angular_constraints(loop),
+        angular_constraints=loop.angular_constraints,
     )
 
 
