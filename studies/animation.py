@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -60,7 +60,12 @@ def animation(
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment).path
     gamma = load_assessment(folder, MODES[0])
-    options = {"seed": seed, "duration_s": duration, "log_period_s": LOG_PERIOD_S}
+    options: dict[str, Any] = {
+        "seed": seed,
+        "duration_s": duration,
+        "log_period_s": LOG_PERIOD_S,
+    }
+    log: Any
     if target is None:
         loop = loaded.make_loop(variation, assessment=gamma, ball=True)
         throws = parse_pushes(loaded, push or [])

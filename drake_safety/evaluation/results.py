@@ -102,10 +102,7 @@ class Results(Mapping[str, Result]):
             found = (content["schema"], content["schema_version"])
             if found != (SCHEMA, SCHEMA_VERSION):
                 raise ValueError(f"schema and version are {found}")
-            figures = {
-                key: Estimate(*(math.nan if end is None else float(end) for end in ends), int(n))
-                for key, (*ends, n) in content["figures"].items()
-            }
+            figures = {key: Estimate.of_row(row) for key, row in content["figures"].items()}
             return cls(figures, content["entries"])
         except _DAMAGES as error:
             raise ValueError(
