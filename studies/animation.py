@@ -32,9 +32,9 @@ from drake_safety.evaluation.figure_style import (
 )
 from drake_safety.evaluation.stills import StillCamera, stack_positions
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
+from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import ThrowLog, run_throw
+from drake_safety.simulation.throws import run_throw
 
 if TYPE_CHECKING:
     from drake_safety.simulation.legged_loop import LeggedLoop
@@ -65,23 +65,23 @@ def animation(
         "duration_s": duration,
         "log_period_s": LOG_PERIOD_S,
     }
-    log: ThrowLog | GoalMotion
+    log: Any
     if target is None:
         loop = loaded.make_loop(variation, assessment=gamma, ball=True)
         throws = parse_pushes(loaded, push or [])
-        log = thrown = run_throw(loop, 0, throws=throws, ports=(_PORT, "ball_state"), **options)
+        log = run_throw(loop, 0, throws=throws, ports=(_PORT, "ball_state"), **options)
         states = {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}
         threshold = loaded.parameters.recovery.threshold
-        events = [start for start, _ in thrown.recovery_intervals_s]
+        events = [start for start, _ in log.recovery_intervals_s]
     else:
         loop = loaded.make_loop(variation, assessment=gamma)
         goal, pushed = parse_target(loop, target), named_push(loop, push or [])
-        log = motion = run_to_goal(loop, goal, push=pushed, ports=(_PORT,), **options)
+        log = run_to_goal(loop, goal, push=pushed, ports=(_PORT,), **options)
         states = {loop.robot.name: log.plant_state}
         threshold = goal_threshold(folder, gamma).threshold
         if "motion" in gamma.calibrations_:
             threshold = gamma.calibrations_["motion"].threshold
-        alarm = alarm_row(motion, threshold)
+        alarm = alarm_row(log, threshold)
         events = [] if alarm is None else [float(log.time_s[alarm])]
     probability, positions = log.extra[_PORT][:, 0], stack_positions(loop, states)
     save_animation(loop, log.time_s, positions, probability, threshold, out, events)

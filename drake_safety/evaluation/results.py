@@ -16,7 +16,6 @@ from drake_safety.files.atomic import replacing
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
-_NUMBERS = ("value", "low", "high", "n")
 _NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
 _DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
 _DAMAGES = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
@@ -51,7 +50,7 @@ class Result(Estimate):
             )
         *rest, metric = _DOT.split(key)
         method = rest.pop() if len(rest) > 1 else ""
-        ends = {name: getattr(estimate, name) for name in _NUMBERS}
+        ends = {name: getattr(estimate, name) for name in ("value", "low", "high", "n")}
         return cls(**ends, set=".".join(rest), method=method, metric=metric)
 
 
@@ -103,10 +102,7 @@ class Results(Mapping[str, Result]):
             found = (content["schema"], content["schema_version"])
             if found != (SCHEMA, SCHEMA_VERSION):
                 raise ValueError(f"schema and version are {found}")
-            figures = {
-                key: Estimate.from_json(dict(zip(_NUMBERS, row, strict=True)))
-                for key, row in content["figures"].items()
-            }
+            figures = {key: Estimate.of_row(row) for key, row in content["figures"].items()}
             return cls(figures, content["entries"])
         except _DAMAGES as error:
             raise ValueError(
