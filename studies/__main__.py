@@ -8,10 +8,12 @@ from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
 from studies.bench import bench
+from studies.compare import compare
 from studies.converged import converged
+from studies.evaluate import evaluate
 from studies.kills import kills
-from studies.learning_curve import train_fewer
 from studies.plan_study import plan_study
+from studies.promises import promises
 from studies.publish import readme, ship, store
 from studies.readings import readings
 from studies.scale import scale
@@ -26,9 +28,11 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.command()(evaluate)
+app.command()(compare)
+app.command()(promises)
 app.command()(ablate)
 app.command()(plan_study)
-app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
 app.command()(readings)
 app.command()(converged)

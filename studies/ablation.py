@@ -19,13 +19,13 @@ from drake_safety.evaluation.metrics import (
     Bootstrap,
     Estimate,
     auc,
-    auc_difference,
     segment_estimates,
     threshold_at,
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
+from studies.baselines import auc_difference
 
 BASELINE = "baseline"
 _SCORE_WEIGHTS = (0.0, 0.001, 0.01, 0.1, 0.3)

@@ -6,10 +6,11 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc_difference, segment_estimates
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, segment_estimates
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from studies.adaptation_study import THRESHOLD, TestSet
+from studies.baselines import auc_difference
 
 BEFORE, PER_CELL, TOTAL = "before_feedback", "n_f_per_cell", "n_f_total"
 

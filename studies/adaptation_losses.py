@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_safety.evaluation.baselines import DirectClassifier
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.segments import Episodes, split
 from studies.adaptation_study import TestSet
+from studies.baselines import DirectClassifier
 
 NUM_NEIGHBOURS = 50
 STEPS = ("x", "psi", "grid", "update", "update_without_gpr")

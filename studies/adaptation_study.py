@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
-from drake_safety.evaluation.scorers import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.progress import StageProgress
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.worker_processes import parallel_map
 

@@ -27,8 +27,8 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
+from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
-from drake_safety.evaluation.plan_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
@@ -96,7 +96,7 @@ def converged(
                 progress=partial(stages, "pairs"),
             )
             literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
-            study = evaluate_throws(
+            found, _ = evaluate_throws(
                 loaded,
                 [
                     TriggerRule(
@@ -107,13 +107,11 @@ def converged(
                     for name, one in literal.items()
                 ],
                 num_throws=throws,
-                num_calibration=0,
                 seed=seeds["disturbances"],
-                calibration_seed=seeds["disturbance thresholds"],
                 num_workers=workers,
                 progress=stages,
             )
-            estimates |= study.estimates
+            estimates |= found
     report = {
         "command": command_line(),
         "scenario": loaded.name,

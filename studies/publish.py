@@ -11,7 +11,7 @@ import typer
 
 from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli.console import TrainingOption, open_stages, print_path
-from drake_safety.cli.evaluate_shifts import SHIFTS_FILE
+from drake_safety.cli.evaluate import SHIFTS_FILE
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.report.results import Results, read_evaluation
 from drake_safety.simulation.dataset import read_info

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import label_of
-from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
 from drake_safety.evaluation.report.results import Results
 from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.report.verdicts import (
@@ -24,6 +23,7 @@ from drake_safety.evaluation.report.verdicts import (
     set_title,
     verdict_tables,
 )
+from studies.plans import SAFE_RECALL, UNSAFE_RECALL
 from studies.shift_table import shifts_text
 from studies.stored_results import read_results
 from studies.walking_table import walking_text

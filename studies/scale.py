@@ -28,7 +28,7 @@ from drake_safety.cli.console import (
 )
 from drake_safety.cli.training_folder import MODES, episodes_folder, run_fresh_episodes
 from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.metrics import Estimate, auc, auc_difference
+from drake_safety.evaluation.metrics import Estimate, auc
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
@@ -37,6 +37,7 @@ from drake_safety.learning.training import segments_for
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
+from studies.baselines import auc_difference
 from studies.learning_curve import parse_sizes
 from studies.scale_figure import STAGES, scale_figure
 

@@ -23,12 +23,13 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import MODES, episodes_folder, load_assessment
 from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.scorers import StageProgress, classifier_scorers
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash, replacing
+from drake_safety.learning.progress import StageProgress
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from studies import command_line
+from studies.baselines import classifier_scorers
 from studies.walking_alarms import (
     alarm_estimates,
     alarm_thresholds,

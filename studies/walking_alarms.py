@@ -7,18 +7,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from drake_safety.evaluation.alarms import Alarm, scorer_alarm, threshold_alarms
-from drake_safety.evaluation.metrics import Estimate, median, proportion
-from drake_safety.evaluation.monitoring_study import (
-    first_alarm,
-    lowest_value,
-    rate_per_hour,
-)
+from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import WatchedMotion
+from studies.alarms import (
+    Alarm,
+    WatchedMotion,
+    first_alarm,
+    lowest_value,
+    scorer_alarm,
+    threshold_alarms,
+)
 from studies.walking_motions import WalkedMotion
 
 EARLY_S = 0.2

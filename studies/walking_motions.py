@@ -12,14 +12,15 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.walking_parameters import profile
+from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 from drake_safety.simulation.worker_processes import Progress, run_batches
+from studies.alarms import WatchedMotion
 
 ROW_S = 0.02
 """Time between two rows of a motion [s]."""

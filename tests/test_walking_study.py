@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.report.results import Results
+from studies.alarms import Alarm
 from studies.walking_alarms import (
     alarm_estimates,
     alarm_thresholds,

@@ -1,8 +1,11 @@
-"""``drake-safety evaluate``: evaluates Γ on fresh episodes and throws, beside baselines."""
+"""``drake-safety evaluate``: evaluates Γ on fresh episodes, on throws, and under shifts."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,44 +21,115 @@ from drake_safety.cli.console import (
     command_line,
     console,
     figures_table,
+    new_table,
     open_stages,
     print_path,
     versions,
 )
-from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
-from drake_safety.cli.evaluate_plans import (
-    PlanOptions,
-    check_options,
-    evaluate_plans,
-)
-from drake_safety.cli.evaluate_shifts import evaluate_shifts_command
-from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
     check_fresh,
     check_writable,
-    episodes_folder,
+    fresh_episodes_folder,
     load_assessment,
     run_fresh_episodes,
 )
 from drake_safety.learning.prediction import CALIBRATED
-from drake_safety.learning.seeds import EVALUATION
+from drake_safety.learning.seeds import EVALUATION, SHIFTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from drake_safety.cli.console import Stages
     from drake_safety.evaluation.metrics import Estimate
-    from drake_safety.evaluation.throw_study import ThrowStudy
-    from drake_safety.learning.segments import Episodes
+    from drake_safety.evaluation.scorers import Scorer
+    from drake_safety.evaluation.shift_study import Motion
+    from drake_safety.evaluation.throw_study import TriggerRule
+    from drake_safety.learning.assessment import SafetyAssessment
+    from drake_safety.learning.segments import Episodes, Segments
+    from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.throws import ThrowLog
 
+SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
+_MOST_JUDGED = 1000  # Nominal motions under `--shifts`; all of them count for false alarms.
+_SHIFT_COLUMNS = {
+    "unsafe": "unsafe",
+    "gamma.unknown": "DK",
+    "gamma.confident_error": "CE",
+    "gamma.auc": "AUC",
+    "paper.unknown": "paper: DK",
+    "paper.confident_error": "CE",
+    "paper.auc": "AUC",
+    "monitor.alarmed": "alarms",
+    "monitor.delay_s": "after [s]",
+    "monitor.delay_95_s": "95 % [s]",
+    "monitor.confident_error_10s": "CE, 10 s with monitor",
+    "monitor.confident_error_60s": "CE, 60 s",
+}
+_SHIFT_CAPTION = (
+    'DK: share of "don\'t know" [%]. CE: share of rows called safe with at least 0.9, not "don\'t '
+    'know", in motions that end unsafely [%]. AUC: of all rows, "don\'t know" the least safe [%]. '
+    'With monitor: rows after its alarm count as "don\'t know", which a scenario with `on_alarm: '
+    "report` does not do. Intervals are in shifts.json."
+)
+
+
+@dataclass(kw_only=True)
+class Evaluation:
+    """An evaluation under way: what is judged, on what, where the results go, and what was found.
+
+    Attributes:
+        assessments: Γ by mode.
+        seed: First seed of the fresh simulations.
+        test_set: Fresh episodes.
+        calibration_set: Other fresh episodes, for thresholds.
+        estimates: By dotted key.
+        pictures: Files of the figures.
+    """
+
+    scenario: Scenario
+    assessments: Mapping[str, SafetyAssessment]
+    run_folder: Path
+    folder: Path
+    seed: int
+    workers: int | None
+    stages: Stages
+    test_set: Episodes
+    calibration_set: Episodes
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    pictures: list[Path] = field(default_factory=list)
+
+    @property
+    def scorers(self) -> list[Scorer]:
+        """Calibrated Γ of either mode."""
+        from drake_safety.evaluation.scorers import assessment_scorer
+
+        return [assessment_scorer(m, one, CALIBRATED) for m, one in self.assessments.items()]
+
+    @property
+    def plan_thresholds(self) -> dict[str, float]:
+        """Stored thresholds of plans by mode, of the unsafe score."""
+        stored = {mode: one.calibrations_.get("plan") for mode, one in self.assessments.items()}
+        return {mode: 1.0 - one.threshold for mode, one in stored.items() if one is not None}
+
+    def add(self, estimates: Mapping[str, Estimate], **figures: Figure) -> None:
+        """Adds results, and figures by name, which are written."""
+        from drake_safety.evaluation.figure_style import save
+
+        self.estimates |= estimates
+        for name, figure in figures.items():
+            self.pictures += save(figure, self.folder / name)
 
 
 def evaluate(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other nominal episodes, for thresholds of the recalls.", min=20)
+    ] = 300,
     throws: Annotated[
         int | None,
         typer.Option(
@@ -63,308 +137,334 @@ def evaluate(
             min=0,
         ),
     ] = None,
-    calibration_episodes: Annotated[
-        int, typer.Option(help="Other nominal episodes, for thresholds of the recalls.", min=20)
-    ] = 300,
-    calibration_throws: Annotated[
-        int, typer.Option(help="Other throws, for thresholds of the baseline classifiers.", min=1)
-    ] = 200,
-    other_hand: Annotated[
-        int | None,
-        typer.Option(
-            help="Targets: number mirrored to the other hand; at most 400 by default.", min=0
-        ),
-    ] = None,
-    plane_x: Annotated[
-        float | None,
-        typer.Option(help="Targets: x of the reachable region's plane [m]; the task's by default."),
-    ] = None,
-    plane_step: Annotated[
-        float,
-        typer.Option(
-            help="Targets: spacing of those simulated on it [m]; 0 to leave it out.", min=0
-        ),
-    ] = 0.1,
-    pushes: Annotated[
-        int,
-        typer.Option(
-            help="Targets: pushed motions of the actual robot, to evaluate alarms; as many more "
-            "for thresholds.",
-            min=0,
-        ),
-    ] = 0,
     shifts: Annotated[
         int,
         typer.Option(
-            help="Motions of each shift of plant, sensors and plans: evaluates Γ's \"don't know\" "
+            help="Motions of each changed plant and faulty sensor: evaluates Γ's \"don't know\" "
             "and the monitor instead of all else.",
             min=0,
         ),
     ] = 0,
-    baselines: Annotated[
-        bool,
-        typer.Option(
-            "--baselines/--no-baselines",
-            help="Baseline classifiers, trained on the same episodes; they take half of the time.",
-        ),
-    ] = True,
     seed: Annotated[
-        int, typer.Option(help="First of the seeds of fresh simulations.")
-    ] = EVALUATION.first,
+        int | None,
+        typer.Option(
+            help=f"First of the seeds of fresh simulations; by default {EVALUATION.first}, "
+            f"{SHIFTS.first} with --shifts."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Evaluate Γ on fresh episodes and throws, beside the paper's form and baseline classifiers.
+    """Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other plants.
 
-    For plans with a goal, verdicts on fresh targets at k = 0 are evaluated, beside inverse
-    kinematics. Episodes are kept in ASSESSMENT: a stopped evaluation continues. With throws, or
-    --pushes, Γ is evaluated as an alarm too, beside margins and tracking errors. With --shifts,
-    only motions under conditions that training does not have are evaluated.
+    It gives AUC, recalls and reliability, in every row and in the first of an episode, and falls
+    with and without recovery. Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
-    from drake_safety.evaluation.embedding_figure import embedding_figure
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.report.results import Results
-    from drake_safety.evaluation.report.verdicts import verdict_tables
-    from drake_safety.evaluation.scorers import classifier_scorers
-    from drake_safety.learning.assessment_file import file_hash, replacing
-    from drake_safety.simulation.capabilities import (
-        CanBePushed,
-        HasBall,
-        HasGoals,
-        require,
-    )
-    from drake_safety.simulation.dataset import load_episodes
+    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
     check_writable(assessment, out or assessment)
     if shifts:
-        evaluate_shifts_command(
-            loaded,
-            assessment,
-            shifts,
-            episodes,
-            baselines=baselines,
-            seed=None if seed == EVALUATION.first else seed,
-            folder=out or assessment,
-            workers=workers,
-        )
+        evaluate_shifts(loaded, assessment, shifts, episodes, seed, out or assessment, workers)
         return
     loop = loaded.make_loop()
-    has_goals, has_recovery = isinstance(loop, HasGoals), isinstance(loop, HasBall)
     if throws is None:
-        throws = _DEFAULT_THROWS if has_recovery and not has_goals else 0
+        is_thrown_at = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
+        throws = _DEFAULT_THROWS if is_thrown_at else 0
     if throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
-    if pushes:
-        require(loop, HasGoals, "evaluate: leave out --pushes; alarms are evaluated on throws")
-        require(loop, CanBePushed, "evaluate: leave out --pushes")
-        loaded.variation("actual")
-    options = PlanOptions(
-        other_hand=other_hand,
-        plane_x=plane_x,
-        plane_step=plane_step,
-    )
-    folder = out or assessment
-    sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
-    # Without baselines, the training episodes need not be there.
-    train_set = load_episodes(episodes_folder(assessment)) if baselines else None
-    trained = next(one for one in sharpened.used_ if one.purpose == "training")
+    with begun(
+        loaded, assessment, episodes, calibration_episodes, seed, out or assessment, workers
+    ) as evaluation:
+        add_verdicts(evaluation, evaluation.scorers)
+        add_reliability(evaluation)
+        if throws:
+            add_throws(evaluation, throws)
+    write(evaluation, command_line())
+
+
+@contextmanager
+def begun(
+    scenario: Scenario,
+    run_folder: Path,
+    num_episodes: int,
+    num_calibration: int,
+    seed: int | None,
+    folder: Path,
+    workers: int | None,
+) -> Iterator[Evaluation]:
+    """An evaluation with its fresh episodes, the first results being its maps."""
+    from drake_safety.evaluation.embedding_figure import embedding_figure
+
+    assessments = {mode: load_assessment(run_folder, mode) for mode in MODES}
     seeds = EVALUATION.seeds(seed)
-    for gamma in (sharpened, paper):
-        check_fresh(gamma, loaded, seeds.values())
-    check_options(loop, options)
+    for gamma in assessments.values():
+        check_fresh(gamma, scenario, seeds.values())
     with open_stages() as stages:
-
-        def run_set(what: str, num_episodes: int, purpose: str, **loop_options: Any) -> Episodes:
-            progress = partial(stages, what)
-            return run_fresh_episodes(
-                loaded,
-                assessment,
-                num_episodes,
-                seeds[purpose],
-                progress,
-                workers,
-                **loop_options,
+        test_set, calibration_set = (
+            run_fresh_episodes(
+                scenario, run_folder, number, seeds[purpose], partial(stages, what), workers
             )
-
-        test_set = run_set("fresh nominal episodes", episodes, "evaluation")
-        calibration_set = run_set("calibration episodes", calibration_episodes, "thresholds")
-        shortest = sharpened.parameters.shortest_segment or None
-        judged = Judged(
-            scenario=loaded,
-            sharpened=sharpened,
-            paper=paper,
-            classifiers=classifier_scorers(train_set, stages, shortest=shortest)
-            if train_set is not None
-            else [],
-            run_folder=assessment,
-            calibration_set=calibration_set,
-            test_set=test_set,
+            for what, number, purpose in (
+                ("fresh nominal episodes", num_episodes, "evaluation"),
+                ("calibration episodes", num_calibration, "thresholds"),
+            )
+        )
+        evaluation = Evaluation(
+            scenario=scenario,
+            assessments=assessments,
+            run_folder=run_folder,
             folder=folder,
+            seed=seeds["evaluation"],
             workers=workers,
             stages=stages,
+            test_set=test_set,
+            calibration_set=calibration_set,
         )
-        findings = Findings(
-            pictures=[
-                *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
-                *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
-            ]
-        )
-        if has_goals:
-            findings.add(evaluate_plans(judged, options, partial(run_set, purpose="evaluation")))
-        else:
-            findings.add(_evaluate_segments(judged))
-        findings.add(_evaluate_calibration(judged))
-        if throws:
-            findings.add(_evaluate_throws(judged, throws, calibration_throws, seeds))
-        if pushes:
-            findings.add(
-                evaluate_pushes(
-                    judged,
-                    pushes,
-                    pushes,
-                    threshold=findings.estimates["plans.sharpened.threshold"].value,
-                    seed=seeds["disturbances"],
-                    calibration_seed=seeds["disturbance thresholds"],
-                )
-            )
-    report = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "scenario_hash": sharpened.info_.scenario_hash,
-        "seed": seed,
-        "training_seed": trained.seed,
-        "training_episodes": trained.num_episodes,
-        "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
-        "versions": versions(),
-        **findings.entries,
-        **{key: estimate.to_json() for key, estimate in findings.estimates.items()},
-    }
-    file = folder / "evaluation.json"
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for table in verdict_tables(Results(estimates=findings.estimates)):
-        console.print(figures_table(table))
-    print_path("figures", file)
-    for picture in findings.pictures:
-        print_path("picture", picture)
+        maps = {f"embedding_{m}": embedding_figure(g, test_set) for m, g in assessments.items()}
+        evaluation.add({}, **maps)
+        yield evaluation
 
 
-def _evaluate_segments(judged: Judged) -> Findings:
-    """Evaluates all scorers on fresh episodes, on every segment and at k = 0."""
-    from drake_safety.evaluation.episode_study import evaluate_episodes
-    from drake_safety.evaluation.figure_style import save
+def add_verdicts(
+    evaluation: Evaluation, scorers: Sequence[Scorer]
+) -> tuple[dict[str, np.ndarray], Segments]:
+    """Evaluates scorers on fresh plans with a goal, else on every segment and first rows.
+
+    Returns:
+        Unsafe scores by scorer, (N,), and the N judged segments.
+    """
+    from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
     from drake_safety.evaluation.roc_figure import roc_figure
-    from drake_safety.evaluation.scorers import assessment_scorer
+    from drake_safety.simulation.capabilities import HasGoals
 
-    scorers = [
-        assessment_scorer("sharpened", judged.sharpened, CALIBRATED),
-        assessment_scorer("paper", judged.paper, CALIBRATED),
-        *judged.classifiers,
-    ]
-    estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
-    curves = {name: (score, labels) for name, score in scores.items()}
-    return Findings(
-        estimates=estimates,
-        pictures=save(roc_figure(curves), judged.folder / "roc"),
-    )
+    sets = evaluation.calibration_set, evaluation.test_set
+    if isinstance(evaluation.scenario.make_loop(), HasGoals):
+        found, scores, rows = evaluate_plans(scorers, *sets, evaluation.plan_thresholds)
+    else:
+        found, scores, rows = evaluate_episodes(scorers, *sets)
+    evaluation.add(found, roc=roc_figure(scores, rows.is_unsafe))
+    return scores, rows
 
 
-def _evaluate_throws(
-    judged: Judged, num_throws: int, num_calibration: int, seeds: dict[str, int]
-) -> Findings:
-    """Evaluates all rules as triggers of recovery, and alarms on the same throws."""
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
-    from drake_safety.simulation.watched_motion import WatchedMotion
-
-    recovery = judged.scenario.parameters.recovery
-    rules = trigger_rules(
-        judged.sharpened,
-        judged.paper,
-        judged.classifiers,
-        threshold=recovery.threshold,
-        is_normalized=recovery.is_normalized,
-    )
-    study = evaluate_throws(
-        judged.scenario,
-        rules,
-        persistence_s=recovery.persistence_s,
-        num_throws=num_throws,
-        num_calibration=num_calibration,
-        seed=seeds["disturbances"],
-        calibration_seed=seeds["disturbance thresholds"],
-        num_workers=judged.workers,
-        progress=judged.stages,
-    )
-    estimates = dict(study.estimates)
-    estimates["throws.falls_with_recovery"] = estimates["throws.sharpened.falls_with_recovery"]
-    findings = Findings(
-        estimates=estimates,
-        pictures=save(_throws_picture(study), judged.folder / "throws"),
-    )
-    findings.add(
-        evaluate_monitoring(
-            judged,
-            [WatchedMotion.of_throw(log) for log in study.calibration_logs],
-            [WatchedMotion.of_throw(log) for log in study.logs],
-        )
-    )
-    return findings
-
-
-def _throws_picture(study: ThrowStudy) -> Figure:
-    from drake_safety.evaluation.throws_figure import throws_figure
-
-    balls = [log.throw for log in study.logs]
-    return throws_figure(
-        np.array([ball.speed_m_s for ball in balls]),
-        np.array([ball.direction_rad for ball in balls]),
-        {
-            "without recovery": study.outcomes(),
-            "with recovery, triggered by Γ": study.outcomes("sharpened"),
-        },
-        mass_kg=np.array([ball.mass_kg for ball in balls]),
-    )
-
-
-def _evaluate_calibration(judged: Judged) -> Findings:
-    """Reliability of both modes at k = 0, and rates of stored calibrations."""
-    from drake_safety.evaluation.calibration_study import reliability, verdict_shares
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.metrics import Bootstrap
-    from drake_safety.evaluation.reliability_figure import reliability_figure
-    from drake_safety.evaluation.scorers import assessment_scorer
+def add_reliability(evaluation: Evaluation) -> None:
+    """Evaluates the reliability of either mode, and its stored calibrations."""
+    from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
     from drake_safety.learning.calibration import PLAN, episode_scores
     from drake_safety.learning.segments import split
 
-    segments = split(judged.test_set, stride=1, discount=1.0, shortest=1)
-    estimates: dict[str, Estimate] = {}
-    curves = {}
-    for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
-        score = assessment_scorer(mode, gamma, CALIBRATED).unsafe_score(segments)
-        expected, is_unsafe = episode_scores(segments, score, PLAN)
-        curves[mode] = reliability(expected, is_unsafe)
-
-        def error(
-            weight: np.ndarray, p: np.ndarray = expected, label: np.ndarray = is_unsafe
-        ) -> float:
-            drawn = np.repeat(np.arange(len(p)), weight.astype(int))
-            return reliability(p[drawn], label[drawn]).calibration_error
-
-        estimates[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
-            num_resamples=100
-        ).over_episodes(error, np.arange(len(expected)))
-        for kind, one in gamma.calibrations_.items():
+    segments = split(evaluation.test_set, stride=1, discount=1.0, shortest=1)
+    found, curves = {}, {}
+    for scorer in evaluation.scorers:
+        mode, score = scorer.name, scorer.unsafe_score(segments)
+        of_first, label = episode_scores(segments, score, PLAN)
+        first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
+        rows = reliability(score, segments.is_unsafe, segments.episode)
+        curves[f"{mode}, every row"] = rows
+        found[f"calibration.{mode}.expected_calibration_error"] = first.error
+        found[f"calibration.{mode}.rows.expected_calibration_error"] = rows.error
+        for kind, one in evaluation.assessments[mode].calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            estimates |= {
-                f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()
-            }
-    return Findings(
-        estimates=estimates,
-        pictures=save(reliability_figure(curves), judged.folder / "reliability"),
+            found |= {f"calibration.{mode}.{kind}.{what}": n for what, n in shares.items()}
+    evaluation.add(found, reliability=reliability_figure(curves))
+
+
+def add_throws(
+    evaluation: Evaluation, num_throws: int, rules: Sequence[TriggerRule] = ()
+) -> list[ThrowLog]:
+    """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
+    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
+
+    recovery = evaluation.scenario.parameters.recovery
+    own = trigger_rules(
+        *evaluation.assessments.values(),
+        threshold=recovery.threshold,
+        is_normalized=recovery.is_normalized,
+    )
+    found, logs = evaluate_throws(
+        evaluation.scenario,
+        [*own, *rules],
+        persistence_s=recovery.persistence_s,
+        num_throws=num_throws,
+        seed=EVALUATION.seeds(evaluation.seed)["disturbances"],
+        num_workers=evaluation.workers,
+        progress=evaluation.stages,
+    )
+    evaluation.add(found)
+    return logs
+
+
+def write(evaluation: Evaluation, command: str) -> None:
+    """Writes ``evaluation.json`` and prints its tables."""
+    from drake_safety.evaluation.report.results import Results
+    from drake_safety.evaluation.report.verdicts import verdict_tables
+
+    sharpened = evaluation.assessments[MODES[0]]
+    trained = next(one for one in sharpened.used_ if one.purpose == "training")
+    entries = {
+        "command": command,
+        "scenario": evaluation.scenario.name,
+        "scenario_hash": sharpened.info_.scenario_hash,
+        "seed": evaluation.seed,
+        "training_seed": trained.seed,
+        "training_episodes": trained.num_episodes,
+        "calibration_episodes": len(evaluation.calibration_set),
+    }
+    file = evaluation.folder / "evaluation.json"
+    write_estimates(file, evaluation.run_folder, entries, evaluation.estimates)
+    for table in verdict_tables(Results(estimates=evaluation.estimates)):
+        console.print(figures_table(table))
+    for picture in evaluation.pictures:
+        print_path("picture", picture)
+
+
+def write_estimates(
+    file: Path, run_folder: Path, entries: Mapping[str, Any], estimates: Mapping[str, Estimate]
+) -> None:
+    """Writes entries, versions and estimates as JSON."""
+    from drake_safety.learning.assessment_file import file_hash, replacing
+
+    content = {
+        **entries,
+        "assessment_sha256": {m: file_hash(assessment_file(run_folder, m)) for m in MODES},
+        "versions": versions(),
+        **{key: estimate.to_json() for key, estimate in estimates.items()},
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    print_path("figures", file)
+
+
+def evaluate_shifts(
+    scenario: Scenario,
+    run_folder: Path,
+    num_motions: int,
+    num_nominal: int,
+    seed: int | None,
+    folder: Path,
+    workers: int | None,
+) -> None:
+    """Evaluates Γ on changed plants and faulty sensors, and writes ``shifts.json``.
+
+    Args:
+        scenario: The scenario.
+        run_folder: Folder written by `train`.
+        num_motions: Motions of each shift.
+        num_nominal: Nominal motions, for false alarms.
+        seed: Seed of the motions; None for the default.
+        folder: Folder of the results.
+        workers: Number of worker processes; None for one a core.
+    """
+    from drake_safety.evaluation.shift_study import (
+        JudgedShift,
+        assessment_judge,
+        false_alarms,
+        monitor_estimates,
+        shift_estimates,
+    )
+
+    gamma, paper = (load_assessment(run_folder, mode) for mode in MODES)
+    (own_seed,) = SHIFTS.seeds(seed).values()
+    for one in (gamma, paper):
+        check_fresh(one, scenario, [own_seed])
+    judges = {"gamma": assessment_judge(gamma), "paper": assessment_judge(paper)}
+    found: dict[str, dict[str, Estimate]] = {}
+    with open_stages() as stages:
+        nominal, sets = shifted_motions(
+            scenario, run_folder, num_motions, num_nominal, own_seed, workers, stages
+        )
+        for i, (name, (kind, motions)) in enumerate(sets.items()):
+            stages("shifts", i, len(sets))
+            judged = JudgedShift.judged_by(judges, motions, gamma)
+            found[name] = shift_estimates(judged)
+            if kind != "nominal":
+                found[name] |= monitor_estimates(judged)
+        stages("shifts", len(sets), len(sets))
+        found["nominal"]["monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
+    kinds = {name: kind for name, (kind, _) in sets.items()}
+    write_shifts(scenario, run_folder, folder, own_seed, command_line(), kinds, found)
+
+
+def shifted_motions(
+    scenario: Scenario,
+    run_folder: Path,
+    num_motions: int,
+    num_nominal: int,
+    seed: int,
+    workers: int | None,
+    stages: Stages,
+) -> tuple[list[Motion], dict[str, tuple[str, list[Motion]]]]:
+    """Simulates the nominal plant and each changed one.
+
+    Returns:
+        All nominal motions, and by shift its kind, "nominal", "plant" or "sensor", and its motions.
+    """
+    from drake_safety.evaluation.shift_study import motions_of
+    from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+    from drake_safety.simulation.capabilities import judging_options
+    from drake_safety.simulation.rollouts import run_episodes
+
+    nominal = motions_of(
+        run_fresh_episodes(
+            scenario, run_folder, num_nominal, seed, partial(stages, "nominal motions"), workers
+        )
+    )
+    sets = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
+    shifts = plant_shifts(scenario, scenario.make_loop())
+    for i, (name, shift) in enumerate(shifts.items()):
+        stages("shifted motions", i, len(shifts))
+        shifted = shifted_scenario(scenario, name, shift)
+        options = {**judging_options(scenario.task_class()), **shift.options}
+        path = fresh_episodes_folder(run_folder, shifted.simulation_hash(name), seed, options)
+        episodes = run_episodes(
+            shifted,
+            num_motions,
+            variation=name,
+            seed=seed,
+            num_workers=workers,
+            path=path,
+            **options,
+        )
+        sets[name] = (shift.kind, motions_of(episodes))
+    stages("shifted motions", len(shifts), len(shifts))
+    return nominal, sets
+
+
+def write_shifts(
+    scenario: Scenario,
+    run_folder: Path,
+    folder: Path,
+    seed: int,
+    command: str,
+    kinds: Mapping[str, str],
+    found: Mapping[str, Mapping[str, Estimate]],
+) -> None:
+    """Writes ``shifts.json`` and prints its table; `kinds` and `found` are by shift."""
+    entries = {"command": command, "scenario": scenario.name, "seed": seed, "kinds": kinds}
+    estimates = {f"shifts.{n}.{key}": one for n, of in found.items() for key, one in of.items()}
+    write_estimates(folder / SHIFTS_FILE, run_folder, entries, estimates)
+    used = {
+        key: title
+        for key, title in _SHIFT_COLUMNS.items()
+        if any(key in of for of in found.values())
+    }
+    table = new_table("shift", *used.values(), title="Γ under shifts")
+    table.caption = _SHIFT_CAPTION
+    for name, of in found.items():
+        cells = [
+            f"{(1.0 if key.endswith('_s') else 100.0) * of[key].value:.1f}" if key in of else ""
+            for key in used
+        ]
+        table.add_row(name.replace("_", " "), *cells)
+    console.print(table)
+    false = found["nominal"]["monitor.false_alarms_per_hour"]
+    console.print(
+        f"false alarms of the monitor: {false.value:.2f} ({false.low:.2f}–{false.high:.2f}) an "
+        f"hour on {false.n} safe nominal motions",
+        highlight=False,
     )

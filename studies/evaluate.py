@@ -1,0 +1,273 @@
+"""``python -m studies evaluate``: `drake-safety evaluate` beside baselines, with what docs show.
+
+Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, baseline classifiers,
+inverse kinematics, the other hand, the reachable region, and alarms on pushed motions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from drake_safety.cli.console import ClusterOption, ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.cli.evaluate import (
+    Evaluation,
+    add_reliability,
+    add_throws,
+    add_verdicts,
+    begun,
+    write,
+)
+from drake_safety.cli.training_folder import (
+    check_writable,
+    episodes_folder,
+    run_fresh_episodes,
+)
+from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.seeds import EVALUATION
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    HasBall,
+    HasGoals,
+    HasMirrorImage,
+    goal_words,
+    judging_options,
+    require,
+)
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.scenario import load_scenario
+from drake_safety.simulation.throws import run_throws
+from studies import command_line
+from studies.alarms import (
+    WatchedMotion,
+    accepted,
+    assessment_alarms,
+    evaluate_alarms,
+    scorer_alarm,
+    threshold_alarms,
+)
+from studies.baselines import KINDS, auc_difference, classifier_scorers
+from studies.plans import Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
+from studies.pushed_motions import run_pushed_motions
+from studies.reachability import BASELINES, Reachability
+from studies.reachable_region import reachable_region, region_figure
+from studies.shifts import evaluate_shifts
+from studies.throws import classifier_rules
+
+_PLANT = "actual"
+
+
+def evaluate(
+    scenario: ScenarioArgument,
+    assessment: TrainingOption,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other nominal episodes, for thresholds.", min=20)
+    ] = 300,
+    calibration_throws: Annotated[
+        int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
+    ] = 200,
+    other_hand: Annotated[
+        int, typer.Option(help="Targets: number mirrored to the other hand.", min=0)
+    ] = 0,
+    plane_x: Annotated[
+        float | None, typer.Option(help="Targets: x of the reachable region's plane [m].")
+    ] = None,
+    plane_step: Annotated[
+        float, typer.Option(help="Targets: spacing on it [m]; 0 to leave it out.", min=0)
+    ] = 0.0,
+    pushes: Annotated[
+        int, typer.Option(help="Targets: pushed motions, and as many for thresholds.", min=0)
+    ] = 0,
+    shifts: Annotated[
+        int, typer.Option(help="Motions of each shift, instead of all else.", min=0)
+    ] = 0,
+    seed: Annotated[int | None, typer.Option(help="First of the seeds.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; ASSESSMENT's by default.")] = None,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+) -> None:
+    """Evaluate Γ beside baselines, trained on the same episodes, for README and docs."""
+    loaded, folder = load_scenario(scenario), out or assessment
+    check_writable(assessment, folder)
+    if shifts:
+        evaluate_shifts(loaded, assessment, shifts, episodes, seed, folder, workers)
+        return
+    loop = loaded.make_loop()
+    if throws:
+        require(loop, HasBall)
+    if pushes:
+        require(loop, CanBePushed)
+    training = load_episodes(episodes_folder(assessment))
+    with begun(
+        loaded, assessment, episodes, calibration_episodes, seed, folder, workers
+    ) as evaluation:
+        shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
+        classifiers = classifier_scorers(training, evaluation.stages, shortest=shortest)
+        if isinstance(loop, HasGoals):
+            limit = _add_plans(evaluation, loop, classifiers, other_hand, plane_x, plane_step)
+            if pushes:
+                _add_pushes(evaluation, loop, classifiers, pushes, 1.0 - limit)
+        else:
+            _add_differences(evaluation, classifiers)
+        add_reliability(evaluation)
+        if throws:
+            _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
+    write(evaluation, command_line())
+
+
+def _add_differences(evaluation: Evaluation, classifiers: Sequence[Scorer]) -> None:
+    """Verdicts, and the AUC of Γ minus that of the better classifier."""
+    scores, segments = add_verdicts(evaluation, [*evaluation.scorers, *classifiers])
+    found = evaluation.estimates
+    everywhere = np.ones(len(segments), dtype=bool)
+    for kind, rows in (("segments", everywhere), ("episodes", segments.is_first)):
+        best = max(KINDS, key=lambda name: found[f"{kind}.{name}.auc"].value)
+        found[f"{kind}.sharpened_minus_best_classifier.auc"] = auc_difference(
+            scores["sharpened"][rows],
+            scores[best][rows],
+            segments.is_unsafe[rows],
+            segments.episode[rows],
+        )
+
+
+def _add_plans(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    num_other: int,
+    plane_x: float | None,
+    plane_step: float,
+) -> float:
+    """Verdicts on all, fair and mirrored targets; returns the threshold of the unsafe score."""
+    scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
+    sets = {"plans": plans_of(loop, evaluation.test_set)}
+    if num_other:
+        mirror = require(loop, HasMirrorImage).mirror_options
+        seed, stages = evaluation.seed, evaluation.stages
+        # The same random draws, mirrored.
+        episodes = run_fresh_episodes(
+            scenario,
+            evaluation.run_folder,
+            num_other,
+            seed,
+            partial(stages, "fresh targets, other hand"),
+            evaluation.workers,
+            **mirror,
+        )
+        mirrored = scenario.make_loop(**judging_options(type(loop)), **mirror)
+        sets["plans.other_hand"] = plans_of(mirrored, episodes)
+    rules: dict[str, Rule] = {
+        one.name: scorer_rule(one) for one in (*evaluation.scorers, *classifiers)
+    }
+    thresholds = evaluation.plan_thresholds
+    hands = [plans.hand for plans in sets.values() if plans.hand is not None]
+    if hands:
+        robot = loop.robot  # type: ignore[attr-defined]
+        for name, is_free in BASELINES.items():
+            reach = {hand: Reachability(robot, hand, is_base_free=is_free) for hand in hands}
+            rules[name] = reachability_rule(reach)
+            thresholds[name] = 0.5
+    found, limits = evaluate_plans(
+        rules,
+        thresholds,
+        gamma,
+        plans_of(loop, evaluation.calibration_set),
+        sets,
+        [key for key in sets if key != "plans"],
+    )
+    evaluation.add(found)
+    if plane_step and goal_words(require(loop, HasGoals)).is_point:
+        region = reachable_region(
+            scenario,
+            gamma,
+            evaluation.stages,
+            threshold=1.0 - limits["sharpened"],
+            x_m=plane_x,
+            step_m=plane_step,
+            num_workers=evaluation.workers,
+        )
+        figure = region_figure(region, list(evaluation.test_set.info.constraint_names))
+        estimates = {f"plans.plane.{key}": one for key, one in region.estimates().items()}
+        evaluation.add(estimates, reachable_region=figure)
+    return limits["sharpened"]
+
+
+def _add_throws(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    num_throws: int,
+    num_calibration: int,
+) -> None:
+    seed = EVALUATION.seeds(evaluation.seed)["disturbance thresholds"]
+    calibration = run_throws(
+        evaluation.scenario,
+        list(range(num_calibration)),
+        seed=seed,
+        variation=_PLANT,
+        num_workers=evaluation.workers,
+        progress=partial(evaluation.stages, "calibration throws"),
+    )
+    persistence_s = evaluation.scenario.parameters.recovery.persistence_s
+    rules = classifier_rules(classifiers, calibration, persistence_s)
+    logs = add_throws(evaluation, num_throws, rules)
+    sets = ([WatchedMotion.of_throw(log) for log in one] for one in (calibration, logs))
+    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, *sets))
+
+
+def _add_pushes(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    num_motions: int,
+    threshold: float,
+) -> None:
+    """Alarms on pushed motions to accepted goals that are safe without a push."""
+    seeds = EVALUATION.seeds(evaluation.seed)
+    calibration, test = (
+        run_pushed_motions(
+            evaluation.scenario,
+            num_motions,
+            seed=seeds[purpose],
+            variation=_PLANT,
+            num_workers=evaluation.workers,
+            progress=partial(evaluation.stages, what),
+        )
+        for what, purpose in (
+            ("calibration pushes", "disturbance thresholds"),
+            ("pushes", "disturbances"),
+        )
+    )
+    verdict = evaluation.scorers[0]
+    kept, others = (accepted(one, verdict, threshold) for one in (test, calibration))
+    refused = proportion(len(test) - len(kept), len(test))
+    evaluation.add({"monitoring.motions.refused": refused})
+    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, others, kept))
+
+
+def _alarm_estimates(
+    evaluation: Evaluation,
+    loop: Any,
+    classifiers: Sequence[Scorer],
+    calibration: Sequence[WatchedMotion],
+    test: Sequence[WatchedMotion],
+) -> dict[str, Estimate]:
+    if all(motion.has_left for motion in calibration):
+        return {}  # Thresholds need motions that stay safe.
+    watched = loop.watched_features if isinstance(loop, CanFall) else {}
+    alarms = [
+        *(a for mode, one in evaluation.assessments.items() for a in assessment_alarms(mode, one)),
+        *(scorer_alarm(scorer) for scorer in classifiers),
+        *threshold_alarms(loop.state_names, loop.feature_names, watched),
+    ]
+    return evaluate_alarms(alarms, calibration, test)
