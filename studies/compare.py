@@ -13,7 +13,7 @@ import typer
 from drake_safety.cli.console import console, interval, new_table, print_path
 from drake_safety.evaluation.figure_style import drawing_style, new_figure, save
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.report.results import read_evaluation
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.stills import StillCamera
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -44,9 +44,9 @@ def compare(
     """Compare evaluated runs of several scenarios, and draw the robots with their figures."""
     rows, stills = {}, {}
     for run in runs:
-        results = read_evaluation(run / "evaluation.json")
+        results = Results.read(run / "evaluation.json")
         name = results.entries["scenario"]
-        rows[name] = results.estimates
+        rows[name] = results
         still = standing_still(load_scenario(name).make_loop())
         if still is not None:
             stills[name] = still

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
@@ -29,6 +28,7 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
@@ -112,7 +112,7 @@ def converged(
                 progress=stages,
             )
             estimates |= found
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "seed": seed,
@@ -120,10 +120,9 @@ def converged(
         "feedback_episodes": calibration_episodes,
         "feedback_pairs": pairs,
         "versions": versions(),
-        **{f"converged.{key}": estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / CONVERGED_FILE
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    Results({f"converged.{key}": one for key, one in estimates.items()}, entries).write(file)
     table = new_table("figure", "value", "interval", "n")
     for key, one in estimates.items():
         table.add_row(key, f"{one.value:.3f}", f"{one.low:.3f} to {one.high:.3f}", f"{one.n}")

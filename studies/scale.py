@@ -38,7 +38,7 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.baselines import auc_difference
-from studies.learning_curve import parse_sizes
+from studies.readings import parse_sizes
 from studies.scale_figure import STAGES, scale_figure
 
 SCALE_FILE = "scale.json"

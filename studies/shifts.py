@@ -406,7 +406,7 @@ def evaluate_shifts(
     (own_seed,) = SHIFTS.seeds(seed).values()
     check_fresh(gamma, scenario, [own_seed])
     training = load_episodes(episodes_folder(run_folder))
-    found = {}
+    found: dict[str, Estimate] = {}
     with open_stages() as stages:
         shortest = gamma.parameters.shortest_segment or None
         classifiers = classifier_scorers(training, stages, shortest=shortest)
@@ -424,10 +424,11 @@ def evaluate_shifts(
         for i, (name, (kind, motions)) in enumerate(sets.items()):
             stages("shifts", i, len(sets))
             judged = JudgedShift.judged_by(judges, motions, gamma)
-            found[name] = shift_estimates(judged) | baseline_estimates(judged, kind)
+            of = shift_estimates(judged) | baseline_estimates(judged, kind)
             if kind in _LASTING:
-                found[name] |= monitor_estimates(judged)
+                of |= monitor_estimates(judged)
+            found |= {f"shifts.{name}.{key}": one for key, one in of.items()}
         stages("shifts", len(sets), len(sets))
-        found["nominal"]["monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
+    found["shifts.nominal.monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
     kinds = {name: kind for name, (kind, _) in sets.items()}
     write_shifts(scenario, run_folder, folder, own_seed, command_line(), kinds, found)

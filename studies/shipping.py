@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -25,7 +24,7 @@ from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 from studies.cards import write_card
-from studies.stored_results import EVALUATION_FILE, read_results, store_results
+from studies.stored_results import EVALUATION_FILE, store_results
 
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
@@ -98,7 +97,7 @@ def ship(
     for file in files.values():
         shutil.copyfile(file, folder / file.name)
     store_results(
-        replace(results, entries=results.entries | stored),
+        Results(results, results.entries | stored),
         folder / EVALUATION_FILE,
         train_command=train_command,
     )
@@ -123,7 +122,7 @@ def check_shipped(folder: Path, scenario: Scenario, *, num_workers: int | None =
         ValueError: A file or the scenario has changed, or outcomes or verdicts of the first
             episodes differ from the stored ones.
     """
-    results = read_results(folder / EVALUATION_FILE)
+    results = Results.read(folder / EVALUATION_FILE)
     stored = results.entries
     missing = [key for key in (_HASHES, _VERDICTS, "seed", "scenario_hash") if key not in stored]
     if missing:

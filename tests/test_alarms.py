@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.verdict_tables import verdict_table
 from studies.alarms import (
     Alarm,
     WatchedMotion,
@@ -177,6 +179,14 @@ def test_what_an_engineer_would_watch_is_found_by_name():
         {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
     )
     assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
+
+
+def test_the_table_says_where_another_alarm_is_ahead():
+    found = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST, num_rows=1)
+    table = verdict_table(Results(found), "monitoring")
+    assert [row.key for row in table.rows] == ["sharpened", "tilt"]
+    (first, *_) = table.better_baselines()
+    assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
 
 
 def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():

@@ -1,10 +1,9 @@
 """The table and the picture of several evaluated runs."""
 
-import json
-
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import shuttling
 from studies.compare import compare, comparison_figure, standing_still
@@ -17,8 +16,7 @@ FIGURES = {
 
 
 def test_a_run_is_a_row_and_what_it_was_not_asked_a_dash(tmp_path, capsys):
-    content = {key: one.to_json() for key, one in FIGURES.items()} | {"scenario": "pendulum"}
-    (tmp_path / "evaluation.json").write_text(json.dumps(content))
+    Results(FIGURES, {"scenario": "pendulum"}).write(tmp_path / "evaluation.json")
     compare([tmp_path])
     printed = capsys.readouterr().out
     assert "pendulum" in printed and "95.0" in printed and "40.0" in printed

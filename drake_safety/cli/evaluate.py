@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,8 +19,6 @@ from drake_safety.cli.console import (
     WorkersOption,
     command_line,
     console,
-    figures_table,
-    new_table,
     open_stages,
     print_path,
     versions,
@@ -54,26 +51,6 @@ if TYPE_CHECKING:
 SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
 _MOST_JUDGED = 1000  # Nominal motions under `--shifts`; all of them count for false alarms.
-_SHIFT_COLUMNS = {
-    "unsafe": "unsafe",
-    "gamma.unknown": "DK",
-    "gamma.confident_error": "CE",
-    "gamma.auc": "AUC",
-    "paper.unknown": "paper: DK",
-    "paper.confident_error": "CE",
-    "paper.auc": "AUC",
-    "monitor.alarmed": "alarms",
-    "monitor.delay_s": "after [s]",
-    "monitor.delay_95_s": "95 % [s]",
-    "monitor.confident_error_10s": "CE, 10 s with monitor",
-    "monitor.confident_error_60s": "CE, 60 s",
-}
-_SHIFT_CAPTION = (
-    'DK: share of "don\'t know" [%]. CE: share of rows called safe with at least 0.9, not "don\'t '
-    'know", in motions that end unsafely [%]. AUC: of all rows, "don\'t know" the least safe [%]. '
-    'With monitor: rows after its alarm count as "don\'t know", which a scenario with `on_alarm: '
-    "report` does not do. Intervals are in shifts.json."
-)
 
 
 @dataclass(kw_only=True)
@@ -266,10 +243,10 @@ def add_reliability(evaluation: Evaluation) -> None:
         rows = reliability(score, segments.is_unsafe, segments.episode)
         curves[f"{mode}, every row"] = rows
         found[f"calibration.{mode}.expected_calibration_error"] = first.error
-        found[f"calibration.{mode}.rows.expected_calibration_error"] = rows.error
+        found[f"calibration.rows.{mode}.expected_calibration_error"] = rows.error
         for kind, one in evaluation.assessments[mode].calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            found |= {f"calibration.{mode}.{kind}.{what}": n for what, n in shares.items()}
+            found |= {f"calibration.{kind}.{mode}.{what}": n for what, n in shares.items()}
     evaluation.add(found, reliability=reliability_figure(curves))
 
 
@@ -300,8 +277,8 @@ def add_throws(
 
 def write(evaluation: Evaluation, command: str) -> None:
     """Writes ``evaluation.json`` and prints its tables."""
-    from drake_safety.evaluation.report.results import Results
-    from drake_safety.evaluation.report.verdicts import verdict_tables
+    from drake_safety.evaluation.results import Results
+    from drake_safety.evaluation.verdict_tables import verdict_tables
 
     sharpened = evaluation.assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
@@ -313,31 +290,23 @@ def write(evaluation: Evaluation, command: str) -> None:
         "training_seed": trained.seed,
         "training_episodes": trained.num_episodes,
         "calibration_episodes": len(evaluation.calibration_set),
+        **_origin(evaluation.run_folder),
     }
+    results = Results(evaluation.estimates, entries)
     file = evaluation.folder / "evaluation.json"
-    write_estimates(file, evaluation.run_folder, entries, evaluation.estimates)
-    for table in verdict_tables(Results(estimates=evaluation.estimates)):
-        console.print(figures_table(table))
+    results.write(file)
+    for table in verdict_tables(results):
+        console.print(table.to_rich())
+    print_path("figures", file)
     for picture in evaluation.pictures:
         print_path("picture", picture)
 
 
-def write_estimates(
-    file: Path, run_folder: Path, entries: Mapping[str, Any], estimates: Mapping[str, Estimate]
-) -> None:
-    """Writes entries, versions and estimates as JSON."""
-    from drake_safety.learning.assessment_file import file_hash, replacing
+def _origin(run_folder: Path) -> dict[str, Any]:
+    from drake_safety.learning.assessment_file import file_hash
 
-    content = {
-        **entries,
-        "assessment_sha256": {m: file_hash(assessment_file(run_folder, m)) for m in MODES},
-        "versions": versions(),
-        **{key: estimate.to_json() for key, estimate in estimates.items()},
-    }
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    print_path("figures", file)
+    hashes = {mode: file_hash(assessment_file(run_folder, mode)) for mode in MODES}
+    return {"assessment_sha256": hashes, "versions": versions()}
 
 
 def evaluate_shifts(
@@ -373,7 +342,7 @@ def evaluate_shifts(
     for one in (gamma, paper):
         check_fresh(one, scenario, [own_seed])
     judges = {"gamma": assessment_judge(gamma), "paper": assessment_judge(paper)}
-    found: dict[str, dict[str, Estimate]] = {}
+    found: dict[str, Estimate] = {}
     with open_stages() as stages:
         nominal, sets = shifted_motions(
             scenario, run_folder, num_motions, num_nominal, own_seed, workers, stages
@@ -381,11 +350,12 @@ def evaluate_shifts(
         for i, (name, (kind, motions)) in enumerate(sets.items()):
             stages("shifts", i, len(sets))
             judged = JudgedShift.judged_by(judges, motions, gamma)
-            found[name] = shift_estimates(judged)
+            of = shift_estimates(judged)
             if kind != "nominal":
-                found[name] |= monitor_estimates(judged)
+                of |= monitor_estimates(judged)
+            found |= {f"shifts.{name}.{key}": one for key, one in of.items()}
         stages("shifts", len(sets), len(sets))
-        found["nominal"]["monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
+    found["shifts.nominal.monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
     kinds = {name: kind for name, (kind, _) in sets.items()}
     write_shifts(scenario, run_folder, folder, own_seed, command_line(), kinds, found)
 
@@ -442,29 +412,18 @@ def write_shifts(
     seed: int,
     command: str,
     kinds: Mapping[str, str],
-    found: Mapping[str, Mapping[str, Estimate]],
+    estimates: Mapping[str, Estimate],
 ) -> None:
-    """Writes ``shifts.json`` and prints its table; `kinds` and `found` are by shift."""
+    """Writes ``shifts.json``, prints its table and draws it; `kinds` are by shift."""
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.results import Results
+    from drake_safety.evaluation.shift_study import shifts_figure, shifts_table
+
     entries = {"command": command, "scenario": scenario.name, "seed": seed, "kinds": kinds}
-    estimates = {f"shifts.{n}.{key}": one for n, of in found.items() for key, one in of.items()}
-    write_estimates(folder / SHIFTS_FILE, run_folder, entries, estimates)
-    used = {
-        key: title
-        for key, title in _SHIFT_COLUMNS.items()
-        if any(key in of for of in found.values())
-    }
-    table = new_table("shift", *used.values(), title="Γ under shifts")
-    table.caption = _SHIFT_CAPTION
-    for name, of in found.items():
-        cells = [
-            f"{(1.0 if key.endswith('_s') else 100.0) * of[key].value:.1f}" if key in of else ""
-            for key in used
-        ]
-        table.add_row(name.replace("_", " "), *cells)
-    console.print(table)
-    false = found["nominal"]["monitor.false_alarms_per_hour"]
-    console.print(
-        f"false alarms of the monitor: {false.value:.2f} ({false.low:.2f}–{false.high:.2f}) an "
-        f"hour on {false.n} safe nominal motions",
-        highlight=False,
-    )
+    results = Results(estimates, {**entries, **_origin(run_folder)})
+    pictures = save(shifts_figure(results), folder / "shifts")
+    results.write(folder / SHIFTS_FILE)
+    console.print(shifts_table(results).to_rich())
+    print_path("figures", folder / SHIFTS_FILE)
+    for picture in pictures:
+        print_path("picture", picture)

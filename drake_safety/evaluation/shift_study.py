@@ -9,15 +9,23 @@ alarm changes no belief.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_safety.evaluation.figure_style import spoken
+from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion, rate_per_hour
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SEEN = ("state", "desired_preview", "features")
 """Output ports that are inputs of assessor and monitor."""
@@ -27,6 +35,26 @@ SPANS_S = (10.0, 60.0)
 """Times since a shift over which confident errors with the monitor are counted [s]."""
 BOOTSTRAP = Bootstrap(num_resamples=200)
 _MOST_STARTS = 100  # Sequences of motions per shift.
+_COLUMNS = (
+    Column("unsafe", "unsafe", "=%", digits=1),
+    Column("gamma.unknown", "don't know", "=%", digits=1),
+    Column("gamma.confident_error", "sure and wrong", "=%", digits=1),
+    Column("gamma.auc", "AUC", "="),
+    Column("paper.unknown", "paper: don't know", "=%", digits=1),
+    Column("paper.confident_error", "sure and wrong", "=%", digits=1),
+    Column("paper.auc", "AUC", "="),
+    Column("monitor.alarmed", "alarms", "=%", digits=0),
+    Column("monitor.delay_s", "after", "s", digits=1),
+    Column("monitor.delay_95_s", "95 %", "s", digits=1),
+    Column("monitor.confident_error_10s", "sure and wrong, 10 s with monitor", "=%", digits=1),
+    Column("monitor.confident_error_60s", "60 s", "=%", digits=1),
+)
+_MEANING = (
+    'Shares of rows; sure and wrong: called safe with at least 0.9, not "don\'t know", in motions '
+    'that end unsafely. AUC: of all rows, "don\'t know" the least safe. With monitor, motions '
+    'follow each other, and rows after its alarm count as "don\'t know": with `on_alarm: report` '
+    "the alarm does not do that. Intervals are in shifts.json."
+)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -256,3 +284,34 @@ def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Est
         row = int(np.argmax(is_alarm)) + (ends[begin - 1] if begin else 0)
         begin = int(np.searchsorted(ends, row, side="right")) + 1
     return rate_per_hour(count, sum(map(len, x)) * innovation.step_s, len(x))
+
+
+def shifts_table(results: Results) -> Table:
+    """The table of all shifts."""
+    columns = [one for one in _COLUMNS if results.select(method=one.key.partition(".")[0])]
+    sets = dict.fromkeys(row.set for row in results.values())
+    false = results.get("shifts.nominal.monitor.false_alarms_per_hour")
+    meaning = _MEANING
+    if false is not None:
+        meaning += (
+            f" On {false.n} safe nominal motions the monitor gives {false.value:.2f} "
+            f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
+        )
+    labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}
+    return Table(
+        corner="shift",
+        columns=columns,
+        rows=rows_of(results, labels, columns),
+        title="Γ under shifts",
+        meaning=meaning,
+    )
+
+
+def shifts_figure(results: Results) -> Figure:
+    """Plots shares of "don't know" and of rows sure and wrong, and the AUC, of all shifts."""
+    shown = [
+        replace(row, set=row.method, method=row.set.removeprefix("shifts."))
+        for metric in ("unknown", "confident_error", "auc", "confident_error_60s")
+        for row in results.select(metric=metric)
+    ]
+    return interval_figure(shown)
