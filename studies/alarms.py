@@ -14,10 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
-from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.simulation.goal_motion import GoalMotion, Mishap
 from drake_safety.simulation.throws import ThrowLog
 
@@ -25,8 +23,6 @@ FALSE_ALARM_SHARE = 0.05
 """Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
 NUM_ROWS = 2
 """Successive rows that give an alarm: a blow itself can make one row "don't know"."""
-PUBLISHED = {"": NORMALIZED, "_literal": LITERAL, "_calibrated": CALIBRATED}
-"""Fields of an assessment's result, by the suffix of the alarm's name."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _TRACKING = "tracking_error_"
 _SLACK_S = 1e-9
@@ -86,16 +82,6 @@ class Alarm:
 
     name: str
     value: Callable[[WatchedMotion], np.ndarray]
-
-
-def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
-    """Alarms on normalised, literal and, where there are heads, calibrated Γ."""
-    has_heads = assessment.base_logit_ is not None
-    return [
-        scorer_alarm(assessment_scorer(f"{name}{suffix}", assessment, published))
-        for suffix, published in PUBLISHED.items()
-        if has_heads or published != CALIBRATED
-    ]
 
 
 def scorer_alarm(scorer: Scorer) -> Alarm:

@@ -49,7 +49,6 @@ from studies import command_line
 from studies.alarms import (
     WatchedMotion,
     accepted,
-    assessment_alarms,
     evaluate_alarms,
     scorer_alarm,
     threshold_alarms,
@@ -266,7 +265,7 @@ def _alarm_estimates(
         return {}  # Thresholds need motions that stay safe.
     watched = loop.watched_features if isinstance(loop, CanFall) else {}
     alarms = [
-        *(a for mode, one in evaluation.assessments.items() for a in assessment_alarms(mode, one)),
+        *(scorer_alarm(scorer) for scorer in evaluation.scorers),
         *(scorer_alarm(scorer) for scorer in classifiers),
         *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]

@@ -30,7 +30,6 @@ from drake_safety.learning.calibration import (
     episodes_needed,
     score_threshold,
 )
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.seeds import CALIBRATION
 from drake_safety.learning.segments import split
 from drake_safety.simulation.scenario import load_scenario
@@ -143,7 +142,7 @@ def promises(
         progress = partial(stages, "calibration episodes")
         fresh = run_fresh_episodes(loaded, assessment, episodes, seed, progress, workers)
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
-    score = assessment_scorer(MODES[0], gamma, CALIBRATED).unsafe_score(segments)
+    score = assessment_scorer(MODES[0], gamma).unsafe_score(segments)
     for kind in KINDS:
         table = new_table(
             "promised miss rate [%]",

@@ -20,7 +20,6 @@ from drake_safety.evaluation.figure_style import (
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.progress import StageProgress
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
@@ -54,8 +53,8 @@ class ReachableRegion:
     Attributes:
         x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
-        calibrated: Calibrated Γ there, (n_z, n_y); NaN for "don't know".
-        threshold: Lowest calibrated Γ of an accepted target.
+        probability: Probability there, (n_z, n_y); NaN for "don't know".
+        threshold: Lowest probability of an accepted target.
         is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
             (n_z, n_y); empty for a task without a hand.
         obstacle_y_m, obstacle_z_m: The grid of obstacle distances, (o_y,), (o_z,) [m].
@@ -67,7 +66,7 @@ class ReachableRegion:
     x_m: float
     y_m: np.ndarray
     z_m: np.ndarray
-    calibrated: np.ndarray
+    probability: np.ndarray
     threshold: float
     is_reachable: dict[str, np.ndarray]
     obstacle_y_m: np.ndarray
@@ -83,7 +82,7 @@ class ReachableRegion:
         Points of a grid are not a random sample: the intervals only indicate their number.
         """
         is_safe = self.outcomes == SAFE
-        verdicts = {"sharpened": self.calibrated >= self.threshold, **self.is_reachable}
+        verdicts = {"sharpened": self.probability >= self.threshold, **self.is_reachable}
         estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
@@ -107,7 +106,7 @@ def reachable_region(
         scenario: A scenario of a task whose goals are points.
         assessment: Γ.
         progress: Called with a stage, the number done and the number wanted.
-        threshold: Lowest calibrated Γ of an accepted target.
+        threshold: Lowest probability of an accepted target.
         x_m: Position of the plane [m]; the middle of the fair box by default.
         step_m: Spacing of the simulated targets [m].
         num_workers: Number of worker processes.
@@ -137,13 +136,13 @@ def reachable_region(
         for name, is_base_free in BASELINES.items():
             one = Reachability(loop.robot, with_goals.hand, is_base_free=is_base_free)
             reachability[name] = one
-    scorer = assessment_scorer("sharpened", assessment, CALIBRATED)
-    probability = []
+    scorer = assessment_scorer("sharpened", assessment)
+    probabilities = []
     reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
     for start in range(0, len(targets), _REPORT_EVERY):
         progress("verdicts on the plane", start, len(targets))
         chunk = targets[start : start + _REPORT_EVERY]
-        probability.append(scorer.probability(*goal_inputs(loop, chunk)))
+        probabilities.append(scorer.probability(*goal_inputs(loop, chunk)))
         for name, kinematics in reachability.items():
             reachable[name].append(kinematics.is_reachable(chunk))
     progress("verdicts on the plane", len(targets), len(targets))
@@ -153,7 +152,7 @@ def reachable_region(
         x_m=x_m,
         y_m=fine[0],
         z_m=fine[1],
-        calibrated=np.concatenate(probability).reshape(shape),
+        probability=np.concatenate(probabilities).reshape(shape),
         threshold=threshold,
         is_reachable={name: np.concatenate(one).reshape(shape) for name, one in reachable.items()},
         obstacle_y_m=edge[0],
@@ -219,7 +218,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 alpha=0.28,
             )
             handles.append(Patch(color=INK, alpha=0.28, label="inside an obstacle"))
-        is_unknown = np.isnan(region.calibrated)
+        is_unknown = np.isnan(region.probability)
         if is_unknown.any():
             of = (region.y_m, region.z_m, is_unknown.astype(float))
             axes.contourf(*of, levels=[0.5, 1.5], colors="none", hatches=["////"])
@@ -227,8 +226,8 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
             handles.append(
                 Patch(facecolor="white", edgecolor=INK, linewidth=0.4, hatch="////", label=label)
             )
-        gamma = np.nan_to_num(region.calibrated)
-        label = f"calibrated Γ = {region.threshold:.2f}"
+        gamma = np.nan_to_num(region.probability)
+        label = f"probability {region.threshold:.2f}"
         # A white edge separates the line from the areas below.
         lines = [("white", 5.0, "-", gamma, region.threshold, None)]
         lines.append((UNSAFE_COLOUR, 2.4, "-", gamma, region.threshold, label))

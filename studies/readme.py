@@ -110,10 +110,10 @@ def summary_text(results: Results) -> str:
             **{f"plans.{method}": _named(method) for method in methods},
         }
         own = {
-            "converged.first.literal": "`paper`, literal Γ < 0.6",
-            "converged.fair.literal": "`paper`, literal Γ < 0.6, fair targets",
-            "converged.first.converged": "`paper`, literal Γ < 0.6 after adaptation",
-            "converged.fair.converged": "`paper`, literal Γ < 0.6 after adaptation, fair targets",
+            "converged.first.literal": "`paper`, b_safe < 0.6",
+            "converged.fair.literal": "`paper`, b_safe < 0.6, fair targets",
+            "converged.first.converged": "`paper`, b_safe < 0.6 after adaptation",
+            "converged.fair.converged": "`paper`, b_safe < 0.6 after adaptation, fair targets",
         }
         names |= {prefix: name for prefix, name in own.items() if results.has(prefix)}
         table = _rows(results, "all targets", names)
@@ -143,7 +143,7 @@ def summary_text(results: Results) -> str:
     if all(key in results for key in adapted):
         formats = [column for _, column in columns.values()]
         cells = [column.text(results[key]) for key, column in zip(adapted, formats, strict=True)]
-        lines.append(f"| `paper`, literal Γ < 0.6 after adaptation | {' | '.join(cells)} |")
+        lines.append(f"| `paper`, b_safe < 0.6 after adaptation | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
     if "throws.falls_without_recovery" in results:
         alone = results["throws.falls_without_recovery"]
@@ -182,10 +182,10 @@ def converged_text(results: Results) -> str:
     """Tables of the paper's mode before and after its adaptation, as Markdown."""
     entries, estimates = results.entries["converged"], results
     rules = {
-        "literal": "literal Γ < 0.6, before adaptation",
-        "converged": "literal Γ < 0.6, after adaptation",
-        "normalized": "normalised Γ, balanced threshold",
-        "conformal": "normalised Γ, promised miss rate 1 %",
+        "literal": "b_safe < 0.6, before adaptation",
+        "converged": "b_safe < 0.6, after adaptation",
+        "normalized": "safe share, balanced threshold",
+        "conformal": "safe share, promised miss rate 1 %",
     }
     sets = {"segments": "every segment", "first": "k = 0", "fair": "k = 0, fair targets"}
     lines = ["| | threshold | safe recall | unsafe recall | AUC |", "|---|---|---|---|---|"]
@@ -213,13 +213,13 @@ def converged_text(results: Results) -> str:
     if len(brier) == 3:
         before, after, prior_alone = brier
         parts.append(
-            f"Brier score of normalised Γ on every segment, without a gap: {before} before "
+            f"Brier score of the safe share on every segment, without a gap: {before} before "
             f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, "
             "without feedback beliefs."
         )
     if results.has("converged.throws."):
         columns = {"falls with recovery": "falls_with_recovery", "false triggers": "false_triggers"}
-        lines = [f"| throws, literal Γ < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
+        lines = [f"| throws, b_safe < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
         for rule, name in {"before": "before adaptation", "converged": "after adaptation"}.items():
             found = (estimates[f"converged.throws.{rule}.{key}"] for key in columns.values())
             lines.append(f"| {name} | {' | '.join(map(_PERCENT.text, found))} |")

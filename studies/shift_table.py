@@ -58,7 +58,7 @@ def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
     """The table of AUCs: on what Γ knows, and on all rows with and without refusals."""
     names = [name for name in kinds if results.has(f"shifts.{name}.without_novelty.auc")]
     intro = (
-        "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
+        "\nAUC of the probability and of gradient boosting [%]: on the rows that Γ knows; on all "
         'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n'
     )
     table = shift_rows(results, dict(zip(names, names, strict=True)), _RANKING_COLUMNS)

@@ -32,7 +32,6 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.seeds import EVALUATION, SHIFTS
 
 if TYPE_CHECKING:
@@ -80,10 +79,10 @@ class Evaluation:
 
     @property
     def scorers(self) -> list[Scorer]:
-        """Calibrated Γ of either mode."""
+        """The probability of either mode."""
         from drake_safety.evaluation.scorers import assessment_scorer
 
-        return [assessment_scorer(m, one, CALIBRATED) for m, one in self.assessments.items()]
+        return [assessment_scorer(m, one) for m, one in self.assessments.items()]
 
     @property
     def plan_thresholds(self) -> dict[str, float]:
@@ -257,11 +256,7 @@ def add_throws(
     from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
 
     recovery = evaluation.scenario.parameters.recovery
-    own = trigger_rules(
-        *evaluation.assessments.values(),
-        threshold=recovery.threshold,
-        is_normalized=recovery.is_normalized,
-    )
+    own = trigger_rules(*evaluation.assessments.values(), threshold=recovery.threshold)
     found, logs = evaluate_throws(
         evaluation.scenario,
         [*own, *rules],

@@ -1,4 +1,4 @@
-"""Reliability of calibrated Γ: predicted probabilities beside outcomes, and stored thresholds."""
+"""Reliability: predicted probabilities beside outcomes, and stored thresholds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def verdict_shares(
 
     Args:
         calibration: The calibration.
-        unsafe_score: 1 - Γ of each episode, (N,), for the kind of the calibration.
+        unsafe_score: 1 - probability of each episode, (N,), for the kind of the calibration.
         is_unsafe: Whether each ended unsafely, (N,).
 
     Returns:
@@ -80,7 +80,7 @@ def reliability(
     """Compares probabilities with outcomes.
 
     Args:
-        unsafe_probability: 1 - Γ of each row, (N,), in [0, 1]; NaN counts as one.
+        unsafe_probability: 1 - probability of each row, (N,), in [0, 1]; NaN counts as one.
         is_unsafe: Whether the row's episode ended unsafely, (N,).
         episode: Index of each row's episode, (N,).
         num_bins: Number of bins; fewer if rows share probabilities.
@@ -144,7 +144,7 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
                 label=f"{name}   {one.error.value:.3f}",
             )
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title="Reliability")
-        axes.set_xlabel("predicted probability, 1 - calibrated Γ")
+        axes.set_xlabel("predicted probability of an unsafe end")
         axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")
         axes.grid(color="#eceef0", linewidth=0.7)
         # Outside: intervals may be anywhere in the axes.

@@ -117,7 +117,9 @@ def assessment_judge(assessment: SafetyAssessment) -> Judge:
     ) -> Verdicts:
         found = assessment.predict(state, preview, features if assessment.uses_features else None)
         unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
-        return Verdicts(probability=np.where(is_outside, 0.0, found.calibrated), is_unknown=unknown)
+        return Verdicts(
+            probability=np.where(is_outside, 0.0, found.probability), is_unknown=unknown
+        )
 
     return judge
 

@@ -12,13 +12,12 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import LITERAL, NORMALIZED
 from drake_safety.learning.progress import StageProgress
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 
 PAPER_THRESHOLD = 0.6
-"""Γ_thre of the paper, on literal Γ."""
+"""Γ_thre of the paper, on b_safe, the probability in the paper's mode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +40,6 @@ def trigger_rules(
     paper: SafetyAssessment,
     *,
     threshold: float,
-    is_normalized: bool,
 ) -> list[TriggerRule]:
     """The scenario's rule, named "sharpened", and the paper's.
 
@@ -49,14 +47,11 @@ def trigger_rules(
         sharpened: An assessment in the sharpened mode.
         paper: An assessment in the paper's mode.
         threshold: The scenario's Γ_thre.
-        is_normalized: Whether it applies to normalised rather than to literal Γ.
     """
-    own = assessment_scorer("sharpened", sharpened, NORMALIZED if is_normalized else LITERAL)
-    name = f"paper_literal_{PAPER_THRESHOLD}"
-    literal = assessment_scorer(name, paper, LITERAL)
+    own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
-        TriggerRule(name=name, scorer=literal, threshold=PAPER_THRESHOLD),
+        TriggerRule(name="paper", scorer=printed, threshold=PAPER_THRESHOLD),
     ]
 
 
