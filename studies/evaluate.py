@@ -16,6 +16,7 @@ import typer
 
 from drake_safety.cli.console import ClusterOption, ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.evaluate import (
+    SHIFTS_FILE,
     Evaluation,
     add_reliability,
     add_throws,
@@ -26,11 +27,13 @@ from drake_safety.cli.evaluate import (
 from drake_safety.cli.training_folder import (
     check_writable,
     episodes_folder,
-    run_fresh_episodes,
 )
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.learning.seeds import EVALUATION
+from drake_safety.evaluation.shift_study import shifts_tables
+from drake_safety.evaluation.verdict_tables import verdict_tables
+from drake_safety.learning.seeds import EVALUATION, SHIFTS
+from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
@@ -54,11 +57,11 @@ from studies.alarms import (
     threshold_alarms,
 )
 from studies.baselines import KINDS, auc_difference, classifier_scorers
-from studies.plans import Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
+from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
 from studies.pushed_motions import run_pushed_motions
 from studies.reachability import BASELINES, Reachability
 from studies.reachable_region import reachable_region, region_figure
-from studies.shifts import evaluate_shifts
+from studies.shifts import add_all_shifts
 from studies.throws import classifier_rules
 
 _PLANT = "actual"
@@ -99,7 +102,9 @@ def evaluate(
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
     if shifts:
-        evaluate_shifts(loaded, assessment, shifts, episodes, seed, folder, workers)
+        with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
+            entries = add_all_shifts(evaluation, shifts, episodes)
+        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, **entries)
         return
     loop = loaded.make_loop()
     if throws:
@@ -107,26 +112,37 @@ def evaluate(
     if pushes:
         require(loop, CanBePushed)
     training = load_episodes(episodes_folder(assessment))
-    with begun(
-        loaded, assessment, episodes, calibration_episodes, seed, folder, workers
-    ) as evaluation:
+    with begun(loaded, assessment, EVALUATION, seed, folder, workers) as evaluation:
+        test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
+        other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
         shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
         classifiers = classifier_scorers(training, evaluation.stages, shortest=shortest)
         if isinstance(loop, HasGoals):
-            limit = _add_plans(evaluation, loop, classifiers, other_hand, plane_x, plane_step)
+            sets = plans_of(loop, other), plans_of(loop, test)
+            limit = _add_plans(
+                evaluation, loop, classifiers, *sets, other_hand, plane_x, plane_step
+            )
             if pushes:
                 _add_pushes(evaluation, loop, classifiers, pushes, 1.0 - limit)
         else:
-            _add_differences(evaluation, classifiers)
-        add_reliability(evaluation)
+            _add_differences(evaluation, classifiers, other, test)
+        add_reliability(evaluation, test)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
-    write(evaluation, command_line())
+    write(
+        evaluation,
+        "evaluation.json",
+        command_line(),
+        verdict_tables,
+        calibration_episodes=calibration_episodes,
+    )
 
 
-def _add_differences(evaluation: Evaluation, classifiers: Sequence[Scorer]) -> None:
+def _add_differences(
+    evaluation: Evaluation, classifiers: Sequence[Scorer], other: Episodes, test: Episodes
+) -> None:
     """Verdicts, and the AUC of Γ minus that of the better classifier."""
-    scores, segments = add_verdicts(evaluation, [*evaluation.scorers, *classifiers])
+    scores, segments = add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
     found = evaluation.estimates
     everywhere = np.ones(len(segments), dtype=bool)
     for kind, rows in (("segments", everywhere), ("episodes", segments.is_first)):
@@ -143,26 +159,19 @@ def _add_plans(
     evaluation: Evaluation,
     loop: ClosedLoop,
     classifiers: Sequence[Scorer],
+    calibration: Plans,
+    test: Plans,
     num_other: int,
     plane_x: float | None,
     plane_step: float,
 ) -> float:
     """Verdicts on all, fair and mirrored targets; returns the threshold of the unsafe score."""
     scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
-    sets = {"plans": plans_of(loop, evaluation.test_set)}
+    sets = {"plans": test}
     if num_other:
         mirror = require(loop, HasMirrorImage).mirror_options
-        seed, stages = evaluation.seed, evaluation.stages
         # The same random draws, mirrored.
-        episodes = run_fresh_episodes(
-            scenario,
-            evaluation.run_folder,
-            num_other,
-            seed,
-            partial(stages, "fresh targets, other hand"),
-            evaluation.workers,
-            **mirror,
-        )
+        episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
         mirrored = scenario.make_loop(**judging_options(type(loop)), **mirror)
         sets["plans.other_hand"] = plans_of(mirrored, episodes)
     rules: dict[str, Rule] = {
@@ -180,7 +189,7 @@ def _add_plans(
         rules,
         thresholds,
         gamma,
-        plans_of(loop, evaluation.calibration_set),
+        calibration,
         sets,
         [key for key in sets if key != "plans"],
     )
@@ -195,7 +204,7 @@ def _add_plans(
             step_m=plane_step,
             num_workers=evaluation.workers,
         )
-        figure = region_figure(region, list(evaluation.test_set.info.constraint_names))
+        figure = region_figure(region, list(loop.constraint_names))
         estimates = {f"plans.plane.{key}": one for key, one in region.estimates().items()}
         evaluation.add(estimates, reachable_region=figure)
     return limits["sharpened"]
@@ -208,11 +217,10 @@ def _add_throws(
     num_throws: int,
     num_calibration: int,
 ) -> None:
-    seed = EVALUATION.seeds(evaluation.seed)["disturbance thresholds"]
     calibration = run_throws(
         evaluation.scenario,
         list(range(num_calibration)),
-        seed=seed,
+        seed=evaluation.seeds["disturbance thresholds"],
         variation=_PLANT,
         num_workers=evaluation.workers,
         progress=partial(evaluation.stages, "calibration throws"),
@@ -232,12 +240,11 @@ def _add_pushes(
     threshold: float,
 ) -> None:
     """Alarms on pushed motions to accepted goals that are safe without a push."""
-    seeds = EVALUATION.seeds(evaluation.seed)
     calibration, test = (
         run_pushed_motions(
             evaluation.scenario,
             num_motions,
-            seed=seeds[purpose],
+            seed=evaluation.seeds[purpose],
             variation=_PLANT,
             num_workers=evaluation.workers,
             progress=partial(evaluation.stages, what),

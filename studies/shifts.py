@@ -7,41 +7,33 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.cli.console import open_stages
-from drake_safety.cli.evaluate import shifted_motions, write_shifts
-from drake_safety.cli.training_folder import (
-    MODES,
-    check_fresh,
-    episodes_folder,
-    load_assessment,
-)
+from drake_safety.cli.evaluate import Evaluation, add_shifts
+from drake_safety.cli.training_folder import episodes_folder
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.evaluation.metrics import Estimate, auc, proportion
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import (
     BOOTSTRAP,
+    LASTING,
     SEEN,
     Judge,
     JudgedShift,
     Motion,
+    MotionSet,
     Verdicts,
     assessment_judge,
-    false_alarms,
-    monitor_estimates,
-    shift_estimates,
 )
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
-from drake_safety.learning.seeds import SHIFTS
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import load_episodes
@@ -50,11 +42,8 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import run_batches
-from studies import command_line
 from studies.baselines import classifier_scorers
 
-_LASTING = ("plant", "sensor")
-"""Kinds whose motions follow each other."""
 _NUM_TREES = 100
 _NEIGHBOURS, _MOST_REFERENCES = 10, 10_000
 _FARTHER, _FASTER = 1.5, 2.0
@@ -191,7 +180,7 @@ POSTURES: Mapping[str, Reshape] = {
 
 def run_changed_starts(
     scenario: Scenario, num_motions: int, seed: int, num_workers: int | None = None
-) -> dict[str, tuple[str, list[Motion]]]:
+) -> dict[str, MotionSet]:
     """Simulates plans and starts outside the range of training, and evaluates such postures.
 
     Postures are single rows, unsafe by definition. "falling" has the rows outside the safe
@@ -206,7 +195,7 @@ def run_changed_starts(
     Returns:
         By name the kind, "plan" or "posture", and the motions.
     """
-    found: dict[str, tuple[str, list[Motion]]] = {}
+    found: dict[str, MotionSet] = {}
     if not isinstance(scenario.make_loop(), LeggedLoop):
         return found
     for name in (*STARTS, *POSTURES, "falling"):
@@ -272,7 +261,7 @@ def _rows_of(loop: ClosedLoop, contexts: Sequence) -> Motion:
     return Motion(**{name: stacked(name) for name in SEEN}, is_outside=is_outside, is_unsafe=True)
 
 
-def junk(motions: Sequence[Motion], seed: int) -> dict[str, tuple[str, list[Motion]]]:
+def junk(motions: Sequence[Motion], seed: int) -> dict[str, MotionSet]:
     """Inputs that contradict themselves, in which no robot can be.
 
     "Another row" is one of another motion: those of the same motion may agree with each other.
@@ -305,7 +294,7 @@ def junk(motions: Sequence[Motion], seed: int) -> dict[str, tuple[str, list[Moti
     for name, what in zip(SEEN, ("state", "plan", "features"), strict=True):
         if rows[name].shape[1]:
             changed[f"{what} of another row"] = {name: rows[name][order]}
-    found: dict[str, tuple[str, list[Motion]]] = {}
+    found: dict[str, MotionSet] = {}
     for name, replaced in changed.items():
         values = {**rows, **replaced}
         found[name] = (
@@ -347,7 +336,7 @@ def baseline_estimates(judged: JudgedShift, kind: str) -> dict[str, Estimate]:
         return found
     probability = judged.verdicts["gamma"].probability[judged.first]
     found |= promised(promise, probability, is_unsafe)
-    if kind in _LASTING:
+    if kind in LASTING:
         accepted = _first_probability(judged) >= promise.threshold
         counts = []  # Missed and unsafe motions of each sequence.
         for order, alarm in judged.sequences:
@@ -392,43 +381,22 @@ def promised(
     return found
 
 
-def evaluate_shifts(
-    scenario: Scenario,
-    run_folder: Path,
-    num_motions: int,
-    num_nominal: int,
-    seed: int | None,
-    folder: Path,
-    workers: int | None,
-) -> None:
-    """As that of `drake-safety evaluate`, beside baselines, on more than plants and sensors."""
-    gamma = load_assessment(run_folder, MODES[0])
-    (own_seed,) = SHIFTS.seeds(seed).values()
-    check_fresh(gamma, scenario, [own_seed])
-    training = load_episodes(episodes_folder(run_folder))
-    found: dict[str, Estimate] = {}
-    with open_stages() as stages:
-        shortest = gamma.parameters.shortest_segment or None
-        classifiers = classifier_scorers(training, stages, shortest=shortest)
-        judges = {
-            "gamma": assessment_judge(gamma),
-            "without_novelty": without_novelty(gamma),
-            **{one.name: classifier_judge(one) for one in classifiers},
-            **detector_judges(gamma, training),
-        }
-        nominal, sets = shifted_motions(
-            scenario, run_folder, num_motions, num_nominal, own_seed, workers, stages
-        )
-        sets |= run_changed_starts(scenario, num_motions, own_seed, workers)
-        sets |= junk(nominal[:num_motions], own_seed)
-        for i, (name, (kind, motions)) in enumerate(sets.items()):
-            stages("shifts", i, len(sets))
-            judged = JudgedShift.judged_by(judges, motions, gamma)
-            of = shift_estimates(judged) | baseline_estimates(judged, kind)
-            if kind in _LASTING:
-                of |= monitor_estimates(judged)
-            found |= {f"shifts.{name}.{key}": one for key, one in of.items()}
-        stages("shifts", len(sets), len(sets))
-    found["shifts.nominal.monitor.false_alarms_per_hour"] = false_alarms(nominal, gamma)
-    kinds = {name: kind for name, (kind, _) in sets.items()}
-    write_shifts(scenario, run_folder, folder, own_seed, command_line(), kinds, found)
+def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> dict[str, Any]:
+    """As `drake-safety evaluate`, beside baselines, on more than plants and sensors."""
+    scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
+    training = load_episodes(episodes_folder(evaluation.run_folder))
+    shortest = gamma.parameters.shortest_segment or None
+    classifiers = classifier_scorers(training, evaluation.stages, shortest=shortest)
+    judges = {
+        "gamma": assessment_judge(gamma),
+        "without_novelty": without_novelty(gamma),
+        **{one.name: classifier_judge(one) for one in classifiers},
+        **detector_judges(gamma, training),
+    }
+    seed = evaluation.seeds["shifts"]
+
+    def others(nominal: Sequence[Motion]) -> dict[str, MotionSet]:
+        changed = run_changed_starts(scenario, num_motions, seed, evaluation.workers)
+        return changed | junk(nominal, seed)
+
+    return add_shifts(evaluation, num_motions, num_nominal, judges, others, baseline_estimates)

@@ -22,6 +22,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.progress import StageProgress
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ CONFIDENT = 0.9
 """Least safety probability of a confident verdict."""
 SPANS_S = (10.0, 60.0)
 """Times since a shift over which confident errors with the monitor are counted [s]."""
+LASTING = ("plant", "sensor")
+"""Kinds whose motions follow each other."""
 BOOTSTRAP = Bootstrap(num_resamples=200)
 _MOST_STARTS = 100  # Sequences of motions per shift.
 _COLUMNS = (
@@ -84,6 +87,10 @@ class Motion:
             is_outside=np.any(episode.margins[rows] < 0.0, axis=1),
             is_unsafe=not episode.is_safe,
         )
+
+
+MotionSet = tuple[str, list[Motion]]
+"""Kind of a shift, "nominal", "plant" or "sensor", and motions under it."""
 
 
 def motions_of(episodes: Episodes) -> list[Motion]:
@@ -288,7 +295,35 @@ def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Est
     return rate_per_hour(count, sum(map(len, x)) * innovation.step_s, len(x))
 
 
-def shifts_table(results: Results) -> Table:
+def evaluate_shifts(
+    sets: Mapping[str, MotionSet],
+    judges: Mapping[str, Judge],
+    assessment: SafetyAssessment,
+    progress: StageProgress,
+    more: Callable[[JudgedShift, str], Mapping[str, Estimate]] = lambda judged, kind: {},
+) -> dict[str, Estimate]:
+    """Estimates of every shift by dotted key; of the monitor on changed plants and sensors.
+
+    Args:
+        sets: By shift, its kind and its motions.
+        judges: Methods by name; "gamma" is Γ.
+        assessment: Γ, with the monitor's innovation.
+        progress: Called with a stage, the number done and the number wanted.
+        more: Other estimates of a shift of a kind.
+    """
+    found: dict[str, Estimate] = {}
+    for i, (name, (kind, motions)) in enumerate(sets.items()):
+        progress("shifts", i, len(sets))
+        judged = JudgedShift.judged_by(judges, motions, assessment)
+        of = {**shift_estimates(judged), **more(judged, kind)}
+        if kind in LASTING:
+            of |= monitor_estimates(judged)
+        found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
+    progress("shifts", len(sets), len(sets))
+    return found
+
+
+def shifts_tables(results: Results) -> list[Table]:
     """The table of all shifts."""
     columns = [one for one in _COLUMNS if results.select(method=one.key.partition(".")[0])]
     sets = dict.fromkeys(row.set for row in results.values())
@@ -300,17 +335,15 @@ def shifts_table(results: Results) -> Table:
             f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
         )
     labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}
-    return Table(
-        corner="shift",
-        columns=columns,
-        rows=rows_of(results, labels, columns),
-        title="Γ under shifts",
-        meaning=meaning,
-    )
+    rows = rows_of(results, labels, columns)
+    return [
+        Table(corner="shift", columns=columns, rows=rows, title="Γ under shifts", meaning=meaning)
+    ]
 
 
-def shifts_figure(results: Results) -> Figure:
+def shifts_figure(estimates: Mapping[str, Estimate]) -> Figure:
     """Plots shares of "don't know" and of rows sure and wrong, and the AUC, of all shifts."""
+    results = Results(estimates)
     shown = [
         replace(row, set=row.method, method=row.set.removeprefix("shifts."))
         for metric in ("unknown", "confident_error", "auc", "confident_error_60s")
