@@ -5,17 +5,14 @@ from __future__ import annotations
 import typer
 
 from drake_safety.cli import run_app
-from studies.ablate import ablate
+from studies.ablation import ablate
 from studies.adaptation import adaptation
 from studies.bench import bench
 from studies.converged import converged
-from studies.kills import kills
-from studies.learning_curve import train_fewer
-from studies.plan_study import plan_study
+from studies.planning import plan_study
 from studies.publish import readme, ship, store
 from studies.readings import readings
 from studies.scale import scale
-from studies.soak import soak
 from studies.truth import truth
 from studies.walking import walking
 
@@ -26,21 +23,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command()(ablate)
-app.command()(plan_study)
-app.command("learning-curve")(train_fewer)
-app.command()(adaptation)
-app.command()(readings)
-app.command()(converged)
-app.command()(kills)
-app.command()(scale)
-app.command()(soak)
-app.command()(truth)
-app.command()(walking)
-app.command()(bench)
-app.command()(store)
-app.command()(readme)
-app.command()(ship)
+for _command in (ablate, plan_study, adaptation, readings, converged, scale, truth, walking):
+    app.command()(_command)
+for _command in (bench, store, readme, ship):
+    app.command()(_command)
 
 
 def main() -> None:
