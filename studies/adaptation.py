@@ -118,9 +118,7 @@ def adaptation(
                 f"scratch {n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback
             }
         for mode, prior in priors.items():
-            baselines = train_baselines(
-                prior, learned_from, num_workers=workers, progress=stages
-            )
+            baselines = train_baselines(prior, learned_from, num_workers=workers, progress=stages)
             judged = [
                 Pool(feedback=one, test=TestSet.of(episodes, prior.parameters.shortest))
                 for one, episodes in zip(sets, fresh, strict=True)

@@ -135,9 +135,7 @@ def _mark_changes(
         axes.add_patch(
             Rectangle(tuple(corner), length, length, fill=False, edgecolor="#d6248a", linewidth=2.0)
         )
-        axes.text(
-            *grid.centres[cell], f"{number}", ha="center", va="center_baseline", fontsize=8
-        )
+        axes.text(*grid.centres[cell], f"{number}", ha="center", va="center_baseline", fontsize=8)
         here = cells == cell
         unsafe, twins = segments.is_unsafe[here].sum(), segments.nominal_is_unsafe[here].sum()
         lines.append(

@@ -130,9 +130,7 @@ def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
             f"{RESULTS_FOLDER}/NAME.json belong"
         )
     if blocks != opened:
-        raise ValueError(
-            f"results begin for {opened}, but <!-- end --> comes only after {blocks}"
-        )
+        raise ValueError(f"results begin for {opened}, but <!-- end --> comes only after {blocks}")
 
     def block(match: re.Match[str]) -> str:
         file = folder / f"{match['name']}.json"

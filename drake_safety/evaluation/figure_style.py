@@ -58,6 +58,7 @@ _STYLE: dict[Any, Any] = {
 }
 
 _LABELS = {
+    "auc": "AUC",
     "mlp": "MLP",
     "reachability": "inverse kinematics",
     "reachability_free": "inverse kinematics, free base",
