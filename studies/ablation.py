@@ -68,7 +68,7 @@ def ablate(
         assessment,
         seed=seed,
         workers=workers,
-        plotted=("auc", "brier", "auc_gain"),
+        plotted=lambda row: row.metric in ("auc", "brier", "auc_gain"),
     ) as study:
         base = study.load(MODES[0]).parameters
         training = load_episodes(episodes_folder(assessment))

@@ -90,7 +90,10 @@ def adaptation(
         seed=seed,
         workers=workers,
         out=folder,
-        plotted=("brier", "auc", "unsafe_recall"),
+        plotted=lambda row: (
+            row.metric in ("brier", "auc", "unsafe_recall")
+            and row.set in ("sharpened.calibrated", "paper.grid")
+        ),
     ) as study:
         loaded, stages = study.scenario, study.stages
         seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
@@ -178,7 +181,7 @@ class TestSet:
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.
 
-    "k0.…" are those of first rows alone; "unknown" is the share of "don't know".
+    "FORM.k0" are those of first rows alone; "unknown" is the share of "don't know".
 
     Args:
         assessment: The assessment.
@@ -194,14 +197,9 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
     unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
     found = {}
     for name, published in PUBLISHED.items():
-        unsafe = 1.0 - published(result)
-        rows = {"": np.ones(len(segments), dtype=bool), "k0.": segments.is_first}
-        found[name] = {
-            f"{prefix}{metric}": value
-            for prefix, chosen in rows.items()
-            for metric, value in _metrics(unsafe[chosen], segments.is_unsafe[chosen]).items()
-        }
-        found[name]["unknown"] = float(unknown.mean())
+        unsafe, label = 1.0 - published(result), segments.is_unsafe
+        found[name] = _metrics(unsafe, label) | {"unknown": float(unknown.mean())}
+        found[f"{name}.k0"] = _metrics(unsafe[segments.is_first], label[segments.is_first])
     return found
 
 
@@ -275,7 +273,7 @@ def pool_estimates(
     num_test = sum(len(pool.test.episodes) for pool in pools)
     everything = [one for pool in pools for one in pool.feedback]
     estimates = {"gap": proportion(sum(one.differs for one in everything), len(everything))}
-    for form in PUBLISHED:
+    for form in found["prior"][0]:
         for who, of_pools in found.items():
             for metric in of_pools[0][form]:
                 values = [one[form][metric] for one in of_pools]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import partial
@@ -30,7 +30,7 @@ from drake_safety.cli.training_folder import check_fresh, load_assessment, run_f
 from drake_safety.evaluation.figure_style import label_of, save, spoken
 from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.results import Result, Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
@@ -117,7 +117,7 @@ def open_study(
     seed: int = EVALUATION.first,
     workers: int | None = None,
     out: Path | None = None,
-    plotted: Sequence[str] = (),
+    plotted: Callable[[Result], bool] | None = None,
 ) -> Iterator[Study]:
     """Runs a study in the block; afterwards its rows are written, printed and plotted.
 
@@ -128,7 +128,7 @@ def open_study(
         seed: First seed of the fresh episodes.
         workers: Number of worker processes; None for one a core.
         out: Folder of the files; that of the training by default.
-        plotted: Metrics to plot.
+        plotted: Whether a row is in the plot; there is none by default.
     """
     loaded = load_scenario(scenario)
     with open_stages() as stages:
@@ -147,7 +147,7 @@ def open_study(
         table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
         console.print(table.to_rich())
     print_path("figures", file)
-    drawn = [row for row in results.values() if row.metric in plotted]
+    drawn = list(filter(plotted, results.values())) if plotted else []
     for picture in save(interval_figure(drawn), file) if drawn else ():
         print_path("picture", picture)
 

@@ -64,7 +64,7 @@ def plan_study(
         seed=seed,
         workers=workers,
         out=out or learned.out,
-        plotted=("safe",),
+        plotted=lambda row: row.metric == "safe",
     ) as study:
         gamma = study.load(mode, [seed])
         rule = goal_threshold(learned.path, gamma)

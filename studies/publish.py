@@ -36,7 +36,7 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 _STUDIES = ("readings", "converged", "shifts", "walking")  # Stored beside the evaluation.
-_DOCUMENTS = [
+DOCUMENTS = [
     Path("README.md"),
     *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts", "walking")),
 ]
@@ -63,7 +63,7 @@ def readme(
     They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->. Without
     PATHS also the cards of the shipped assessments, from what ships.
     """
-    for path in paths or _DOCUMENTS:
+    for path in paths or DOCUMENTS:
         text = path.read_text(encoding="utf-8")
         try:
             generated = generate(text)

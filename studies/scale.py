@@ -55,9 +55,13 @@ def scale(
     """
     if mode not in MODES:
         raise ValueError(f"scale: mode must be one of {list(MODES)}; got '{mode}'")
-    plotted = ("ms a segment", "peak GB", "auc")
     with open_study(
-        "scale", scenario, assessment, seed=seed, workers=workers, plotted=plotted
+        "scale",
+        scenario,
+        assessment,
+        seed=seed,
+        workers=workers,
+        plotted=lambda row: row.metric in ("ms a segment", "peak GB", "auc"),
     ) as study:
         parameters = replace(study.scenario.assessment, mode=mode)
         path = episodes_folder(assessment, mode)

@@ -50,7 +50,9 @@ def test_a_fingerprint_is_that_of_every_field():
 
 
 def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
-    with open_study("tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=["auc"]) as study:
+    with open_study(
+        "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda row: row.metric == "auc"
+    ) as study:
         study.entries["pairs"] = 3
         study.add("segments.paper", {"auc": Estimate(0.5, 0.25, 0.75, 40)})
         study.add("segments.sharpened", {"auc": Estimate(0.9, 0.8, 1.0, 40)})
