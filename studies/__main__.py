@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import typer
 
 from drake_safety.cli import run_app
@@ -23,9 +25,11 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (ablate, plan_study, adaptation, readings, converged, scale, truth, walking):
-    app.command()(_command)
-for _command in (bench, store, readme, ship):
+_COMMANDS: tuple[Callable[..., None], ...] = (
+    *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
+    *(bench, store, readme, ship),
+)
+for _command in _COMMANDS:
     app.command()(_command)
 
 

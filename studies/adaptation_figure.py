@@ -110,7 +110,7 @@ def _draw_feedback(axes: Axes, prior: SafetyAssessment, feedback: Sequence[Feedb
         (difference >= 0.25, UNSAFE_COLOUR, "less safe than its twin"),
         (difference <= -0.25, SAFE_COLOUR, "safer than its twin"),
     ):
-        axes.scatter(*points[rows].T, s=6.0, c=colour, linewidths=0.0, label=label)
+        axes.scatter(points[rows, 0], points[rows, 1], s=6.0, c=colour, linewidths=0.0, label=label)
     axes.set_title(f"Feedback: {len(feedback)} actual episodes")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), fontsize=8, markerscale=2.0)
 
@@ -135,7 +135,8 @@ def _mark_changes(
         axes.add_patch(
             Rectangle(tuple(corner), length, length, fill=False, edgecolor="#d6248a", linewidth=2.0)
         )
-        axes.text(*grid.centres[cell], f"{number}", ha="center", va="center_baseline", fontsize=8)
+        x, y = grid.centres[cell]
+        axes.text(x, y, f"{number}", ha="center", va="center_baseline", fontsize=8)
         here = cells == cell
         unsafe, twins = segments.is_unsafe[here].sum(), segments.nominal_is_unsafe[here].sum()
         lines.append(

@@ -216,10 +216,14 @@ def run_motions(
         workers=num_workers,
         progress=progress,
     )
-    return [
-        WalkedMotion(**{name: v if v.ndim else v.item() for name, v in arrays.items()})
-        for arrays in found.values()
-    ]
+    return [_motion(arrays) for arrays in found.values()]
+
+
+def _motion(arrays: Arrays) -> WalkedMotion:
+    fields: dict[str, Any] = {
+        n: value if value.ndim else value.item() for n, value in arrays.items()
+    }
+    return WalkedMotion(**fields)
 
 
 def _run_motion(

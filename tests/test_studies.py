@@ -2,14 +2,17 @@
 
 import shutil
 import sys
+from dataclasses import replace
 
 import pytest
 import typer
 
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation import rollouts
+from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
 from studies import planning, scale
@@ -88,12 +91,17 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(monkeypatch, capsys,
 @pytest.mark.slow
 def test_studies_of_a_run_are_stored_with_its_evaluation(monkeypatch, capsys, run):
     file, folder = run
-    options = ("--assessment", folder, *FRESH)
-    found, _ = results_of(monkeypatch, capsys, folder, "converged", "converged", file, *options)
+    options = (file, "--assessment", folder, "--episodes", 40, "--seed", 100, "--workers", 1)
+    # A promised miss rate takes more than a hundred unsafe episodes.
+    more = (*options, "--calibration-episodes", 300)
+    found, _ = results_of(monkeypatch, capsys, folder, "converged", "converged", *more)
     assert {"converged.first.literal.auc", "converged.fair.converged.auc"} <= set(found)
-    only = ("--only", "200 epochs, stopped early", "--train-episodes", 64, "--sizes", "60")
-    assert call(monkeypatch, "readings", file, *options, *only) == 2
-    assert "holds 60 episodes, expected at least 64" in " ".join(capsys.readouterr().out.split())
+    only = ("--calibration-episodes", 30, "--only", "none", "--sizes", 60)
+    found, _ = results_of(monkeypatch, capsys, folder, "readings", "readings", *options, *only)
+    assert found.entries["names"] == ["default, 60 episodes"]
+    assert found["readings.0.first.normalized.auc"].n == 40
+    assert call(monkeypatch, "readings", *options, "--only", "default") == 2
+    assert "holds 60 episodes, expected at least 1024" in " ".join(capsys.readouterr().out.split())
     Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
         folder / "evaluation.json"
     )
@@ -101,8 +109,9 @@ def test_studies_of_a_run_are_stored_with_its_evaluation(monkeypatch, capsys, ru
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) in (0, None)
     again = Results.read(stored)
     assert {"plans.sharpened.auc", "converged.first.literal.auc"} <= set(again)
-    assert again.entries["converged"]["feedback_episodes"] == 30
-    for name in ("evaluation", "converged"):
+    assert again.entries["converged"]["feedback_episodes"] == 300
+    assert again.entries["readings"]["seed"] == 100
+    for name in ("evaluation", "converged", "readings"):
         (folder / f"{name}.json").unlink()
 
 
@@ -133,6 +142,23 @@ def test_scale_learns_in_a_process_of_its_own_and_keeps_what_it_has(monkeypatch,
     monkeypatch.setattr(scale, "learned_row", None)
     again, _ = results_of(monkeypatch, capsys, folder, "scale", *options)
     assert dict(again) == dict(found)
+
+
+@pytest.mark.slow
+def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, capsys, tmp_path):
+    scenario = load_scenario("pendulum")
+    episodes = run_episodes(scenario, 120, num_workers=1, path=episodes_folder(tmp_path))
+    for mode in MODES:
+        scenario.assessment = replace(scenario.assessment, mode=mode, epochs=2, ensemble_size=1)
+        learned = SafetyAssessment(scenario.assessment).fit(episodes)
+        learned.save(assessment_file(tmp_path, mode))
+    options = ("--assessment", tmp_path, "--episodes", 20, "--resolution", 3, "--workers", 1)
+    found, _ = results_of(
+        monkeypatch, capsys, tmp_path, "known_truth", "truth", "pendulum", *options
+    )
+    assert found["hold.paper.safe_share"].n == 9
+    assert found["random.sharpened.confident_errors"].n == 20
+    assert (tmp_path / "known_truth_paper.png").is_file()
 
 
 @pytest.mark.train
