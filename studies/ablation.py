@@ -25,6 +25,7 @@ from drake_safety.evaluation.metrics import (
     threshold_at,
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.capabilities import rate_names
@@ -214,8 +215,8 @@ def unsafe_scores(
     """Trains a variant and scores the fresh segments.
 
     Returns:
-        "calibration" and "test", 1 - normalised Γ of their segments, and "calibrated", 1 -
-        calibrated Γ of those of the test; or "failed", why it cannot be trained.
+        "calibration" and "test", 1 - the safe share of their segments' beliefs, and "calibrated",
+        1 - the probability of those of the test; or "failed", why it cannot be trained.
     """
     parameters = variant.parameters(base)
     recut = variant.recut(training[: variant.num_episodes], parameters.horizon)
@@ -239,9 +240,9 @@ def unsafe_scores(
         found.append(result)
     seen, judged = found
     return {
-        "calibration": 1.0 - seen.normalized,
-        "test": 1.0 - judged.normalized,
-        "calibrated": 1.0 - judged.calibrated,
+        "calibration": 1.0 - safe_share(seen.belief),
+        "test": 1.0 - safe_share(judged.belief),
+        "calibrated": 1.0 - judged.probability,
     }
 
 

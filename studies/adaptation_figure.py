@@ -69,14 +69,14 @@ def adaptation_figure(
         cells = one.beliefs_[0]
         known = cells[:, SAFE] + cells[:, UNSAFE]
         share = np.divide(cells[:, SAFE], known, out=np.zeros_like(known), where=known > 0.0)
-        draw(axes, share, cells[:, UNCERTAINTY] >= 1.0, safety_colours(), "normalised Γ")
+        draw(axes, share, cells[:, UNCERTAINTY] >= 1.0, safety_colours(), "safe share")
         axes.set_title(title)
         return share
 
     with drawing_style():
         fig = new_figure(4.6 * (1 + len(stages)), 8.6)
         panels = fig.subplots(2, 1 + len(stages))
-        before = draw_beliefs(panels[0, 0], prior, "Normalised Γ before any feedback")
+        before = draw_beliefs(panels[0, 0], prior, "Safe share before any feedback")
         _draw_feedback(panels[1, 0], prior, feedback[: stages[-1]])
         for (upper, lower), update, size in zip(panels.T[1:], updates, stages, strict=False):
             adapted = prior.adapt(feedback[:size])

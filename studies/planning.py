@@ -70,7 +70,7 @@ def plan_study(
         rule = goal_threshold(learned.path, gamma)
         print_shipped(learned)
         console.print(
-            f"threshold {rule.threshold:.3f} of calibrated Γ, {rule.origin}",
+            f"threshold {rule.threshold:.3f}, {rule.origin}",
             highlight=False,
             soft_wrap=True,
         )
@@ -201,7 +201,7 @@ def planning_estimates(
     outcomes, gamma = [], []
     for trial in trials.values():
         features = trial.features if assessment.uses_features else None
-        gamma.append(assessment.predict(trial.state, trial.desired_preview, features).calibrated)
+        gamma.append(assessment.predict(trial.state, trial.desired_preview, features).probability)
         outcomes.append(trial.is_safe)
     best = [int(np.argmax(values)) for values in gamma]
     default = np.array([is_safe[0] for is_safe in outcomes])

@@ -245,7 +245,7 @@ def first_verdicts(
 
     Returns:
         An entry for each episode: "episode", its index; "cause" of its end, "" if it stayed safe;
-        and by mode "verdict" and "safety_probability", calibrated Γ at k = 0. Diverged episodes
+        and by mode "verdict" and "safety_probability" at k = 0. Diverged episodes
         have no modes.
     """
     episodes = run_episodes(
@@ -262,7 +262,7 @@ def first_verdicts(
     segments = split(episodes, stride=1, discount=1.0, shortest=1)
     first = segments.take(np.flatnonzero(segments.is_first))
     for mode, assessment in assessments.items():
-        scorer = assessment_scorer(mode, assessment, "calibrated")
+        scorer = assessment_scorer(mode, assessment)
         gamma = 1.0 - scorer.unsafe_score(first)
         verdicts = assessment.calibrations_[PLAN].verdicts(gamma)
         for position, verdict, value in zip(first.episode, verdicts, gamma, strict=True):

@@ -26,6 +26,7 @@ from drake_safety.evaluation.figure_style import (
 )
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasStatePlanes, require
@@ -108,7 +109,7 @@ class KnownTruth:
     features: np.ndarray
 
     def safety_probability(self, assessment: SafetyAssessment) -> np.ndarray:
-        """Normalised Γ of every start, (n, n).
+        """Safe share of every start's belief, (n, n).
 
         Args:
             assessment: Γ.
@@ -117,7 +118,7 @@ class KnownTruth:
             array.reshape(-1, array.shape[-1])
             for array in (self.state, self.desired_preview, self.features)
         ]
-        return assessment.predict(*rows).normalized.reshape(self.is_safe.shape)
+        return safe_share(assessment.predict(*rows).belief).reshape(self.is_safe.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +250,8 @@ def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> d
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     first = segments.take(segments.is_first)
     state = first.state if assessment.uses_features else first.true_state
-    probability = assessment.predict(state, first.desired_preview, first.features).normalized
+    found = assessment.predict(state, first.desired_preview, first.features)
+    probability = safe_share(found.belief)
     is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD
     wrong = is_confidently_wrong(is_safe, probability)
     return {
@@ -323,7 +325,7 @@ def known_truth_figure(
                 fontsize=10,
             )
         all_axes[0].set_ylabel(panels[0][0].axes[1])
-        fig.colorbar(image, ax=list(all_axes), label="normalised Γ", fraction=0.03)
+        fig.colorbar(image, ax=list(all_axes), label="safe share", fraction=0.03)
         handles = [
             Line2D([], [], color=INK, lw=2.0, label="true safe set, simulated"),
             Line2D(
@@ -332,7 +334,7 @@ def known_truth_figure(
                 color=SAFE_COLOUR,
                 lw=1.6,
                 ls="--",
-                label=f"normalised Γ = {panels[0][2].threshold:g}",
+                label=f"safe share = {panels[0][2].threshold:g}",
             ),
             Line2D([], [], color=INK, marker="x", ls="", label="confident and wrong"),
         ]

@@ -38,7 +38,7 @@ def make_diagram(assessment=None):
     if assessment is not None:
         preview = flight.GetOutputPort("desired_preview")
         assessor = AddSafetyAssessor(builder, assessment, state=state, desired_preview=preview)
-        builder.ExportOutput(assessor.GetOutputPort("normalized_safety_probability"), "gamma")
+        builder.ExportOutput(assessor.GetOutputPort("safety_probability"), "gamma")
     return builder.Build()
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from drake_safety.evaluation.metrics import Bootstrap
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.segments import Episodes
 from lip_episodes import make_episodes
 from studies.ablation import (
@@ -51,8 +52,8 @@ def test_the_baseline_is_what_training_makes_of_the_same_episodes(sets, scores):
         .fit(training)
         .predict(segments.state, segments.desired_preview, segments.features)
     )
-    np.testing.assert_array_equal(scores[BASELINE]["test"], 1.0 - result.normalized)
-    np.testing.assert_array_equal(scores[BASELINE]["calibrated"], 1.0 - result.calibrated)
+    np.testing.assert_array_equal(scores[BASELINE]["test"], 1.0 - safe_share(result.belief))
+    np.testing.assert_array_equal(scores[BASELINE]["calibrated"], 1.0 - result.probability)
     seen = judged_segments(calibration, BASE)
     found = {
         name: variant_estimates(one, scores[BASELINE], seen, segments, bootstrap=FEW)

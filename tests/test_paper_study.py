@@ -88,7 +88,7 @@ def test_the_tables_of_the_papers_mode_say_what_was_found():
     assert "python -m studies x" in text and "| raw x | 0.500 (0.400–0.600) |" in text
     assert "64 episodes" in text and "100 fresh ones of seed 3" in text
     text = render("converged", found)
-    assert "k = 0: literal Γ < 0.6, after adaptation | 0.50 | 0.500" in text
+    assert "k = 0: b_safe < 0.6, after adaptation | 0.50 | 0.500" in text
     assert "fair" not in text and "throws" not in text
     estimates |= {f"converged.{key}": one for key in [*throws, "throws.falls_without_recovery"]}
     text = render("converged", Results(estimates, found.entries))
@@ -110,4 +110,4 @@ def test_the_summary_shows_the_papers_mode_after_its_adaptation():
     assert "`paper` has learned from 9 episodes." in text
     rates = "25.0 % (20.0–30.0) | 25.0 % (20.0–30.0)"
     auc = "0.250 (0.200–0.300) | 0.250 (0.200–0.300)"
-    assert f"| `paper`, literal Γ < 0.6 after adaptation | {auc} | {rates} |" in text
+    assert f"| `paper`, b_safe < 0.6 after adaptation | {auc} | {rates} |" in text

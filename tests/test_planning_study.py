@@ -106,7 +106,7 @@ def test_who_knows_comes_all_the_way_to_hindsight_and_who_errs_does_not(trials):
 def test_starts_that_no_plan_is_accepted_for_are_told_apart(trials):
     found = planning_estimates(Knowing(), trials, threshold=0.5)
     gamma = [Knowing().predict(t.state, t.desired_preview, t.features) for t in trials.values()]
-    accepted = [one.calibrated.max() >= 0.5 for one in gamma]
+    accepted = [one.probability.max() >= 0.5 for one in gamma]
     assert found["chosen.accepted"].value == np.mean(accepted)
     assert found["chosen and accepted.safe"].n == sum(accepted)
 

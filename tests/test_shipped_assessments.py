@@ -169,7 +169,7 @@ def test_the_first_verdicts_are_those_of_the_first_fresh_episodes(run, shipped, 
                 episode.features[0] if mode == "sharpened" else None,
             )
             is_known = said.belief[2] <= 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
-            gamma = said.calibrated if is_known else 0.0
+            gamma = said.probability if is_known else 0.0
             assert entry[mode]["safety_probability"] == pytest.approx(gamma, abs=1e-5)
             (verdict,) = assessment.calibrations_["plan"].verdicts(np.array([gamma]))
             assert entry[mode]["verdict"] == verdict

@@ -37,7 +37,6 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:
@@ -259,8 +258,8 @@ def _evaluate_segments(judged: Judged) -> Findings:
     from drake_safety.evaluation.scorers import assessment_scorer
 
     scorers = [
-        assessment_scorer("sharpened", judged.sharpened, CALIBRATED),
-        assessment_scorer("paper", judged.paper, CALIBRATED),
+        assessment_scorer("sharpened", judged.sharpened),
+        assessment_scorer("paper", judged.paper),
         *judged.classifiers,
     ]
     estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
@@ -285,7 +284,6 @@ def _evaluate_throws(
         judged.paper,
         judged.classifiers,
         threshold=recovery.threshold,
-        is_normalized=recovery.is_normalized,
     )
     study = evaluate_throws(
         judged.scenario,
@@ -343,7 +341,7 @@ def _evaluate_calibration(judged: Judged) -> Findings:
     estimates: dict[str, Estimate] = {}
     curves = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
-        score = assessment_scorer(mode, gamma, CALIBRATED).unsafe_score(segments)
+        score = assessment_scorer(mode, gamma).unsafe_score(segments)
         expected, is_unsafe = episode_scores(segments, score, PLAN)
         curves[mode] = reliability(expected, is_unsafe)
 

@@ -18,7 +18,6 @@ from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
-from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
@@ -126,10 +125,7 @@ def compare_scenario(
             lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
         )
         assessment.save(folder / "sharpened.safetensors")
-        published = CALIBRATED
-        if recovery is not None:
-            published = NORMALIZED if recovery.is_normalized else LITERAL
-        scorer = assessment_scorer("sharpened", assessment, published)
+        scorer = assessment_scorer("sharpened", assessment)
         estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
         if recovery is not None:
             study = evaluate_throws(

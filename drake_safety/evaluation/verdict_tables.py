@@ -14,7 +14,7 @@ INPUTS = (
     "features; paper uses its next H steps and no features."
 )
 """Note beside every table that compares them."""
-_SCORES = "Modes are judged by calibrated Γ, classifiers by their probability."
+_SCORES = "Modes and classifiers are judged by their probability."
 _SHARE = Column("", "", "%", digits=1)
 _AUC, _BRIER = Column("auc", "AUC", "", 1), Column("brier", "Brier", "", -1)
 _RECALLS = (
@@ -95,8 +95,7 @@ _KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
     ),
     "monitoring": (
         "Alarms on pushed motions",
-        "Thresholds are chosen for the same share of false alarms on calibration motions; those "
-        "of sharpened and paper apply to normalised Γ, unless a row names another.",
+        "Thresholds are chosen for the same share of false alarms on calibration motions.",
         ALARMS,
     ),
     "plans": (
@@ -107,7 +106,7 @@ _KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
     ),
     "calibration": (
         "Stored calibrations on fresh motions",
-        "Promised and observed rates of the thresholds of calibrated Γ.",
+        "Promised and observed rates of the thresholds of the probability.",
         CALIBRATIONS,
     ),
 }
