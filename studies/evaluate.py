@@ -14,7 +14,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_safety.cli.console import ClusterOption, ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.cli.console import (
+    ClusterOption,
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    command_line,
+)
 from drake_safety.cli.evaluate import (
     SHIFTS_FILE,
     Evaluation,
@@ -48,7 +54,6 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throws
-from studies import command_line
 from studies.alarms import (
     WatchedMotion,
     accepted,
@@ -104,7 +109,7 @@ def evaluate(
     if shifts:
         with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
             entries = add_all_shifts(evaluation, shifts, episodes)
-        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, **entries)
+        write(evaluation, SHIFTS_FILE, command_line("python -m studies"), shifts_tables, **entries)
         return
     loop = loaded.make_loop()
     if throws:
@@ -132,7 +137,7 @@ def evaluate(
     write(
         evaluation,
         "evaluation.json",
-        command_line(),
+        command_line("python -m studies"),
         verdict_tables,
         calibration_episodes=calibration_episodes,
     )
