@@ -109,8 +109,8 @@ class Results(Mapping[str, Result]):
             if found != (SCHEMA, SCHEMA_VERSION):
                 raise ValueError(f"schema and version are {found}")
             figures = {
-                key: Estimate(*(math.nan if end is None else float(end) for end in ends), int(n))
-                for key, (*ends, n) in content["figures"].items()
+                key: Estimate(_number(v), _number(low), _number(high), int(n))
+                for key, (v, low, high, n) in content["figures"].items()
             }
             return cls(figures, content["entries"])
         except (
@@ -145,6 +145,10 @@ class Results(Mapping[str, Result]):
         )
         with replacing(Path(path)) as temporary:
             temporary.write_text(text, encoding="utf-8")
+
+
+def _number(stored: float | None) -> float:
+    return math.nan if stored is None else float(stored)
 
 
 def _rounded(number: float) -> float | None:
