@@ -109,7 +109,7 @@ def evaluate(
     if shifts:
         with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
             entries = add_all_shifts(evaluation, shifts, episodes)
-        write(evaluation, SHIFTS_FILE, command_line("python -m studies"), shifts_tables, **entries)
+        write(evaluation, SHIFTS_FILE, command_line("python -m studies"), shifts_tables, entries)
         return
     loop = loaded.make_loop()
     if throws:
@@ -134,13 +134,9 @@ def evaluate(
         add_reliability(evaluation, test)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
-    write(
-        evaluation,
-        "evaluation.json",
-        command_line("python -m studies"),
-        verdict_tables,
-        calibration_episodes=calibration_episodes,
-    )
+    made_by = command_line("python -m studies")
+    entries = {"calibration_episodes": calibration_episodes}
+    write(evaluation, "evaluation.json", made_by, verdict_tables, entries)
 
 
 def _add_differences(

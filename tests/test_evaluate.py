@@ -59,6 +59,28 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     assert dict(Results.read(folder / "evaluation.json")) == dict(first)
 
 
+def study(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["studies", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        studies()
+    assert ended.value.code in (0, None)
+
+
+@pytest.mark.slow
+def test_shifts_and_promises_are_studied_beside_baselines(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    out, where = folder / "beside", ("--assessment", folder, "--workers", 1)
+    shifts = ("--shifts", 6, "--episodes", 12, "--out", out)
+    study(monkeypatch, "evaluate", file, *where, *shifts)
+    found = Results.read(out / "shifts.json")
+    assert found.entries["kinds"]["state of another row"] == "junk"
+    for method in ("gamma", "without_novelty", "gradient_boosting", "mlp", "deep_knn"):
+        assert f"shifts.gaussian.{method}.confident_error" in found
+        assert f"shifts.nominal.{method}.first.confident_error" in found
+    study(monkeypatch, "promises", file, *where, "--episodes", 40, "--splits", 5)
+    assert "needs 99 unsafe episodes" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.slow
 def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
@@ -66,11 +88,7 @@ def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys
     assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
     alone = Results.read(folder / "evaluation.json")
     arguments = ("--other-hand", 10, "--plane-step", 0.6, "--pushes", 15)
-    words = ("evaluate", file, "--assessment", folder, *OPTIONS, *arguments)
-    monkeypatch.setattr(sys, "argv", ["studies", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        studies()
-    assert ended.value.code in (0, None)
+    study(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments)
     beside = Results.read(folder / "evaluation.json")
     assert {key: beside[key] for key in alone} == dict(alone)
     for method in ("sharpened", "paper", "gradient_boosting", "mlp"):

@@ -119,10 +119,7 @@ def evaluate(
     ] = 300,
     throws: Annotated[
         int | None,
-        typer.Option(
-            help="Fresh throws at the actual plant; 600 by default for tasks with recovery.",
-            min=0,
-        ),
+        typer.Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
     ] = None,
     shifts: Annotated[
         int,
@@ -134,10 +131,7 @@ def evaluate(
     ] = 0,
     seed: Annotated[
         int | None,
-        typer.Option(
-            help=f"First of the seeds of fresh simulations; by default {EVALUATION.first}, "
-            f"{SHIFTS.first} with --shifts."
-        ),
+        typer.Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
@@ -160,7 +154,7 @@ def evaluate(
     if shifts:
         with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
             entries = add_shifts(evaluation, shifts, episodes)
-        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, **entries)
+        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, entries)
         return
     loop = loaded.make_loop()
     if throws is None:
@@ -175,13 +169,8 @@ def evaluate(
         add_reliability(evaluation, test)
         if throws:
             add_throws(evaluation, throws)
-    write(
-        evaluation,
-        "evaluation.json",
-        command_line(),
-        verdict_tables,
-        calibration_episodes=calibration_episodes,
-    )
+    entries = {"calibration_episodes": calibration_episodes}
+    write(evaluation, "evaluation.json", command_line(), verdict_tables, entries)
 
 
 @contextmanager
@@ -338,7 +327,7 @@ def write(
     name: str,
     command: str,
     tables: Callable[[Results], Sequence[Table]],
-    **entries: Any,
+    entries: Mapping[str, Any],
 ) -> None:
     """Writes what was found to a file of results, and prints its tables."""
     from drake_safety.learning.assessment_file import file_hash
