@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -229,11 +229,12 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
         gamma = np.nan_to_num(region.probability)
         label = f"probability {region.threshold:.2f}"
         # A white edge separates the line from the areas below.
-        lines = [("white", 5.0, "-", gamma, region.threshold, None)]
+        lines: list[tuple[str, float, Any, np.ndarray, float, str]]
+        lines = [("white", 5.0, "-", gamma, region.threshold, "")]
         lines.append((UNSAFE_COLOUR, 2.4, "-", gamma, region.threshold, label))
         for name, is_reachable in region.is_reachable.items():
-            dashes, label = _KINEMATICS[name]
-            lines.append((SAFE_COLOUR, 2.0, dashes, is_reachable.astype(float), 0.5, label))
+            style, words = _KINEMATICS[name]
+            lines.append((SAFE_COLOUR, 2.0, style, is_reachable.astype(float), 0.5, words))
         for colour, width, dashes, values, level, label in lines:
             axes.contour(
                 *_closed(region.y_m, region.z_m, values),
