@@ -22,11 +22,11 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.scenario import load_scenario

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.learning.progress import StageProgress
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments, split
 

@@ -45,9 +45,7 @@ from drake_safety.simulation.capabilities import (
     CanFall,
     HasBall,
     HasGoals,
-    HasMirrorImage,
     goal_words,
-    judging_options,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -170,10 +168,10 @@ def _add_plans(
     scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
     sets = {"plans": test}
     if num_other:
-        mirror = require(loop, HasMirrorImage).mirror_options
+        mirror = loop.mirror_options
         # The same random draws, mirrored.
         episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
-        mirrored = scenario.make_loop(**judging_options(type(loop)), **mirror)
+        mirrored = scenario.make_loop(**type(loop).judging_options, **mirror)
         sets["plans.other_hand"] = plans_of(mirrored, episodes)
     rules: dict[str, Rule] = {
         one.name: scorer_rule(one) for one in (*evaluation.scorers, *classifiers)
@@ -181,7 +179,7 @@ def _add_plans(
     thresholds = evaluation.plan_thresholds
     hands = [plans.hand for plans in sets.values() if plans.hand is not None]
     if hands:
-        robot = loop.robot  # type: ignore[attr-defined]
+        robot = loop.robot
         for name, is_free in BASELINES.items():
             reach = {hand: Reachability(robot, hand, is_base_free=is_free) for hand in hands}
             rules[name] = reachability_rule(reach)

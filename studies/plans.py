@@ -65,9 +65,9 @@ def scorer_rule(scorer: Scorer) -> Rule:
     return lambda plans: scorer.unsafe_score(plans.first)
 
 
-def reachability_rule(reachability: Mapping[str | None, Reachability]) -> Rule:
+def reachability_rule(reachability: Mapping[str, Reachability]) -> Rule:
     """The rule, by hand, that accepts goals within reach of inverse kinematics."""
-    return lambda plans: 1.0 - reachability[plans.hand].is_reachable(plans.goals)
+    return lambda plans: 1.0 - reachability[plans.hand or ""].is_reachable(plans.goals)
 
 
 def evaluate_plans(

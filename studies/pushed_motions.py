@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from drake_safety.evaluation.shift_study import SEEN
-from drake_safety.simulation.capabilities import CanBePushed, HasGoals, judging_options, require
+from drake_safety.simulation.capabilities import CanBePushed, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
@@ -76,9 +78,8 @@ def run_pushed_motions(
         progress: Called with the number done and in all.
     """
     pairs = run_batches(
-        _motion_batch,
+        partial(_motion_batch, scenario, variation, seed),
         list(range(num_motions)),
-        lambda batch: (scenario, variation, seed, batch),
         num_workers=num_workers,
         progress=progress,
         stage="pushed motions",
@@ -89,5 +90,5 @@ def run_pushed_motions(
 def _motion_batch(
     scenario: Scenario, variation: str, seed: int, indices: list[int]
 ) -> list[tuple[WatchedMotion, WatchedMotion]]:
-    loop = worker_loop(scenario, variation, judging_options(scenario.task_class()))
+    loop = worker_loop(scenario, variation, scenario.task_class().judging_options)
     return [run_pushed_motion(loop, index, seed=seed) for index in indices]

@@ -19,8 +19,8 @@ from drake_safety.evaluation.figure_style import (
 )
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.scorers import assessment_scorer
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.progress import StageProgress
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop

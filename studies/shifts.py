@@ -57,7 +57,9 @@ def without_novelty(assessment: SafetyAssessment) -> Judge:
     limits = np.full_like(novelty.limits, np.inf)
     blind.novelty_ = Novelty(training=novelty.training, limits=limits, plan=novelty.plan)
     judge = assessment_judge(blind)
-    return lambda *rows: judge(*rows[:3], np.zeros(len(rows[0]), dtype=bool))
+    return lambda state, preview, features, _: judge(
+        state, preview, features, np.zeros(len(state), dtype=bool)
+    )
 
 
 def classifier_judge(scorer: Scorer) -> Judge:
@@ -120,7 +122,7 @@ def detector_judges(assessment: SafetyAssessment, episodes: Episodes) -> dict[st
         unknown = found.is_unknown | (is_strange > limit)
         return Verdicts(probability=np.where(unknown, 0.0, found.probability), is_unknown=unknown)
 
-    judges = {}
+    judges: dict[str, Judge] = {}
     for name, score in scores.items():
         worst = np.array([score(one).max() for one in held_out])
         limit = np.quantile(worst, 1.0 - assessment.parameters.novelty_rate, method="higher")
@@ -202,7 +204,6 @@ def run_changed_starts(
         results = run_batches(
             partial(_changed_batch, scenario, name, seed),
             list(range(num_motions)),
-            lambda batch: (batch,),
             num_workers=num_workers,
         )
         motions = [motion for motion in results if len(motion.state)]
@@ -355,9 +356,11 @@ def baseline_estimates(judged: JudgedShift, kind: str) -> dict[str, Estimate]:
 
 def _first_probability(judged: JudgedShift) -> np.ndarray:
     """Calibrated Γ of first rows as before the motion, without measured margins, (M,)."""
-    rows = [np.stack([getattr(one, name)[0] for one in judged.motions]) for name in SEEN]
+    state, preview, features = (
+        np.stack([getattr(one, name)[0] for one in judged.motions]) for name in SEEN
+    )
     is_inside = np.zeros(len(judged.motions), dtype=bool)
-    return assessment_judge(judged.assessment)(*rows, is_inside).probability
+    return assessment_judge(judged.assessment)(state, preview, features, is_inside).probability
 
 
 def promised(

@@ -38,12 +38,12 @@ from drake_safety.learning.seeds import EVALUATION, SHIFTS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from drake_safety.cli.console import Stages
     from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.scorers import Scorer
     from drake_safety.evaluation.shift_study import Judge, JudgedShift, Motion, MotionSet
     from drake_safety.evaluation.tables import Table
     from drake_safety.evaluation.throw_study import TriggerRule
+    from drake_safety.files.progress import StageProgress
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.seeds import SeedBlock
     from drake_safety.learning.segments import Episodes, Segments
@@ -72,7 +72,7 @@ class Evaluation:
     folder: Path
     seeds: Mapping[str, int]
     workers: int | None
-    stages: Stages
+    stages: StageProgress
     estimates: dict[str, Estimate] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
 
@@ -287,7 +287,6 @@ def add_shifts(
     """
     from drake_safety.evaluation import shift_study
     from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
 
     gamma, paper = evaluation.assessments.values()
@@ -301,7 +300,7 @@ def add_shifts(
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)
-        options = {**judging_options(scenario.task_class()), **shift.options}
+        options = {**scenario.task_class().judging_options, **shift.options}
         hash_ = shifted.simulation_hash(name)
         episodes = run_episodes(
             shifted,

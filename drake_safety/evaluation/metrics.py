@@ -8,7 +8,7 @@ likely. A segment is classified unsafe when its score exceeds a threshold, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,12 @@ class Estimate:
     def exact(cls, value: float, n: int) -> Estimate:
         """A value without uncertainty, such as a threshold: both ends of the interval equal it."""
         return cls(value, value, value, n)
+
+    @classmethod
+    def of_row(cls, row: Sequence[float | int | None]) -> Estimate:
+        """The estimate of a stored row: value, low, high and n; None stands for NaN."""
+        value, low, high = (math.nan if end is None else float(end) for end in row[:3])
+        return cls(value, low, high, int(row[3] or 0))
 
     def to_json(self) -> dict[str, float | int | None]:
         """The estimate as JSON types; non-finite numbers become None."""

@@ -20,9 +20,9 @@ from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion, rate_per_hour
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.progress import StageProgress
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
 
 if TYPE_CHECKING:
