@@ -9,6 +9,7 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablation import ablate
 from studies.adaptation import adaptation
+from studies.animation import animation
 from studies.bench import bench
 from studies.converged import converged
 from studies.planning import plan_study
@@ -27,7 +28,7 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
-    *(bench, store, readme, ship),
+    *(animation, bench, store, readme, ship),
 )
 for _command in _COMMANDS:
     app.command()(_command)

@@ -28,7 +28,6 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
-from drake_safety.simulation.capabilities import rate_names
 from drake_safety.simulation.dataset import load_episodes
 from studies.harness import (
     Arrays,
@@ -78,7 +77,7 @@ def ablate(
             base,
             len(training),
             state_names=training.info.state_names,
-            rate_names=rate_names(study.scenario.make_loop()),
+            rate_names=study.scenario.make_loop().rate_names,
         )
         variants = [one for one in variants if only in one.name or one.name == BASELINE]
         sets = (training, calibration, test)

@@ -23,7 +23,7 @@ from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_f
 from drake_safety.evaluation.baselines import DirectClassifier
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
-from drake_safety.evaluation.scorers import StageProgress
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import FeedbackSet

@@ -32,9 +32,9 @@ from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Result, Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
+from drake_safety.files.atomic import replacing
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import replacing
-from drake_safety.learning.progress import Stages
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -68,7 +68,7 @@ class Study:
     folder: Path
     seed: int
     workers: int | None
-    stages: Stages
+    stages: StageProgress
     entries: dict[str, Any] = field(default_factory=dict)
     rows: dict[str, Estimate] = field(default_factory=dict)
 

@@ -23,7 +23,7 @@ from drake_safety.cli.training_folder import assessment_folder, goal_threshold
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import PLANNING
-from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
+from drake_safety.simulation.capabilities import OffersPlans, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -130,7 +130,7 @@ def run_trials(
     Raises:
         ValueError: The task offers no plans or only one, or too few starts are undisturbed.
     """
-    loop = scenario.make_loop(**judging_options(scenario.task_class()))
+    loop = scenario.make_loop(**scenario.task_class().judging_options)
     context = loop.CreateDefaultContext()
     indices: list[int] = []
     index = 0
@@ -168,7 +168,7 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
 
 
 def _run_candidates(scenario: Scenario, seed: int, num_plans: int, index: int) -> Arrays:
-    loop = worker_loop(scenario, "nominal", judging_options(scenario.task_class()))
+    loop = worker_loop(scenario, "nominal", scenario.task_class().judging_options)
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     motions = [run_episode(loop, index, seed=seed, plan=plan) for plan in plans]
     first = {

@@ -16,7 +16,6 @@ from drake_safety.cli.training_folder import episodes_folder
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.capabilities import judging_options, paper_options
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
@@ -124,7 +123,7 @@ def readings_of(scenario: Scenario) -> list[Reading]:
     if any(getattr(start, "tracking_offset_m", ())):
         offset = {"tracking_offset_m": [0.0, 0.0, 0.0]}
         singles.append(Reading(name="no offset between plan and state", start=offset))
-    if paper_options(scenario.task_class()):
+    if scenario.task_class().paper_options:
         singles.append(Reading(name="disturbed episodes", is_exploring=True))
     singles = [
         one
@@ -196,7 +195,7 @@ class _EpisodeSets:
     def training(self, count: int) -> Episodes:
         """The first training episodes."""
         if self._is_own:
-            options = paper_options(self._scenario.task_class())
+            options = self._scenario.task_class().paper_options
             episodes = self._run("training", count, 0, options)
         else:
             mode = "sharpened" if self._reading.is_exploring else "paper"
@@ -214,7 +213,7 @@ class _EpisodeSets:
         """Fresh episodes, as `evaluate` draws them."""
         if not self._is_own:
             return self._study.fresh(count, purpose)
-        options = judging_options(self._scenario.task_class())
+        options = self._scenario.task_class().judging_options
         return self._run(purpose, count, self._study.seeds[purpose], options)
 
     def _run(self, what: str, count: int, seed: int, options: dict[str, Any]) -> Episodes:

@@ -29,7 +29,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, split
-from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, batches, parallel_map
@@ -57,7 +56,9 @@ def truth(
     """
     with open_study("known_truth", scenario, assessment, seed=seed, workers=workers) as study:
         loop = study.scenario.make_loop()
-        planes = require(loop, HasStatePlanes, "truth").state_planes
+        planes = loop.state_planes
+        if not planes:
+            raise ValueError(f"truth: task '{type(loop).__name__}' has no state planes")
         assessments = {mode: study.load(mode, [seed]) for mode in MODES}
         fresh = study.fresh(episodes)
         truths = [
@@ -161,7 +162,7 @@ def simulate_truth(
         ValueError: The task has no such plane.
     """
     loop = scenario.make_loop()
-    planes = require(loop, HasStatePlanes).state_planes
+    planes = loop.state_planes
     if plane not in planes:
         raise ValueError(
             f"task '{type(loop).__name__}' has no state plane '{plane}'; it has {list(planes)}"
@@ -194,7 +195,7 @@ def _outcomes(
     scenario: Scenario, plane: str, indices: list[int], points: np.ndarray
 ) -> dict[int, tuple]:
     loop = worker_loop(scenario, "nominal", {})
-    start = require(loop, HasStatePlanes).state_planes[plane].start
+    start = loop.state_planes[plane].start
     found = {}
     for index, point in zip(indices, points, strict=True):
         episode = run_episode(loop, index, start=start(point))
