@@ -31,8 +31,8 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, compare, promises),
-    *(ablate, plan_study, adaptation, animation, readings, converged, scale, truth, walking),
-    *(bench, store, readme, ship),
+    *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
+    *(animation, bench, store, readme, ship),
 )
 for _command in _COMMANDS:
     app.command()(_command)

@@ -28,7 +28,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress
-from studies.harness import Arrays, fingerprint, kept, open_study
+from studies.harness import Arrays, kept, open_study
 
 _MAX_TRIES = 100
 _CANDIDATES = 1  # Second spawn key of the generator of an episode's candidates.
@@ -149,7 +149,7 @@ def run_trials(
             f"{require(loop, OffersPlans).plan_variety}"
         )
     found = kept(
-        path / f"{fingerprint(scenario.simulation_hash())}-{seed}-of-{num_plans}",
+        path / f"{scenario.simulation_hash()[:12]}-{seed}-of-{num_plans}",
         {f"{index}": (scenario, seed, num_plans, index) for index in indices},
         _run_candidates,
         workers=num_workers,
