@@ -115,13 +115,12 @@ def first_segments(episodes: Episodes) -> Segments:
 
 
 def promised_miss_rate(is_unsafe: np.ndarray) -> float:
-    """Miss rate that thresholds promise: as wanted, or higher with few unsafe plans.
+    """Miss rate that thresholds promise if chosen on plans with these labels, (N,).
 
-    Args:
-        is_unsafe: Whether each plan on which they are chosen ended unsafely, (N,).
+    It is higher than wanted with few unsafe plans.
 
     Raises:
-        ValueError: None of them did.
+        ValueError: No plan is unsafe.
     """
     num_unsafe, wanted = int(is_unsafe.sum()), 1.0 - PROMISED_UNSAFE_RECALL
     if num_unsafe == 0:

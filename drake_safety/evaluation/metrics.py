@@ -72,11 +72,9 @@ class Bootstrap:
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
     ) -> Estimate:
-        """A statistic of weighted samples, with an interval from resampling whole episodes.
+        """A statistic of weights of samples, (N,), with an interval by resampling whole episodes.
 
-        Args:
-            statistic: Maps the weight of each sample, (N,), to a number; NaN where undefined.
-            episode: Index of each sample's episode, (N,).
+        The statistic is NaN where it is undefined; `episode` is the index of each sample's, (N,).
         """
         members = np.unique(episode, return_inverse=True)[1]
         value = statistic(np.ones(len(members)))
@@ -138,14 +136,7 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
 
 
 def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
-    """Events per hour, with the exact interval of a Poisson process.
-
-    Args:
-        count: Number of events.
-        duration_s: Observed time [s].
-        n: Number of observed motions.
-        confidence: Confidence of the interval.
-    """
+    """Events per hour, with the exact interval of a Poisson process, observed on n motions."""
     from scipy.stats import chi2
 
     if not duration_s > 0:
@@ -168,13 +159,8 @@ def area_under_curve(
 ) -> float:
     """Area under the ROC curve: probability that an unsafe sample scores above a safe one.
 
-    Args:
-        unsafe_score: Unsafe scores, (N,); NaN counts as the most unsafe. Ties count one half.
-        is_unsafe: Labels, (N,).
-        weight: Weights, (N,); ones by default.
-
-    Returns:
-        The area; NaN unless both classes have weight.
+    Scores, labels and weights are (N,). A NaN score counts as the most unsafe, a tie one half. The
+    area is NaN unless both classes have weight.
     """
     score, label = _checked("area_under_curve", unsafe_score, is_unsafe)
     rank = _ranks(score)
@@ -189,15 +175,9 @@ def auc(
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Estimate:
-    """The area under the ROC curve, with an interval from a bootstrap over episodes.
+    """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,).
 
     If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
-
-    Args:
-        unsafe_score: Unsafe scores, (N,).
-        is_unsafe: Labels, (N,).
-        episode: Index of each sample's episode, (N,).
-        bootstrap: Settings of the interval.
     """
     score, label = _checked("auc", unsafe_score, is_unsafe, episode)
     rank = _ranks(score)
@@ -211,15 +191,10 @@ def auc(
 def share(
     is_hit: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap = _BOOTSTRAP
 ) -> Estimate:
-    """The share of samples, with an interval over episodes.
+    """The share of samples (N,) that hit, with an interval over their episodes (N,).
 
     It is a bootstrap; that of Clopper and Pearson with one sample an episode, where it is exact,
     and, over the number of episodes, where all or no samples hit and resampling has no spread.
-
-    Args:
-        is_hit: Whether each sample counts, (N,).
-        episode: Index of each sample's episode, (N,).
-        bootstrap: Settings of the interval.
     """
     num_hits, num_samples = int(is_hit.sum()), len(is_hit)
     num_episodes = len(np.unique(episode))
@@ -280,14 +255,9 @@ def segment_estimates(
 
 
 def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
-    """The threshold with the best balanced accuracy, the mean of both recalls.
+    """The threshold of scores (N,) with the best balanced accuracy, the mean of both recalls.
 
-    Args:
-        unsafe_score: Unsafe scores, (N,).
-        is_unsafe: Labels, (N,).
-
-    Returns:
-        A threshold midway between two scores; the middle one of equally good ones.
+    It is midway between two scores; of equally good ones, it is the middle one.
 
     Raises:
         ValueError: One of the classes is missing, or no score is finite.
