@@ -125,7 +125,8 @@ class Reaching(LeggedLoop):
         )
         self._controller = controller
         self._connect_controller(builder, controller, measured)
-        physics.connect_torques(builder, controller.GetOutputPort("actuation"))
+        torques = self._delayed(builder, controller.GetOutputPort("actuation"))
+        physics.connect_torques(builder, torques)
         self._add_push_source(builder)
 
         clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)

@@ -13,8 +13,9 @@ from pydrake.systems.framework import Context
 
 from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
-_GRAVITY = np.array([0.0, 0.0, -9.81])
+_GRAVITY_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _MAX_STEPS = 30_000  # Of sphere tracing.
 _TOUCH_M = 1e-4  # Contact distance and shortest step.
 _BEFORE_M, _BEYOND_M = 2.0, 1.0  # Ends of the line of flight, relative to its aim.
@@ -51,14 +52,7 @@ def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
 
 
 class Ball:
-    """A ball in a finalised plant.
-
-    Args:
-        plant: The plant.
-        scene_graph: Its scene graph.
-        instance: The ball's model instance.
-        target: Body to throw at.
-    """
+    """A ball in a finalised plant, thrown at a target: the name of a body."""
 
     def __init__(
         self,
@@ -76,11 +70,7 @@ class Ball:
         self._robot_geometries = collision_geometries(plant, [self._target.model_instance()])
 
     def park(self, context: Context) -> None:
-        """Puts the ball at rest on the ground, far away.
-
-        Args:
-            context: The plant's Context.
-        """
+        """Puts the ball at rest on the ground, far away, in the plant's Context."""
         p = _PARKED + [0.0, 0.0, self.radius_m]
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
         self._plant.SetFreeBodySpatialVelocity(context, self._body, SpatialVelocity.Zero())
@@ -126,11 +116,11 @@ class Ball:
         if not distance < _TOUCH_M:
             self.park(context)
             raise ValueError(f"throw: the line of flight of {throw} misses the robot")
-        velocity = throw.speed_m_s * direction - _GRAVITY * lead_s
-        start = p - velocity * lead_s - 0.5 * _GRAVITY * lead_s**2
+        velocity = throw.speed_m_s * direction - _GRAVITY_W * lead_s
+        start = p - velocity * lead_s - 0.5 * _GRAVITY_W * lead_s**2
         if start[2] < self.radius_m:
             self.park(context)
-            longest_s = math.sqrt(2 * max(p[2] - self.radius_m, 0.0) / -_GRAVITY[2])
+            longest_s = math.sqrt(2 * max(p[2] - self.radius_m, 0.0) / GRAVITY_M_S2)
             raise ValueError(
                 f"throw: a ball that arrives horizontally at {p[2]:.3f} m can fly for at most "
                 f"{longest_s:.3f} s; got lead_s = {lead_s}"

@@ -19,9 +19,9 @@ from drake_safety.plants.obstacles import remove_visuals
 from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
-from drake_safety.robots.shift import InputShift
+from drake_safety.robots.shift import Fault, Shift
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.gravity_features import GravityFeatures
@@ -134,17 +134,28 @@ class LeggedLoop(PlannedLoop):
         )
         self._observer = self._observers.add("observer", noise)
         seen_noise = combined(noise, self.variation.input_noise)
-        shift = InputShift() if self.variation.shift is None else self.variation.shift.inputs
-        if shift == InputShift():
-            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
-        else:
-            self._assessor_observer = self._observers.add_shifted(
-                "assessor_observer", seen_noise, shift
+        faults = (self.variation.shift or Shift()).sensor_faults
+        if faults:
+            self._assessor_observer = self._observers.add_faulty(
+                "assessor_observer", seen_noise, faults
             )
+        else:
+            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
         self._true_observer = self._observers.add("true_observer", ObservationNoise())
         self.state_names = self._assessor_observer.state_names
         self.output_names = self._assessor_observer.output_names
         return self._observer.GetOutputPort("measured_plant_state")
+
+    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
+        """Adds the variation's delay of the command between controller and robot."""
+        delay_s = (self.variation.shift or Shift()).command_delay_s
+        if not delay_s:
+            return command
+        names = [str(i) for i in range(command.size())]
+        faults = [Fault(kind="delay", value=delay_s)]
+        period_s = self.scenario.time_step_s
+        late = add_faults(builder, "command_delay", command, faults, names, period_s=period_s)
+        return late.get_output_port()
 
     def _watch(
         self,
