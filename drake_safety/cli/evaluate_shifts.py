@@ -26,9 +26,9 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import SHIFTS
 
 if TYPE_CHECKING:
-    from drake_safety.files.progress import StageProgress
     from drake_safety.evaluation.shift_study import ShiftResult
     from drake_safety.evaluation.shifted_motions import ShiftedSet
+    from drake_safety.files.progress import StageProgress
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.scenario import Scenario
 
