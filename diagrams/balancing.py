@@ -2,8 +2,7 @@
 
 import math
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -18,7 +17,6 @@ from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
-from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.sampling import calm_start
@@ -50,7 +48,7 @@ class Balancing(LeggedLoop):
 
     Parameters = BalancingParameters
     # "We also add a random offset to the initial state to simulate the disturbances": no ball.
-    paper_options = MappingProxyType({"ball": False})
+    paper_options: ClassVar[dict[str, Any]] = {"ball": False}
     online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
@@ -163,7 +161,7 @@ class Balancing(LeggedLoop):
         return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
     @classmethod
-    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Removes the ball from both diagrams if the variation's engine does not support it."""
         if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
             return {}

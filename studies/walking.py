@@ -23,7 +23,8 @@ from drake_safety.cli.training_folder import MODES, episodes_folder, load_assess
 from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.scorers import StageProgress, classifier_scorers
+from drake_safety.evaluation.scorers import classifier_scorers
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
@@ -137,8 +138,6 @@ def walking(
             fallen = fallen[:recovered]
             alone = [motion for motion in pushed if motion.index in set(fallen)]
             for branch in BRANCHES:
-                if branch == "policy" and not loaded.parameters.recovery.policy:
-                    continue
                 again = sets.run("push", fallen, _PUSHED_S, branch=branch)
                 estimates |= recovery_estimates(branch, alone, again)
         if commands:

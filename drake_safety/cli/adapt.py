@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +13,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ClusterOption,
     ScenarioArgument,
-    Stages,
     WorkersOption,
     command_line,
     console,
@@ -35,6 +33,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
@@ -94,7 +93,7 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.learning.assessment_file import replacing
+    from drake_safety.evaluation.results import Results
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -143,7 +142,7 @@ def adapt(
                     for key, estimate in _judge(one, fresh).items()
                 }
     differing, num_pairs = pairs.gap
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "scenario_hash": pairs.actual.info.scenario_hash,
@@ -155,11 +154,9 @@ def adapt(
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
-        **{key: estimate.to_json() for key, estimate in judged.items()},
     }
     file = folder / "adaptation.json"
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    Results(judged, entries).write(file)
     console.print(_adaptation_table(adapted, differing, num_pairs, name))
     if not differing:
         _print_unchanged(loaded, adapted, num_pairs)
@@ -177,7 +174,7 @@ def paired_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
 ) -> EpisodePairs:
     """Simulates pairs of actual episodes and nominal twins, and keeps them in the folder.
 
@@ -211,7 +208,7 @@ def fresh_actual_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
     what: str = "fresh actual episodes",
 ) -> Episodes:
     """Simulates other episodes of the actual plant, and keeps them in the folder.
@@ -226,7 +223,6 @@ def fresh_actual_episodes(
         stages: Progress bars.
         what: Name of the stage.
     """
-    from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.rollouts import run_episodes
 
     return run_episodes(
@@ -238,7 +234,7 @@ def fresh_actual_episodes(
         path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
         progress=partial(stages, what),
         extra={"command": command_line()},
-        **pairing_options(scenario, variation),
+        **scenario.task_class().pairing_options(scenario, variation),
     )
 
 

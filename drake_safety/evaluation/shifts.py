@@ -16,7 +16,6 @@ from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.shift import Fault, JointShift, Shift
-from drake_safety.simulation.capabilities import pairing_options
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -66,7 +65,9 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     """
     own = {
         f"variation {name}": PlantShift(
-            kind="plant", variation=variation, options=pairing_options(scenario, name)
+            kind="plant",
+            variation=variation,
+            options=scenario.task_class().pairing_options(scenario, name),
         )
         for name, variation in scenario.variations.items()
         if name != "nominal"

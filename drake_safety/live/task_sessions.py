@@ -25,7 +25,6 @@ from drake_safety.simulation.capabilities import (
     FollowsCommands,
     HasBall,
     HasGoals,
-    angular_constraints,
     goal_words,
     require,
 )
@@ -162,7 +161,7 @@ class LiveGoals(LiveSession):
             return
         if verdict.reason:
             told = "don't know"
-        cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))
+        cause = describe_margin(verdict.cause, verdict.cause_margin, self.loop.angular_constraints)
         notes = [] if cause else [verdict.reason]
         if self.nearest is not None:
             distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.segments import RECORDED
-from drake_safety.systems.float_system import FloatSystem
 
 if TYPE_CHECKING:
+    from drake_safety.control.kinematics import RobotKinematics
     from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.assessment_parameters import AssessmentParameters
-    from drake_safety.robots.robot import PlantVariation
+    from drake_safety.simulation.contract import Finding
+    from drake_safety.simulation.episode_start import StatePlane
+    from drake_safety.simulation.scenario import Scenario
     from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
@@ -36,39 +38,7 @@ _SIZED_BY = {
 }
 
 
-class LoopScenario(Protocol):
-    """The part of a :class:`~drake_safety.simulation.scenario.Scenario` that a loop reads."""
-
-    name: str
-    task: str
-    robot: str
-    episode_duration_s: float
-    step_s: float
-    time_step_s: float
-    control_period_s: float
-    on_alarm: str
-    assessment: AssessmentParameters
-    parameters: Any
-
-    @property
-    def num_steps(self) -> int:
-        """Rows after the first one of a whole episode."""
-
-    @property
-    def preview_step_s(self) -> float:
-        """Time between two samples of the preview [s]."""
-
-    def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name."""
-
-    def simulation_hash(self, variation: str = "nominal") -> str:
-        """A digest of all parameters that determine a rollout."""
-
-    def code_digest(self) -> str:
-        """A digest of the code that simulates."""
-
-
-class ClosedLoop(FloatSystem, Diagram):
+class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
     The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
@@ -105,6 +75,7 @@ class ClosedLoop(FloatSystem, Diagram):
         scenario: The scenario.
         variation_name, variation: The plant variation.
         assessment: The assessment, or None.
+        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
@@ -114,23 +85,70 @@ class ClosedLoop(FloatSystem, Diagram):
     online_parameters: tuple[str, ...] = ()
     """Parameters on which no episode depends; the scenario's hash leaves them out."""
 
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; the others are lengths [m]."""
+
+    judging_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for evaluation, if they differ from training's."""
+
+    paper_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for training episodes of the paper's mode, which has no disturbances
+    but the offsets of the initial state."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]
     constraint_names: list[str]
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
         self.scenario = scenario
         self.variation_name = variation
         self.variation = scenario.variation(variation)
         self.assessment = assessment
+        self.monitor_period_s = scenario.control_period_s
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
+        del robot
+        return stated
+
+    @classmethod
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """Options with which an actual variation and its nominal twin can start alike."""
+        del scenario, variation
+        return {}
+
+    @classmethod
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
+
+    @classmethod
+    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterable[Finding]:
+        """Findings about the task's own files, which ``check`` checks before the diagram."""
+        del scenario, kinematics
+        return ()
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that depend on velocities."""
+        return [*filter(is_rate, self.state_names)]
+
+    @property
+    def mirror_options(self) -> dict[str, Any]:
+        """Options of the mirrored diagram; empty without a mirror image."""
+        return {}
+
+    @property
+    def state_planes(self) -> Mapping[str, StatePlane]:
+        """Planes of starts on which the true safe set can be simulated, by name of the plan."""
+        return {}
+
+    def remove_visuals(self, context: Context) -> None:
+        """Removes shapes that only pictures need from the Context of a simulation without them."""
 
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
         """Finds this diagram's Context in that of the outermost diagram.

@@ -20,10 +20,10 @@ from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import Fault, Shift
-from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
+from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
@@ -89,14 +89,14 @@ class LeggedLoop(PlannedLoop):
 
     view: View = View()
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
         self._push_source: PushSource | None = None
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
 
@@ -295,7 +295,7 @@ class LeggedLoop(PlannedLoop):
         return assessor
 
     def remove_visuals(self, context: Context) -> None:
-        """Removes the visual shapes, unless the diagram has a visualiser; see `HasVisuals`."""
+        """Removes the visual shapes, unless the diagram has a visualiser."""
         if not self._is_shown:
             remove_visuals(self.plant, self.scene_graph, context)
 

@@ -19,13 +19,12 @@ from pydrake.systems.framework import (
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.prediction import Correction
-from drake_safety.systems.float_system import FloatSystem
 
 _LARGEST_NOVELTY = 1e6
 _CORRECTION = tuple(field.name for field in fields(Correction))
 
 
-class SafetyAssessor(FloatSystem, LeafSystem):
+class SafetyAssessor(LeafSystem):
     """Evaluates Γ on the measured state and the upcoming desired trajectory.
 
     .. pydrake_system::

@@ -16,13 +16,12 @@ from drake_safety.control.whole_body_model import (
     WholeBodyReference,
 )
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
-from drake_safety.systems.float_system import FloatSystem
 
 NOT_FINITE = 1
 """Solver status of an update with a non-finite state or set point."""
 
 
-class WholeBodyController(FloatSystem, LeafSystem):
+class WholeBodyController(LeafSystem):
     """Torques that track weighted tasks with the feet at rest, from one QP per update.
 
     .. pydrake_system::
