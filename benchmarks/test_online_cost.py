@@ -202,21 +202,16 @@ def test_novelty_and_monitor_beside_an_evaluation(
     assessment = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(some)
     assessment.info_ = dataclasses.replace(assessment.info_, step_s=PERIOD_S)
     inputs = {name: getattr(some[0], name)[0] for name in INPUT_NAMES}
-    x = assessment.inputs_of(*inputs.values())[None]
     gamma = Running(SafetyAssessor(assessment, period_s=PERIOD_S), inputs)
-    monitor = Running(NoveltyMonitor(assessment), {**inputs, "novelty": np.zeros(1)})
-
-    novelty = repeat(lambda: assessment.novelty_.of(x))
-
-    def update() -> None:
-        monitor.update()
-        novelty()
-
+    monitor = Running(NoveltyMonitor(assessment), inputs)
+    innovation = assessment.innovation_
     # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
     monitor.update()
     assert monitor.output("alarm")[0] == 1.0
     assert monitor.output("levels")[2:].min() > 0.0
-    cost_s, peers_s = alternate(benchmark, update, {"Γ in a diagram": gamma.update}, rounds=ROUNDS)
+    cost_s, peers_s = alternate(
+        benchmark, monitor.update, {"Γ in a diagram": gamma.update}, rounds=ROUNDS
+    )
     peers = {name: per_update_us(seconds) for name, seconds in peers_s.items()}
     report(
         "novelty and monitor in a diagram",
@@ -224,7 +219,7 @@ def test_novelty_and_monitor_beside_an_evaluation(
         "us CPU",
         at_most=0.75 * peers["Γ in a diagram"],
         peers=peers,
-        note=f"{x.shape[1]} inputs, {assessment.innovation_.num_states} states",
+        note=f"{innovation.num_inputs} inputs, {innovation.num_states} states",
     )
 
 

@@ -220,7 +220,6 @@ class ClosedLoop(FloatSystem, Diagram):
             period_s=period_s,
         )
         watched = {"state": state, "desired_preview": desired_preview, "hold": hold}
-        watched["novelty"] = assessor.GetOutputPort("novelty")
         if monitor.reads_features:
             watched["features"] = features
         for name, port in watched.items():
