@@ -142,7 +142,7 @@ class Balancing(LeggedLoop):
         )
         assessor = self._export_robot(
             builder,
-            assessment_period_s=parameters.recovery.assessment_period_s,
+            period_s=parameters.recovery.assessment_period_s,
             desired_output=desired["desired_output"],
             desired_preview=desired["desired_preview"],
             hold=recovery_active,

@@ -136,7 +136,7 @@ class Reaching(LeggedLoop):
         self._watch(builder, self.safe_set)
         self._export_robot(
             builder,
-            assessment_period_s=parameters.assessment_period_s,
+            period_s=parameters.assessment_period_s,
             desired_preview=desired_preview,
             meshcat=meshcat,
         )

@@ -174,7 +174,7 @@ class Walking(LeggedLoop):
         )
         assessor = self._export_robot(
             builder,
-            assessment_period_s=parameters.assessment_period_s,
+            period_s=parameters.assessment_period_s,
             desired_output=desired["desired_output"],
             desired_preview=desired["desired_preview"],
             meshcat=meshcat,

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.segments import RECORDED
 from drake_safety.systems.float_system import FloatSystem
+from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
 if TYPE_CHECKING:
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.assessment_parameters import AssessmentParameters
     from drake_safety.robots.robot import PlantVariation
-    from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
 """Output ports recorded in episodes."""
@@ -178,22 +178,14 @@ class ClosedLoop(FloatSystem, Diagram):
         state: OutputPort,
         desired_preview: OutputPort,
         features: OutputPort,
-        margins: OutputPort | None = None,
+        margins: OutputPort | None,
         hold: OutputPort | None = None,
     ) -> SafetyAssessor | None:
-        """Adds an assessor and a monitor, if there is an assessment, and exports their outputs.
+        """Adds an assessor, if there is an assessment, and exports its outputs.
 
         The names of the ports' entries must have been set. The scenario says what an alarm of the
-        monitor does.
-
-        Args:
-            builder: The diagram's builder.
-            period_s: Time between two evaluations of Γ [s].
-            state: Port of the state.
-            desired_preview: Port of the desired preview.
-            features: Port of the features.
-            margins: Port of the margins of the measured state, outside of which nothing is safe.
-            hold: Port that is 1 while the monitor waits, as during recovery.
+        monitor does. The arguments are those of
+        :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
 
         Returns:
             The assessor; None without an assessment.
@@ -203,12 +195,7 @@ class ClosedLoop(FloatSystem, Diagram):
         """
         if self.assessment is None:
             return None
-        from drake_safety.systems.novelty_monitor import NoveltyMonitor
-        from drake_safety.systems.safety_assessor import AddSafetyAssessor
-
         self._check_assessment(self.assessment)
-        monitor = builder.AddNamedSystem("novelty_monitor", NoveltyMonitor(self.assessment))
-        is_binding = self.scenario.on_alarm == "unknown"
         assessor = AddSafetyAssessor(
             builder,
             self.assessment,
@@ -216,19 +203,13 @@ class ClosedLoop(FloatSystem, Diagram):
             desired_preview=desired_preview,
             features=features,
             margins=margins,
-            alarm=monitor.GetOutputPort("alarm") if is_binding else None,
+            hold=hold,
             period_s=period_s,
+            on_alarm=self.scenario.on_alarm,
         )
-        watched = {"state": state, "desired_preview": desired_preview, "hold": hold}
-        if monitor.reads_features:
-            watched["features"] = features
-        for name, port in watched.items():
-            if port is not None:
-                builder.Connect(port, monitor.GetInputPort(name))
-        for system in (assessor, monitor):
-            for i in range(system.num_output_ports()):
-                port = system.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
+        for i in range(assessor.num_output_ports()):
+            port = assessor.get_output_port(i)
+            builder.ExportOutput(port, port.get_name())
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:

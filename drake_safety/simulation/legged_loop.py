@@ -259,22 +259,20 @@ class LeggedLoop(PlannedLoop):
         self,
         builder: DiagramBuilder,
         *,
-        assessment_period_s: float,
-        desired_output: OutputPort | None = None,
-        desired_preview: OutputPort | None = None,
-        hold: OutputPort | None = None,
+        period_s: float,
         meshcat: Meshcat | None,
+        hold: OutputPort | None = None,
+        **ports: OutputPort,
     ) -> SafetyAssessor | None:
         """Adds the optional assessor and visualiser, and exports ports; see :meth:`_export`."""
         assessor = self._export(
             builder,
-            assessment_period_s=assessment_period_s,
+            period_s=period_s,
+            hold=hold,
             state=self._assessor_observer.GetOutputPort("state"),
             true_state=self._true_observer.GetOutputPort("state"),
             output=self._observer.GetOutputPort("output"),
-            desired_output=desired_output,
-            desired_preview=desired_preview,
-            hold=hold,
+            **ports,
         )
         if self._physics.ball_state is not None:
             builder.ExportOutput(self._physics.ball_state, "ball_state")

@@ -5,23 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.inputs import is_rate
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop, LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
-
-if TYPE_CHECKING:
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.systems.safety_assessor import SafetyAssessor
 
 
 class PlannedLoop(ClosedLoop):
@@ -145,53 +143,38 @@ class PlannedLoop(ClosedLoop):
         self,
         builder: DiagramBuilder,
         *,
-        assessment_period_s: float,
-        state: OutputPort,
-        true_state: OutputPort | None = None,
-        output: OutputPort,
-        desired_output: OutputPort | None = None,
-        desired_preview: OutputPort | None = None,
+        period_s: float,
         hold: OutputPort | None = None,
+        **ports: OutputPort,
     ) -> SafetyAssessor | None:
         """Adds the assessor, if there is an assessment, and exports the ports of the contract.
 
         Args:
             builder: The diagram's builder.
-            assessment_period_s: Time between two evaluations of Γ [s].
-            state: See the table of :class:`ClosedLoop`, as for all that follow.
-            true_state: ``state`` by default.
-            output: The measured output.
-            desired_output: The planner's by default.
-            desired_preview: The planner's by default.
-            hold: See :meth:`~ClosedLoop.add_assessor`.
+            period_s: Time between two evaluations of Γ [s].
+            hold: Port that is 1 while the assessor's monitor waits.
+            **ports: ``state``, ``output``, and what differs from the planner's ``desired_output``
+                and ``desired_preview``; ``true_state`` is ``state`` by default.
 
         Returns:
             The assessor; None without an assessment.
         """
-        features = self._features
-        desired_preview = desired_preview or self._planner.GetOutputPort("desired_preview")
-        assessor = self.add_assessor(
-            builder,
-            period_s=assessment_period_s,
-            state=state,
-            desired_preview=desired_preview,
-            features=features,
-            margins=self._seen_margins,
-            hold=hold,
-        )
-        for name, port in {
-            "state": state,
-            "true_state": true_state or state,
-            "output": output,
-            "desired_output": desired_output or self._planner.GetOutputPort("desired_output"),
-            "desired_preview": desired_preview,
-            "features": features,
+        ports = {
+            "true_state": ports["state"],
+            "desired_output": self._planner.GetOutputPort("desired_output"),
+            "desired_preview": self._planner.GetOutputPort("desired_preview"),
+            "features": self._features,
             "margins": self._monitor.GetOutputPort("margins"),
             "safe": self._monitor.GetOutputPort("safe"),
             "plant_state": self._plant_state,
-        }.items():
+            **ports,
+        }
+        for name, port in ports.items():
             builder.ExportOutput(port, name)
-        return assessor
+        seen = {name: ports[name] for name in ("state", "desired_preview", "features")}
+        return self.add_assessor(
+            builder, period_s=period_s, margins=self._seen_margins, hold=hold, **seen
+        )
 
     def finish(self, builder: DiagramBuilder) -> None:
         """Builds the diagram and checks its ports."""
