@@ -104,8 +104,6 @@ class Walking(LeggedLoop):
         # The servos' gains are part of the policy, and its default posture is how it stands.
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
-        # Assessor, guard or trigger, and controller update in this order in one plant step.
-        tick_offset_s = 0.25 * scenario.time_step_s
         builder = DiagramBuilder()
         physics = self._add_robot(builder, Scene(), servos=True)
         measured = self._add_observers(builder, is_walking=True)
@@ -125,7 +123,7 @@ class Walking(LeggedLoop):
                     self.policy.parameters.command,
                     threshold=parameters.guard.threshold,
                     period_s=parameters.guard.period_s,
-                    offset_s=tick_offset_s,
+                    offset_s=self.tick_s,
                     num_outlook=_NUM_OUTLOOK,
                 ),
             )
@@ -140,13 +138,15 @@ class Walking(LeggedLoop):
                 builder,
                 parameters.recovery,
                 period_s=scenario.control_period_s,
-                offset_s=tick_offset_s,
+                offset_s=self.tick_s,
             )
             trigger = branches.trigger
             command = branches.command(command)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
-            PolicyController(self.kinematics, self.policy, offset_s=2 * tick_offset_s),
+            PolicyController(
+                self.kinematics, self.policy, offset_s=2 * self.tick_s
+            ),  # After guard or trigger.
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))

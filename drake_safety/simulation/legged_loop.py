@@ -29,6 +29,15 @@ from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
+UPDATE_TICK = 0.25
+"""Time between two systems that update one after the other, as a share of the plant's step.
+
+Drake has no order for events of one kind at one time: all discrete updates see the state before any
+of them. (Unrestricted ones come before, and publishing after; two kinds are too few.) So a system
+whose input is another's new state updates a tick later. Assessor, trigger, step planner and
+controller are the longest chain, done within the plant's step in which it began.
+"""
+
 
 @dataclass(kw_only=True)
 class View:
@@ -85,6 +94,7 @@ class LeggedLoop(PlannedLoop):
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
         view: The camera's pose.
+        tick_s: Time between two systems that update one after the other [s].
     """
 
     view: View = View()
@@ -93,6 +103,7 @@ class LeggedLoop(PlannedLoop):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
+        self.tick_s = UPDATE_TICK * scenario.time_step_s
         self._push_source: PushSource | None = None
 
     @classmethod

@@ -45,8 +45,9 @@ class RecoverySwitch(FloatSystem, Diagram):
             :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
         persistence_s: Time for which Γ must have been below it while nothing is known [s].
         period_s: Period of trigger and step planner [s].
-        offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s].
-            Simultaneous discrete updates would add a period of delay each.
+        offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s]:
+            discrete updates of one time see the state before all of them, so each would be a period
+            late.
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """
