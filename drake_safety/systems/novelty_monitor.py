@@ -122,13 +122,12 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
             part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
             error = innovation.of(previous[None], x[None, : innovation.num_states])[0]
             levels = part["levels"]
-            for i, (chart, rate) in enumerate(
-                zip(innovation.charts, innovation.rates, strict=True), LEVELS.index("fast")
-            ):
-                average = part[LEVELS[i]]
+            for i, rate in enumerate(innovation.rates):
+                average = part[("fast", "slow")[i]]
                 average += rate * (error - average)
-                whitened = average @ chart.whitening
-                levels[i] = math.sqrt(whitened @ whitened) / chart.limit
+                whitened = average @ innovation.chart_whitenings[i]
+                norm = math.sqrt(whitened @ whitened)
+                levels[LEVELS.index("fast") + i] = norm / innovation.chart_limits[i]
             distance = novelty.of(x[None])[0]
             part["sums"][:] = innovation.next_sums(part["sums"], distance, error)
             levels[LEVELS.index("frozen")] = part["repeats"][0] / innovation.longest_repeat
