@@ -90,6 +90,7 @@ class Balancing(LeggedLoop):
                     parameters.recovery.step,
                     threshold=parameters.recovery.threshold,
                     persistence_s=parameters.recovery.persistence_s,
+                    initial_uncertainty=scenario.assessment.initial_uncertainty,
                     period_s=scenario.control_period_s,
                     offset_s=self.tick_s,
                     horizon=scenario.assessment.horizon,
@@ -147,8 +148,8 @@ class Balancing(LeggedLoop):
             meshcat=meshcat,
         )
         if assessor is not None and recovery:
-            for name, port in (("safety_probability", self.trigger_port), ("belief", "belief")):
-                builder.Connect(assessor.GetOutputPort(port), switch.GetInputPort(name))
+            for name in ("safety_probability", "belief"):
+                builder.Connect(assessor.GetOutputPort(name), switch.GetInputPort(name))
         elif recovery:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
         self.finish(builder)
@@ -265,12 +266,6 @@ class Balancing(LeggedLoop):
             end = np.append(goal[:2], height_m)
             plans.append(interpolate(start, end, duration_s, planned.start_time()))
         return plans
-
-    @property
-    def trigger_port(self) -> str:
-        """Name of the output port that triggers recovery."""
-        is_normalized = self.scenario.parameters.recovery.is_normalized
-        return "normalized_safety_probability" if is_normalized else "safety_probability"
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
         """Samples a ball with its impact at ``time_s`` [s]."""

@@ -25,14 +25,12 @@ class RecoveryParameters:
     """Parameters of trigger and recovery steps."""
 
     threshold: float = 0.6
-    """Γ_thre. The default is the paper's value, which it has for literal Γ."""
-    is_normalized: bool = True
-    """Whether the threshold is on normalised Γ, b_safe / (1 - μ), or on literal Γ, b_safe."""
+    """Γ_thre, of the probability. The default is the paper's value, which it has for b_safe."""
     persistence_s: float = 0.02
-    """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known Γ
-    triggers at once. The paper has neither."""
+    """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known
+    probability triggers at once. The paper has neither."""
     assessment_period_s: float = 0.02
-    """Time between two evaluations of Γ [s]."""
+    """Time between two assessments [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 
 

@@ -137,6 +137,7 @@ class Walking(LeggedLoop):
             branches = RecoveryBranches(
                 builder,
                 parameters.recovery,
+                initial_uncertainty=scenario.assessment.initial_uncertainty,
                 period_s=scenario.control_period_s,
                 offset_s=self.tick_s,
             )
@@ -185,11 +186,8 @@ class Walking(LeggedLoop):
             )
             builder.Connect(self._features, guard_system.GetInputPort("features"))
         if trigger is not None and assessor is not None:
-            for name, port in (
-                ("safety_probability", "calibrated_safety_probability"),
-                ("belief", "belief"),
-            ):
-                builder.Connect(assessor.GetOutputPort(port), trigger.GetInputPort(name))
+            for name in ("safety_probability", "belief"):
+                builder.Connect(assessor.GetOutputPort(name), trigger.GetInputPort(name))
         elif trigger is not None:
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")

@@ -159,20 +159,20 @@ class GuardParameters:
     """The command guard."""
 
     threshold: float = 0.9
-    """Lowest calibrated Γ of a command that is passed on; set after a look at figures."""
+    """Lowest probability of a command that is passed on; set after a look at figures."""
     period_s: float = 0.1
     """Time between two decisions [s]."""
 
 
 @dataclass(kw_only=True)
 class WalkingRecovery:
-    """What the robot does when Γ falls below a threshold."""
+    """What the robot does when the probability falls below a threshold."""
 
     branch: str = "stop"
     """"stop": a command of zero; "slower": a share of the command; "crouch": down to a posture,
     with damping; "policy": another policy."""
     threshold: float = 0.5
-    """Γ_thre, of calibrated Γ; not tuned."""
+    """Γ_thre, of the probability; not tuned."""
     persistence_s: float = 0.04
     """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
     move, a single row can be unlike those of training."""

@@ -22,6 +22,7 @@ class RecoveryBranches:
     Args:
         builder: The diagram's builder.
         recovery: The scenario's recovery.
+        initial_uncertainty: μ_ini of the assessment.
         period_s: Update period [s].
         offset_s: Time of the trigger's first update; the branches' is twice that [s].
 
@@ -34,6 +35,7 @@ class RecoveryBranches:
         builder: DiagramBuilder,
         recovery: WalkingRecovery,
         *,
+        initial_uncertainty: float,
         period_s: float,
         offset_s: float,
     ):
@@ -44,6 +46,7 @@ class RecoveryBranches:
             RecoveryTrigger(
                 threshold=recovery.threshold,
                 persistence_s=recovery.persistence_s,
+                initial_uncertainty=initial_uncertainty,
                 period_s=period_s,
                 offset_s=offset_s,
             ),

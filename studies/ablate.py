@@ -46,7 +46,7 @@ _COLUMNS = {
     "safe_recall": "safe recall",
     "unsafe_recall": "unsafe recall",
     "brier": "Brier",
-    "calibrated_auc": "AUC, calibrated Γ",
+    "calibrated_auc": "AUC, probability",
     "k0.auc": "AUC, k = 0",
     "k0.auc_gain": "over the baseline, k = 0",
 }

@@ -24,6 +24,7 @@ from drake_safety.evaluation.metrics import (
     threshold_at,
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
 
@@ -209,10 +210,9 @@ class VariantScores:
     """Unsafe scores 1 - Γ of a variant on fresh segments.
 
     Attributes:
-        calibration: Scores of the calibration set, 1 - normalised Γ, (M,).
+        calibration: Scores of the calibration set, 1 - safe share of the belief, (M,).
         test: Scores of the test set, likewise, (N,).
-        calibrated: Scores of the test set by calibrated Γ, (N,); equal to `test` in the paper's
-            mode, which has no heads.
+        calibrated: Scores of the test set by the probability, (N,).
     """
 
     calibration: np.ndarray
@@ -269,9 +269,9 @@ def unsafe_scores(
         found.append(result)
     seen, judged = found
     return VariantScores(
-        calibration=1.0 - seen.normalized,
-        test=1.0 - judged.normalized,
-        calibrated=1.0 - judged.calibrated,
+        calibration=1.0 - safe_share(seen.belief),
+        test=1.0 - safe_share(judged.belief),
+        calibrated=1.0 - judged.probability,
     )
 
 
@@ -299,7 +299,7 @@ def variant_estimates(
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall`, `brier` and `auc_gain` of all segments, and "k0.…" of
-        the first of each episode; `calibrated_auc` is that of calibrated Γ. Recalls are at
+        the first of each episode; `calibrated_auc` is that of the probability. Recalls are at
         the threshold of best balanced accuracy.
     """
     bootstrap = bootstrap or Bootstrap()

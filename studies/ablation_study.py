@@ -15,7 +15,6 @@ import numpy as np
 
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Bootstrap, Estimate
-from drake_safety.evaluation.report.results import as_estimate
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.simulation.worker_processes import parallel_map
 from studies.ablation import (
@@ -90,7 +89,9 @@ class AblationFile:
                 raise ValueError(f"its schema is not '{_SCHEMA}'")
             rows = {}
             for row in content.pop("rows"):
-                estimates = {key: as_estimate(value) for key, value in row.pop("figures").items()}
+                estimates = {
+                    key: Estimate.from_json(value) for key, value in row.pop("figures").items()
+                }
                 rows[row["name"]] = AblationRow(**row, estimates=estimates)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} holds no ablation: {error!r}") from error

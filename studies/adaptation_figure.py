@@ -71,7 +71,7 @@ def adaptation_figure(
         axes = fig.subplots(2, 1 + len(stages))
         shares = _safe_share(prior.beliefs_[0])
         is_empty = prior.beliefs_[0][:, UNCERTAINTY] >= 1.0
-        _draw_share(fig, axes[0, 0], prior, shares, is_empty, "Normalised Γ before any feedback")
+        _draw_share(fig, axes[0, 0], prior, shares, is_empty, "Safe share before any feedback")
         segments = prior.feedback_segments(feedback[: stages[-1]])
         _draw_feedback(fig, axes[1, 0], prior, segments, stages[-1])
         for column, (update, size) in enumerate(zip(updates, stages, strict=False), start=1):
@@ -112,7 +112,7 @@ def _draw_share(
     shade = ScalarMappable(Normalize(0.0, 1.0), safety_colours())
     draw_cells(axes, prior.grid_, shade.to_rgba(shares), is_empty)
     axes.set_title(title)
-    add_colour_bar(fig, axes, shade, "normalised Γ")
+    add_colour_bar(fig, axes, shade, "safe share")
 
 
 def _draw_feedback(

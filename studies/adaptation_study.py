@@ -12,6 +12,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.evaluation.scorers import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import FeedbackSet
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes, Segments, split
@@ -23,10 +24,10 @@ THRESHOLD = 0.5
 """Γ below which a segment is classified unsafe."""
 
 PUBLISHED: dict[str, Callable[[Assessments], np.ndarray]] = {
-    "calibrated": lambda result: result.calibrated,
-    "grid": lambda result: result.normalized,
+    "calibrated": lambda result: result.probability,
+    "grid": lambda result: safe_share(result.belief),
 }
-"""Γ by the key of stored results: calibrated, and normalised, that of the grid."""
+"""By the key of stored results: the probability, and the safe share of the grid's belief."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +57,11 @@ class TestSet:
         )
 
     def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
-        """1 - Γ of each segment by the grid of an assessment, (N,)."""
+        """1 - the safe share of each segment's belief, (N,)."""
         segments = self.segments
         features = segments.features if assessment.uses_features else None
-        return (
-            1.0 - assessment.predict(segments.state, segments.desired_preview, features).normalized
-        )
+        found = assessment.predict(segments.state, segments.desired_preview, features)
+        return 1.0 - safe_share(found.belief)
 
 
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-
-from drake_safety.evaluation.report.results import read_object
 
 _KEYS = {"machine_info", "commit_info", "datetime", "figures"}
 _COLUMNS = {"name", "value", "unit", "limit", "verdict", "peers", "note"}  # Of a figure.
@@ -39,8 +38,8 @@ def read_run(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: The file holds no figures of benchmarks.
     """
-    content = read_object(path)
-    figures = content.get("figures")
+    content = json.loads(path.read_text(encoding="utf-8"))
+    figures = content.get("figures") if isinstance(content, dict) else None
     if (
         not isinstance(figures, list)
         or not content.keys() >= _KEYS

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import yaml
 
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.report.results import Results
-from drake_safety.evaluation.report.tables import Column, Table
-from drake_safety.evaluation.report.verdicts import INPUTS, columns_of, verdict_tables
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import CONFIDENT
+from drake_safety.evaluation.tables import Column, Table
+from drake_safety.evaluation.verdict_tables import CALIBRATIONS, INPUTS, verdict_table
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA_VERSION
 from drake_safety.learning.calibration import MOTION, PLAN, Calibration
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
 from studies.shift_table import shift_rows
-from studies.stored_results import EVALUATION_FILE, read_results
+from studies.stored_results import EVALUATION_FILE
 
 CARD_FILE = "README.md"
 _TEMPLATE = Path(__file__).with_name("card.md")
@@ -41,7 +41,7 @@ _SHIFT_COLUMNS = {
     "monitor.delay_s": "monitor's alarm after [s]",
 }
 _NUM_SHIFTS = 5
-_PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
+_PERCENT = Column("", "", "%", digits=1)
 
 
 def write_card(folder: Path, scenario: Scenario) -> Path:
@@ -61,7 +61,7 @@ def write_card(folder: Path, scenario: Scenario) -> Path:
 
 def card_text(folder: Path, scenario: Scenario) -> str:
     """The card of a shipped folder, as Markdown; the arguments are those of `write_card`."""
-    results = read_results(folder / EVALUATION_FILE)
+    results = Results.read(folder / EVALUATION_FILE)
     assessments = {
         mode: SafetyAssessment.load(folder / f"{mode}.safetensors")
         for mode in results.entries["assessment_sha256"]
@@ -71,8 +71,11 @@ def card_text(folder: Path, scenario: Scenario) -> str:
         for mode, assessment in assessments.items()
         for kind, calibration in assessment.calibrations_.items()
     }
-    reported = {table.key: table for table in verdict_tables(results)}
-    tables = [_narrow(reported[key]) for key in _JUDGED if key in reported]
+    tables = [
+        verdict_table(results, key, corner=corner).narrow(_FIGURES)
+        for key, corner in _JUDGED.items()
+        if results.select(set=key)
+    ]
     link = f"[`{scenario.robot}`](../../models/{scenario.robot}/README.md)"
     return _TEMPLATE.read_text(encoding="utf-8").format(
         name=scenario.name,
@@ -89,14 +92,6 @@ def card_text(folder: Path, scenario: Scenario) -> str:
         commands="\n".join(_commands(results, assessments)),
         num_first=len(results.entries["first_episodes"]),
     )
-
-
-def _narrow(table: Table) -> Table:
-    """The columns of a report's table that the card has."""
-    shown = [i for i, column in enumerate(table.columns) if column.key in _FIGURES]
-    rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in table.rows]
-    columns = [table.columns[i] for i in shown]
-    return replace(table, corner=_JUDGED[table.key], columns=columns, rows=rows)
 
 
 def _facts(
@@ -133,7 +128,7 @@ def _facts(
 
 def _judged(results: Results) -> str:
     """What the figures are of."""
-    found = results.estimates
+    found = results
     words = [
         f"On {one.n} fresh episodes of seed {results.entries['seed']}, of which "
         f"{_PERCENT.text(one)} are {what}."
@@ -146,13 +141,13 @@ def _judged(results: Results) -> str:
 
 
 def _thresholds(results: Results, calibrations: Mapping[tuple[str, str], Calibration]) -> list[str]:
-    columns = [column for column in columns_of("calibrations") if column.key in _RATES]
+    columns = [column for column in CALIBRATIONS if column.key in _RATES]
     titles = ["threshold", "safe from", "unsafe below", *(column.title for column in columns)]
     rows = [titles, ["---"] * len(titles)]
     for (mode, kind), one in calibrations.items():
         safe = f"{one.threshold:.3f}" if one.threshold <= 1.0 else "never"
         unsafe = f"{one.unsafe_below:.3f}" if one.unsafe_below > 0.0 else "never"
-        found = (results.estimates.get(f"calibration.{mode}.{kind}.{c.key}") for c in columns)
+        found = (results.get(f"calibration.{kind}.{mode}.{c.key}") for c in columns)
         rates = [column.text(one) for column, one in zip(columns, found, strict=True)]
         rows.append([f"`{mode}`, {_WHEN[kind]}", safe, unsafe, *rates])
     return [f"| {' | '.join(row)} |" for row in rows]
@@ -164,20 +159,20 @@ def _limits(
     tables: Sequence[Table],
 ) -> list[str]:
     """Where the stored figures are weak."""
-    found = results.estimates
+    found = results
     limits = ["Every episode is simulated; none is of a real robot."]
     for table in tables:
         if ahead := table.better_baselines():
             limits.append(f"Better than `sharpened`, {table.corner}: {'; '.join(ahead)}.")
     for (mode, kind), one in calibrations.items():
         who = f"`{mode}`, {_WHEN[kind]}, calls"
-        missed = found.get(f"calibration.{mode}.{kind}.miss_rate")
+        missed = found.get(f"calibration.{kind}.{mode}.miss_rate")
         if missed is not None and missed.value > one.miss_rate:
             limits.append(
                 f"{who} {_PERCENT.text(missed)} of {missed.n} unsafe episodes safe: more than the "
                 f"promised {100 * one.miss_rate:g} %."
             )
-        safe = found.get(f"calibration.{mode}.{kind}.safe_recall")
+        safe = found.get(f"calibration.{kind}.{mode}.safe_recall")
         if safe is not None and safe.value < 0.5:
             limits.append(f"{who} only {_PERCENT.text(safe)} of {safe.n} safe episodes safe.")
     causes = ", ".join(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
@@ -29,12 +28,13 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
 from drake_safety.evaluation.plan_study import PROMISED_UNSAFE_RECALL
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.calibration import score_threshold
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
-from drake_safety.learning.prediction import LITERAL, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair
@@ -81,7 +81,7 @@ def converged(
         rules = judged_rules(prior, adapted)
         prior_alone = without_feedback_beliefs(prior).adapt(feedback, method="paper")
         for name, gamma in {"adapted": adapted, "discrepancy": prior_alone}.items():
-            rules[name] = (assessment_scorer(name, gamma, NORMALIZED), PAPER_THRESHOLD)
+            rules[name] = (share_scorer(name, gamma), PAPER_THRESHOLD)
         fair = np.array([isinstance(loop, HasGoals) and is_fair(loop, one) for one in test])
         estimates = recalls(rules, other, test, fair)
         if throws:
@@ -101,7 +101,7 @@ def converged(
                 [
                     TriggerRule(
                         name=name,
-                        scorer=assessment_scorer(name, one, LITERAL),
+                        scorer=assessment_scorer(name, one),
                         threshold=PAPER_THRESHOLD,
                     )
                     for name, one in literal.items()
@@ -114,7 +114,7 @@ def converged(
                 progress=stages,
             )
             estimates |= study.estimates
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "seed": seed,
@@ -122,10 +122,9 @@ def converged(
         "feedback_episodes": calibration_episodes,
         "feedback_pairs": pairs,
         "versions": versions(),
-        **{f"converged.{key}": estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / CONVERGED_FILE
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    Results({f"converged.{key}": one for key, one in estimates.items()}, entries).write(file)
     table = new_table("figure", "value", "interval", "n")
     for key, one in estimates.items():
         table.add_row(key, f"{one.value:.3f}", f"{one.low:.3f} to {one.high:.3f}", f"{one.n}")
@@ -151,19 +150,28 @@ def without_feedback_beliefs(prior: SafetyAssessment) -> SafetyAssessment:
 def judged_rules(
     prior: SafetyAssessment, adapted: SafetyAssessment
 ) -> dict[str, tuple[Scorer, float | str]]:
-    """Scorers by name, each with its threshold on Γ or the way to choose it.
+    """Scorers by name, each with its threshold or the way to choose it.
 
     Args:
         prior: The assessment before feedback.
         adapted: The same after it.
     """
-    literal, normalized = LITERAL, NORMALIZED
     return {
-        "literal": (assessment_scorer("literal", prior, literal), PAPER_THRESHOLD),
-        "converged": (assessment_scorer("converged", adapted, literal), PAPER_THRESHOLD),
-        "normalized": (assessment_scorer("normalized", prior, normalized), "balanced"),
-        "conformal": (assessment_scorer("conformal", prior, normalized), "promised"),
+        "literal": (assessment_scorer("literal", prior), PAPER_THRESHOLD),
+        "converged": (assessment_scorer("converged", adapted), PAPER_THRESHOLD),
+        "normalized": (share_scorer("normalized", prior), "balanced"),
+        "conformal": (share_scorer("conformal", prior), "promised"),
     }
+
+
+def share_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
+    """The safe share of the belief of a `paper` assessment, b_safe / (1 - μ), as a scorer."""
+    return replace(
+        assessment_scorer(name, assessment),
+        probability=lambda state, preview, features: safe_share(
+            assessment.predict(state, preview).belief
+        ),
+    )
 
 
 def recalls(

@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.rollouts import run_episode, worker_loop
@@ -41,7 +42,7 @@ class KnownTruth:
     features: np.ndarray
 
     def safety_probability(self, assessment: SafetyAssessment) -> np.ndarray:
-        """Normalised Γ of every start, (n, n).
+        """Safe share of every start's belief, (n, n).
 
         Args:
             assessment: Γ.
@@ -50,7 +51,7 @@ class KnownTruth:
             array.reshape(-1, array.shape[-1])
             for array in (self.state, self.desired_preview, self.features)
         ]
-        return assessment.predict(*rows).normalized.reshape(self.is_safe.shape)
+        return safe_share(assessment.predict(*rows).belief).reshape(self.is_safe.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +183,8 @@ def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> d
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     first = segments.take(segments.is_first)
     state = first.state if assessment.uses_features else first.true_state
-    probability = assessment.predict(state, first.desired_preview, first.features).normalized
+    found = assessment.predict(state, first.desired_preview, first.features)
+    probability = safe_share(found.belief)
     is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD
     wrong = is_confidently_wrong(is_safe, probability)
     return {

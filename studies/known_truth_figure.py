@@ -63,7 +63,7 @@ def known_truth_figure(
                 fontsize=10,
             )
         all_axes[0].set_ylabel(panels[0][0].axes[1])
-        fig.colorbar(image, ax=list(all_axes), label="normalised Γ", fraction=0.03)
+        fig.colorbar(image, ax=list(all_axes), label="safe share", fraction=0.03)
         handles = [
             Line2D([], [], color=INK, lw=2.0, label="true safe set, simulated"),
             Line2D(
@@ -72,7 +72,7 @@ def known_truth_figure(
                 color=SAFE_COLOUR,
                 lw=1.6,
                 ls="--",
-                label=f"normalised Γ = {panels[0][2].threshold:g}",
+                label=f"safe share = {panels[0][2].threshold:g}",
             ),
             Line2D([], [], color=INK, marker="x", ls="", label="confident and wrong"),
         ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,7 +14,6 @@ from drake_safety.cli.console import (
     TrainingOption,
     WorkersOption,
     console,
-    figures_table,
     open_stages,
     print_path,
     versions,
@@ -37,10 +35,10 @@ from drake_safety.evaluation.plan_study import (
     scorer_rule,
     verdict_estimates,
 )
-from drake_safety.evaluation.report.results import Results
-from drake_safety.evaluation.report.tables import Table
-from drake_safety.evaluation.report.verdicts import columns_of, estimate_rows
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.tables import Table, rows_of
+from drake_safety.evaluation.verdict_tables import TARGETS
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import score_threshold
@@ -105,29 +103,27 @@ def train_fewer(
             progress=stages,
         )
     estimates = {f"plans.learning_curve.{key}": estimate for key, estimate in curve.items()}
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "scenario_hash": info.scenario_hash,
         "seed": seed,
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
-        **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
+    results = Results(estimates, entries)
     file = assessment / CURVE_FILE
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    columns = columns_of("targets")
+    results.write(file)
     prefixes = {f"plans.learning_curve.{size}": f"{size}" for size in sorted(set(wanted))}
     prefixes |= {f"{key}.fair": f"{name}, fair targets" for key, name in list(prefixes.items())}
     table = Table(
-        key="learning_curve",
         title="Learning curve",
         meaning="The same test after training on fewer episodes.",
         corner="training episodes",
-        columns=columns,
-        rows=estimate_rows(Results(estimates=estimates), prefixes, columns),
+        columns=TARGETS,
+        rows=rows_of(results, prefixes, TARGETS),
     )
-    console.print(figures_table(table))
+    console.print(table.to_rich())
     print_path("figures", file)
     for path in save(learning_curve_figure(curve), assessment / "learning_curve"):
         print_path("picture", path)
@@ -210,7 +206,7 @@ def learning_curve(
     estimates: dict[str, Estimate] = {}
     miss_rate = promised_miss_rate(calibration)
     for size in wanted:
-        rule = scorer_rule(assessment_scorer("sharpened", learned[size], "calibrated"))
+        rule = scorer_rule(assessment_scorer("sharpened", learned[size]))
         threshold = score_threshold(
             rule.unsafe_score(calibration), calibration.is_unsafe, miss_rate
         )

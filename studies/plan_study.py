@@ -108,7 +108,7 @@ def plan_study(
     console.print(table)
     console.print(planning_verdict(study.estimates), highlight=False, soft_wrap=True)
     console.print(
-        f"threshold {rule.threshold:.3f} of calibrated Γ, {rule.origin}",
+        f"threshold {rule.threshold:.3f}, {rule.origin}",
         highlight=False,
         soft_wrap=True,
     )

@@ -231,7 +231,7 @@ def planning_study(
             trial.state,
             trial.desired_preview,
             trial.features if assessment.uses_features else None,
-        ).calibrated
+        ).probability
         for trial in trials
     ]
     best = [int(np.argmax(values)) for values in gamma]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli.console import TrainingOption, open_stages, print_path
 from drake_safety.cli.evaluate_shifts import SHIFTS_FILE
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.evaluation.report.results import Results, read_evaluation
+from drake_safety.evaluation.results import Results
 from drake_safety.simulation.dataset import read_info
 from drake_safety.simulation.scenario import load_scenario
 from studies.cards import write_card
@@ -88,29 +87,22 @@ def _evaluated(folder: Path) -> tuple[Results, dict[str, Any]]:
         raise ValueError(
             f"{folder} holds no evaluation to store: `drake-safety evaluate` makes one"
         )
-    results = read_evaluation(file)
+    results = Results.read(file)
     try:
         _, extra = read_info(episodes_folder(folder))
     except (ValueError, OSError):
         extra = {}  # The results do not need the training episodes.
     curve = folder / CURVE_FILE
     if curve.is_file():
-        drawn = read_evaluation(curve)
+        drawn = Results.read(curve)
         keys = ("scenario_hash", "assessment_sha256", "seed")
         if any(drawn.entries.get(key) != results.entries.get(key) for key in keys):
             raise ValueError(f"{curve} is of another training or other seeds than {file}")
-        results = replace(
-            results,
-            estimates=results.estimates | drawn.estimates,
-            entries=results.entries | {"learning_curve_command": drawn.entries["command"]},
-        )
+        command = {"learning_curve_command": drawn.entries["command"]}
+        results = Results({**results, **drawn}, results.entries | command)
     for name in (READINGS_FILE, CONVERGED_FILE, SHIFTS_FILE, WALKING_FILE):
         if (folder / name).is_file():
-            studied = read_evaluation(folder / name)
-            key = Path(name).stem
-            results = replace(
-                results,
-                estimates=results.estimates | studied.estimates,
-                entries=results.entries | {key: studied.entries},
-            )
+            studied = Results.read(folder / name)
+            entries = results.entries | {Path(name).stem: studied.entries}
+            results = Results({**results, **studied}, entries)
     return results, extra

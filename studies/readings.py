@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,6 +24,7 @@ from drake_safety.cli.console import (
 )
 from drake_safety.cli.training_folder import episodes_folder, run_fresh_episodes
 from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
@@ -190,20 +190,20 @@ def readings(
             found[reading.name] = recalls(rules, calibration, test, never)
         stages("readings", len(chosen), len(chosen))
     file = assessment / READINGS_FILE
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "seed": seed,
         "training_episodes": train_episodes,
         "versions": versions(),
         "names": [one.name for one in chosen],
-        **{
-            f"readings.{position}.{key}": estimate.to_json()
-            for position, one in enumerate(chosen)
-            for key, estimate in found[one.name].items()
-        },
     }
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    rows = {
+        f"readings.{position}.{key}": estimate
+        for position, one in enumerate(chosen)
+        for key, estimate in found[one.name].items()
+    }
+    Results(rows, entries).write(file)
     columns = [f"{kind}.normalized.auc" for kind in ("segments", "first")]
     columns += [
         f"first.{rule}.{label}_recall"

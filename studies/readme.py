@@ -8,24 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
-from drake_safety.evaluation.report.results import Results
-from drake_safety.evaluation.report.tables import Column, Row, Table
-from drake_safety.evaluation.report.verdicts import (
-    INPUTS,
-    columns_of,
-    estimate_rows,
-    plan_sets,
-    set_title,
-    verdict_tables,
-)
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.tables import Column, Table, rows_of
+from drake_safety.evaluation.verdict_tables import INPUTS, TARGETS, set_title, verdict_table
 from studies.shift_table import shifts_text
-from studies.stored_results import read_results
 from studies.walking_table import walking_text
 
 RESULTS_FOLDER = Path("docs/results")
@@ -36,10 +27,9 @@ _BLOCK = re.compile(
     re.DOTALL,
 )
 _OPEN = re.compile(r"<!-- (?:results|summary|readings|converged|shifts|walking): ([\w-]+) -->")
-_PERCENT = Column(key="", title="", meaning="", unit="%", digits=1)
-_SHARE = Column(key="", title="", meaning="")
-_PRINTED = {"safe_recall": SAFE_RECALL, "unsafe_recall": UNSAFE_RECALL}
-"""Recalls of the paper on 1000 random targets."""
+_PERCENT = Column("", "", "%", digits=1)
+_SHARE = Column("", "")
+_RECALLS = ("safe_recall", "unsafe_recall", "auc")
 
 
 def rewrite_readme(path: Path, folder: Path = RESULTS_FOLDER) -> list[str]:
@@ -92,7 +82,7 @@ def generate(text: str, folder: Path) -> str:
                 f"README: there are no results '{match['name']}' in {folder}; there are {there}: "
                 "`python -m studies store RUN` writes them"
             )
-        return f"{match['start']}{_MAKE[match['kind']](read_results(file))}\n{match['end']}"
+        return f"{match['start']}{_MAKE[match['kind']](Results.read(file))}\n{match['end']}"
 
     return _BLOCK.sub(block, text)
 
@@ -112,7 +102,7 @@ def results_text(results: Results) -> str:
 def summary_text(results: Results) -> str:
     """Counts and the main table of an evaluation, as Markdown."""
     if results.has("plans."):
-        sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in plan_sets(results)[1:]}
+        sets = {f"{prefix}.sharpened": set_title(prefix) for prefix in _plan_sets(results)[1:]}
         methods = ("paper", "gradient_boosting", "mlp", "reachability", "reachability_free")
         names = {
             "plans.sharpened": "`sharpened`",
@@ -120,10 +110,10 @@ def summary_text(results: Results) -> str:
             **{f"plans.{method}": _named(method) for method in methods},
         }
         own = {
-            "converged.first.literal": "`paper`, literal Γ < 0.6",
-            "converged.fair.literal": "`paper`, literal Γ < 0.6, fair targets",
-            "converged.first.converged": "`paper`, literal Γ < 0.6 after adaptation",
-            "converged.fair.converged": "`paper`, literal Γ < 0.6 after adaptation, fair targets",
+            "converged.first.literal": "`paper`, b_safe < 0.6",
+            "converged.fair.literal": "`paper`, b_safe < 0.6, fair targets",
+            "converged.first.converged": "`paper`, b_safe < 0.6 after adaptation",
+            "converged.fair.converged": "`paper`, b_safe < 0.6 after adaptation, fair targets",
         }
         names |= {prefix: name for prefix, name in own.items() if results.has(prefix)}
         table = _rows(results, "all targets", names)
@@ -140,9 +130,7 @@ def summary_text(results: Results) -> str:
         cells = []
         for key, column in columns.values():
             wanted = (key.format(method), key.format(f"{method}_literal_0.6"))
-            found = next(
-                (results.estimates[one] for one in wanted if one in results.estimates), None
-            )
+            found = next((results[one] for one in wanted if one in results), None)
             cells.append("" if found is None else column.text(found))
         if any(cells):
             lines.append(f"| {_named(method)} | {' | '.join(cells)} |")
@@ -152,16 +140,13 @@ def summary_text(results: Results) -> str:
         "converged.throws.converged.falls_with_recovery",
         "converged.throws.converged.false_triggers",
     )
-    if all(key in results.estimates for key in adapted):
+    if all(key in results for key in adapted):
         formats = [column for _, column in columns.values()]
-        cells = [
-            column.text(results.estimates[key])
-            for key, column in zip(adapted, formats, strict=True)
-        ]
-        lines.append(f"| `paper`, literal Γ < 0.6 after adaptation | {' | '.join(cells)} |")
+        cells = [column.text(results[key]) for key, column in zip(adapted, formats, strict=True)]
+        lines.append(f"| `paper`, b_safe < 0.6 after adaptation | {' | '.join(cells)} |")
     parts = [_counts(results), "\n".join(lines)]
-    if "throws.falls_without_recovery" in results.estimates:
-        alone = results.estimates["throws.falls_without_recovery"]
+    if "throws.falls_without_recovery" in results:
+        alone = results["throws.falls_without_recovery"]
         parts.insert(1, f"Of {alone.n} fresh throws {_PERCENT.text(alone)} fall without recovery.")
     return "\n\n".join(parts)
 
@@ -182,11 +167,10 @@ def readings_text(results: Results) -> str:
     lines = [f"| reading | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
     for position, name in enumerate(entries["names"]):
         cells = [
-            column.text(results.estimates[f"readings.{position}.{key}"])
-            for key, column in columns.values()
+            column.text(results[f"readings.{position}.{key}"]) for key, column in columns.values()
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    n = results.estimates["readings.0.first.normalized.auc"].n
+    n = results["readings.0.first.normalized.auc"].n
     counts = (
         f"Each is learned from {entries['training_episodes']} episodes and judged on {n} fresh "
         f"ones of seed {entries['seed']}."
@@ -196,12 +180,12 @@ def readings_text(results: Results) -> str:
 
 def converged_text(results: Results) -> str:
     """Tables of the paper's mode before and after its adaptation, as Markdown."""
-    entries, estimates = results.entries["converged"], results.estimates
+    entries, estimates = results.entries["converged"], results
     rules = {
-        "literal": "literal Γ < 0.6, before adaptation",
-        "converged": "literal Γ < 0.6, after adaptation",
-        "normalized": "normalised Γ, balanced threshold",
-        "conformal": "normalised Γ, promised miss rate 1 %",
+        "literal": "b_safe < 0.6, before adaptation",
+        "converged": "b_safe < 0.6, after adaptation",
+        "normalized": "safe share, balanced threshold",
+        "conformal": "safe share, promised miss rate 1 %",
     }
     sets = {"segments": "every segment", "first": "k = 0", "fair": "k = 0, fair targets"}
     lines = ["| | threshold | safe recall | unsafe recall | AUC |", "|---|---|---|---|---|"]
@@ -229,13 +213,13 @@ def converged_text(results: Results) -> str:
     if len(brier) == 3:
         before, after, prior_alone = brier
         parts.append(
-            f"Brier score of normalised Γ on every segment, without a gap: {before} before "
+            f"Brier score of the safe share on every segment, without a gap: {before} before "
             f"adaptation, {after} after it, {prior_alone} if feedback updates the prior alone, "
             "without feedback beliefs."
         )
     if results.has("converged.throws."):
         columns = {"falls with recovery": "falls_with_recovery", "false triggers": "false_triggers"}
-        lines = [f"| throws, literal Γ < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
+        lines = [f"| throws, b_safe < 0.6 | {' | '.join(columns)} |", "|---|---|---|"]
         for rule, name in {"before": "before adaptation", "converged": "after adaptation"}.items():
             found = (estimates[f"converged.throws.{rule}.{key}"] for key in columns.values())
             lines.append(f"| {name} | {' | '.join(map(_PERCENT.text, found))} |")
@@ -270,7 +254,7 @@ def _commands(results: Results) -> str:
 
 
 def _counts(results: Results) -> str:
-    entries, estimates = results.entries, results.estimates
+    entries, estimates = results.entries, results
     judged = estimates.get("plans.outcomes.safe") or estimates.get("episodes.share_unsafe")
     words = [
         f"Trained on {entries.get('training_episodes')} episodes of seed "
@@ -297,14 +281,14 @@ def _counts(results: Results) -> str:
 def _moments(results: Results) -> list[str]:
     titles = {"segments": "every segment", "episodes": "first row, k = 0"}
     parts = [
-        replace(table, corner=titles[table.key]).to_markdown()
-        for table in verdict_tables(results)
-        if table.key in titles
+        verdict_table(results, key, corner=corner).to_markdown()
+        for key, corner in titles.items()
+        if results.select(set=key)
     ]
     ahead = [
-        f"{_SHARE.text(results.estimates[key])} {place}"
+        f"{_SHARE.text(results[key])} {place}"
         for kind, place in (("segments", "per segment"), ("episodes", "at k = 0"))
-        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results.estimates
+        if (key := f"{kind}.sharpened_minus_best_classifier.auc") in results
     ]
     if ahead:
         parts.append(f"`sharpened` minus the better classifier, AUC: {', '.join(ahead)}.")
@@ -312,13 +296,13 @@ def _moments(results: Results) -> list[str]:
 
 
 def _throws(results: Results) -> list[str]:
-    (table,) = (table for table in verdict_tables(results) if table.key == "throws")
-    alone = results.estimates["throws.falls_without_recovery"]
+    table = verdict_table(results, "throws", corner="trigger")
+    alone = results["throws.falls_without_recovery"]
     remark = (
         f"{alone.n} fresh throws (seed {int(results.entries.get('seed', 0)) + 1}); "
         f"{_PERCENT.text(alone)} fall without recovery."
     )
-    return [remark, replace(table, corner="trigger").to_markdown(), _ahead(table), _broken(results)]
+    return [remark, table.to_markdown(), _ahead(table), _broken(results)]
 
 
 def _broken(results: Results) -> str:
@@ -326,7 +310,7 @@ def _broken(results: Results) -> str:
     prefix = "throws.sharpened.recoveries_with_"
     found = {
         key.removeprefix(prefix).replace("_", " "): estimate
-        for key, estimate in results.estimates.items()
+        for key, estimate in results.items()
         if key.startswith(prefix)
     }
     if not found:
@@ -340,39 +324,22 @@ def _broken(results: Results) -> str:
 
 
 def _targets(results: Results) -> list[str]:
-    parts = []
-    columns = 3  # Recalls and AUC; the report shows all.
-    tables = verdict_tables(results)
-    for table in tables:
-        if table.key != "plans":
-            continue
-        rows = [
-            Row(key=row.key, label=row.label, estimates=row.estimates[:columns])
-            for row in table.rows
-        ]
-        narrow = replace(
-            table, corner=set_title("plans"), columns=table.columns[:columns], rows=rows
-        )
-        text = narrow.to_markdown()
-        printed = " | ".join(
-            f"*{_PRINTED[column.key]:.3f}*" if column.key in _PRINTED else ""
-            for column in table.columns[:columns]
-        )
-        parts.append(f"{text}\n| *the paper's own* | {printed} |".replace("|  |", "| |"))
-        parts.append(_ahead(narrow))
-    prefixes = plan_sets(results)
+    table = verdict_table(results, "plans", corner=set_title("plans")).narrow(_RECALLS)
+    printed = f"*{SAFE_RECALL:.3f}* | *{UNSAFE_RECALL:.3f}* | |"
+    parts = [f"{table.to_markdown()}\n| *the paper's own* | {printed}", _ahead(table)]
+    prefixes = _plan_sets(results)
     if len(prefixes) > 1:
         names = {f"{prefix}.sharpened": set_title(prefix) for prefix in prefixes}
         parts.append(_rows(results, "`sharpened` on", names))
     parts.append(_differences(results))
-    right = results.estimates.get("plans.causes.right_cause")
+    right = results.get("plans.causes.right_cause")
     if right is not None and right.n:
         parts.append(
             f"The correct cause is named for {_PERCENT.text(right)} of the {right.n} correctly "
             "refused targets."
         )
     pattern = re.compile(r"(plans\.learning_curve\.(\d+))\.safe_recall")
-    found = (pattern.fullmatch(key) for key in results.estimates)
+    found = (pattern.fullmatch(key) for key in results)
     sizes = {match[1]: match[2] for match in found if match}
     if sizes:
         ordered = sorted(sizes, key=lambda prefix: int(sizes[prefix]))
@@ -383,11 +350,14 @@ def _targets(results: Results) -> list[str]:
 
 def _rows(results: Results, corner: str, prefixes: Mapping[str, str]) -> str:
     """Recalls and AUC by prefix, as Markdown."""
-    columns = columns_of("targets")[:3]
-    rows = estimate_rows(results, prefixes, columns)
-    return Table(
-        key="", title="", meaning="", corner=corner, columns=columns, rows=rows
-    ).to_markdown()
+    rows = rows_of(results, prefixes, TARGETS)
+    return Table(corner=corner, columns=TARGETS, rows=rows).narrow(_RECALLS).to_markdown()
+
+
+def _plan_sets(results: Results) -> list[str]:
+    """The judged sets of plans, that of all plans first."""
+    sets = [row.set for row in results.select(method="outcomes", metric="safe") if row.n]
+    return sorted(sets, key=lambda name: (name.count("."), name))
 
 
 def _points(loss: float) -> str:
@@ -397,7 +367,7 @@ def _points(loss: float) -> str:
 def _differences(results: Results) -> str:
     """Differences of the recalls of `sharpened` between the hands."""
     lost = {
-        what: results.estimates.get(f"plans.other_hand.sharpened.{what}_recall_loss")
+        what: results.get(f"plans.other_hand.sharpened.{what}_recall_loss")
         for what in ("safe", "unsafe")
     }
     losses = [

@@ -200,7 +200,7 @@ def learned_row(
         for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         if line.startswith("VmHWM")
     )
-    scorer = assessment_scorer(parameters.mode, learned, "normalized")
+    scorer = assessment_scorer(parameters.mode, learned)
     return {
         "segments": len(segments_for(training, parameters)[0]),
         "episodes": count,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 
 _COLUMNS = {
     "unsafe": "unsafe",
@@ -36,7 +36,7 @@ def shifts_text(results: Results) -> str:
     lines += shift_rows(results, titles, _COLUMNS)
     lines += _ranking(results, kinds)
     lines += _promises(results, kinds)
-    false = results.estimates["shifts.nominal.monitor.false_alarms_per_hour"]
+    false = results["shifts.nominal.monitor.false_alarms_per_hour"]
     lines.append(
         f"\nFalse alarms of the monitor: {false.value:.2f} ({false.low:.2f}–{false.high:.2f}) an "
         f"hour on {false.n} safe nominal motions."
@@ -58,7 +58,7 @@ def _ranking(results: Results, kinds: dict[str, str]) -> list[str]:
     """The table of AUCs: on what Γ knows, and on all rows with and without refusals."""
     names = [name for name in kinds if results.has(f"shifts.{name}.without_novelty.auc")]
     intro = (
-        "\nAUC of calibrated Γ and of gradient boosting [%]: on the rows that Γ knows; on all "
+        "\nAUC of the probability and of gradient boosting [%]: on the rows that Γ knows; on all "
         'rows, the novelty ignored; and with "don\'t know" as the lowest probability.\n'
     )
     table = shift_rows(results, dict(zip(names, names, strict=True)), _RANKING_COLUMNS)
@@ -106,7 +106,7 @@ def shift_rows(results: Results, titles: dict[str, str], columns: dict[str, str]
 
 
 def _cell(results: Results, key: str) -> str:
-    estimate = results.estimates.get(key)
+    estimate = results.get(key)
     if estimate is None:
         return ""
     if key.endswith("_s"):

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -25,7 +24,7 @@ from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 from studies.cards import write_card
-from studies.stored_results import EVALUATION_FILE, read_results, store_results
+from studies.stored_results import EVALUATION_FILE, store_results
 
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
@@ -98,7 +97,7 @@ def ship(
     for file in files.values():
         shutil.copyfile(file, folder / file.name)
     store_results(
-        replace(results, entries=results.entries | stored),
+        Results(results, results.entries | stored),
         folder / EVALUATION_FILE,
         train_command=train_command,
     )
@@ -123,7 +122,7 @@ def check_shipped(folder: Path, scenario: Scenario, *, num_workers: int | None =
         ValueError: A file or the scenario has changed, or outcomes or verdicts of the first
             episodes differ from the stored ones.
     """
-    results = read_results(folder / EVALUATION_FILE)
+    results = Results.read(folder / EVALUATION_FILE)
     stored = results.entries
     missing = [key for key in (_HASHES, _VERDICTS, "seed", "scenario_hash") if key not in stored]
     if missing:
@@ -174,7 +173,7 @@ def first_verdicts(
 
     Returns:
         An entry for each episode: "episode", its index; "cause" of its end, "" if it stayed safe;
-        and by mode "verdict" and "safety_probability", calibrated Γ at k = 0. Diverged episodes
+        and by mode "verdict" and "safety_probability" at k = 0. Diverged episodes
         have no modes.
     """
     episodes = run_episodes(
@@ -191,7 +190,7 @@ def first_verdicts(
     segments = split(episodes, stride=1, discount=1.0, shortest=1)
     first = segments.take(np.flatnonzero(segments.is_first))
     for mode, assessment in assessments.items():
-        scorer = assessment_scorer(mode, assessment, "calibrated")
+        scorer = assessment_scorer(mode, assessment)
         gamma = 1.0 - scorer.unsafe_score(first)
         verdicts = assessment.calibrations_[PLAN].verdicts(gamma)
         for position, verdict, value in zip(first.episode, verdicts, gamma, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,9 +22,10 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import MODES, episodes_folder, load_assessment
 from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import StageProgress, classifier_scorers
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import file_hash, replacing
+from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from studies import command_line
@@ -154,18 +154,16 @@ def walking(
             estimates |= speed_estimates(ours, theirs)
         walked = sets.run("tour", range(tours), TOUR_S)
         estimates |= tour_estimates(alarms, thresholds, walked)
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "variation": variation,
         "seeds": _SEEDS,
         "assessment_sha256": file_hash(assessment / f"{MODES[0]}.safetensors"),
         "thresholds": thresholds,
-        **{key: estimate.to_json() for key, estimate in estimates.items()},
     }
     file = assessment / WALKING_FILE
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    Results(estimates, entries).write(file)
     table = new_table("figure", "value", "n")
     for key, estimate in estimates.items():
         table.add_row(key, interval(estimate), f"{estimate.n}")

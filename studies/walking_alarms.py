@@ -32,7 +32,7 @@ def walking_alarms(
     """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action."""
     loop = scenario.make_loop()
     watched = require(loop, CanFall).watched_features
-    scorers = [assessment_scorer("sharpened", assessment, "calibrated"), *classifiers]
+    scorers = [assessment_scorer("sharpened", assessment), *classifiers]
     alarms = [
         *(_in_logits(scorer_alarm(scorer)) for scorer in scorers),
         *threshold_alarms(loop.state_names, loop.feature_names, watched),

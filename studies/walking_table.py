@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 
 _NAMES = {
     "sharpened": "Γ, `sharpened`",
@@ -23,7 +23,7 @@ def walking_text(results: Results) -> str:
     Args:
         results: Stored results with those of the study.
     """
-    entries, found = results.entries["walking"], results.estimates
+    entries, found = results.entries["walking"], results
     stated = (results.entries.get(key) for key in ("train_command", "command"))
     commands = [*(str(one) for one in stated if one), str(entries["command"])]
     lines = ["```sh", *commands, "```\n", *_plan_lines(results)]
@@ -93,7 +93,7 @@ def _plan_lines(results: Results) -> list[str]:
         "gradient_boosting": "gradient boosting",
         "mlp": "MLP",
     }
-    found = results.estimates
+    found = results
     shown = [name for name in methods if results.has(f"plans.{name}.auc")]
     if not shown:
         return []
@@ -107,7 +107,7 @@ def _plan_lines(results: Results) -> list[str]:
     for name in shown:
         cells = [_share(found[f"plans.{name}.{key}"]) for key in _RATES]
         lines.append(f"| {methods[name]} | {' | '.join(cells)} |")
-    promise = "calibration.sharpened.plan"
+    promise = "calibration.plan.sharpened"
     if results.has(f"{promise}.miss_rate"):
         promised, missed = found[f"{promise}.promised_miss_rate"], found[f"{promise}.miss_rate"]
         lines.append(

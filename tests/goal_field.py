@@ -53,12 +53,10 @@ class FieldAssessment:
         known = 1.0 - self._unknown
         unsafe = known * (1.0 - gamma)
         return Assessments(
-            literal=known * gamma,
-            normalized=gamma,
             belief=np.column_stack([known * gamma, unsafe, np.full(n, self._unknown)]),
             embedding=np.zeros((n, 2)),
             cause_probability=np.column_stack([0.2 * unsafe, 0.8 * unsafe]),
             predicted_margins=np.column_stack([gamma - 0.5, np.full(n, 0.02)]),
-            calibrated=gamma,
+            probability=gamma,
             novelty=np.zeros(len(gamma)),
         )

@@ -38,7 +38,7 @@ def make_diagram(assessment=None):
     if assessment is not None:
         ports = {name: flight.GetOutputPort(name) for name in ("desired_preview", "margins")}
         assessor = AddSafetyAssessor(builder, assessment, state=state, **ports)
-        builder.ExportOutput(assessor.GetOutputPort("normalized_safety_probability"), "gamma")
+        builder.ExportOutput(assessor.GetOutputPort("safety_probability"), "gamma")
     return builder.Build()
 
 

@@ -4,6 +4,7 @@ import json
 
 from drake_safety.evaluation.figure_style import new_figure, save
 from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.simulation.dataset import EpisodeWriter
 from lip_episodes import make_episodes
@@ -25,12 +26,12 @@ def make_figures():
         estimates[f"{prefix}false_triggers"] = proportion(2, 30)
         estimates[f"{prefix}falls_missed"] = proportion(0, 20)
     estimates["throws.falls_without_recovery"] = proportion(20, 60)
-    estimates["calibration.sharpened.miss_rate_5"] = proportion(1, 40)
+    estimates["calibration.plan.sharpened.miss_rate"] = proportion(1, 40)
     return estimates
 
 
 def write_evaluation(folder, scenario_hash="0" * 64):
-    content = {
+    entries = {
         "command": "drake-safety evaluate lip --assessment /somebodys/own/lip --episodes 60",
         "scenario": "lip",
         "scenario_hash": scenario_hash,
@@ -38,9 +39,8 @@ def write_evaluation(folder, scenario_hash="0" * 64):
         "training_seed": 0,
         "training_episodes": 60,
         "versions": {"lip": "1"},
-        **{key: estimate.to_json() for key, estimate in make_figures().items()},
     }
-    (folder / "evaluation.json").write_text(json.dumps(content))
+    Results(make_figures(), entries).write(folder / "evaluation.json")
 
 
 def write_run(folder):

@@ -10,6 +10,7 @@ import pytest
 
 from drake_safety.evaluation.metrics import Bootstrap, Estimate
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import feedback_sets
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.dataset import EpisodeWriter
@@ -86,8 +87,8 @@ def test_the_baseline_is_what_training_makes_of_the_same_episodes(sets, whole):
     segments = judged_segments(sets.test.load(), BASE)
     result = assessment.predict(segments.state, segments.desired_preview, segments.features)
     scores = unsafe_scores(VARIANTS[0], BASE, sets)
-    np.testing.assert_array_equal(scores.test, 1.0 - result.normalized)
-    np.testing.assert_array_equal(scores.calibrated, 1.0 - result.calibrated)
+    np.testing.assert_array_equal(scores.test, 1.0 - safe_share(result.belief))
+    np.testing.assert_array_equal(scores.calibrated, 1.0 - result.probability)
     estimates = rows[0].estimates
     assert (rows[0].name, estimates["auc_gain"].value, estimates["auc_gain"].high) == (
         BASELINE,
@@ -255,7 +256,7 @@ def test_counting_all_feedback_in_every_cell_is_not_the_same_as_counting_its_own
     adapted = prior.adapt(feedback, method="paper").predict(
         segments.state, segments.desired_preview, segments.features
     )
-    error = np.mean((1.0 - adapted.normalized - segments.is_unsafe) ** 2)
+    error = np.mean((1.0 - safe_share(adapted.belief) - segments.is_unsafe) ** 2)
     assert found[PER_CELL]["brier"].value == pytest.approx(error)
     assert prior.parameters.adaptation.count == "cell"
 

@@ -13,7 +13,14 @@ from drake_safety.learning.assessment import (
     AssessmentParameters,
     SafetyAssessment,
 )
-from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY, average_cells, from_scores, fuse
+from drake_safety.learning.beliefs import (
+    EMPTY,
+    UNCERTAINTY,
+    average_cells,
+    from_scores,
+    fuse,
+    safe_share,
+)
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import feedback_sets, segments_of
 from drake_safety.learning.grid import Grid
@@ -131,8 +138,8 @@ def test_gamma_never_rises_in_a_learned_cell_whose_feedback_was_unsafe(sharpened
     all_guarded = dataclasses.replace(
         adapted.correction_, guard=np.ones_like(adapted.correction_.guard)
     )
-    held = sharpened.predict(*x, correction=all_guarded).calibrated
-    assert np.all(held <= sharpened.predict(*x).calibrated + 1e-12)
+    held = sharpened.predict(*x, correction=all_guarded).probability
+    assert np.all(held <= sharpened.predict(*x).probability + 1e-12)
 
 
 @pytest.mark.train
@@ -155,8 +162,8 @@ def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, off
     extreme = dataclasses.replace(own, change=np.array([offset, 0.0, 0.0]))
     one = worse()[0]
     x = one.state, one.desired_preview, one.features
-    many = sharpened.predict(*x, correction=extreme).calibrated
-    single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).calibrated
+    many = sharpened.predict(*x, correction=extreme).probability
+    single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).probability
     assert many[0] == pytest.approx(expected, abs=1e-9)
     assert single == pytest.approx(expected, abs=1e-9)
 
@@ -200,10 +207,10 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
                 )
         for row in range(0, len(segments), 7):
             one = adapted.predict_one(*inputs(segments, row))
-            for name in ("calibrated", "normalized", "literal"):
-                assert getattr(one, name) == pytest.approx(getattr(results[0], name)[row], abs=1e-3)
+            assert one.probability == pytest.approx(results[0].probability[row], abs=1e-3)
+            np.testing.assert_allclose(one.belief, results[0].belief[row], atol=1e-3)
         unmoved = assessment.predict(*given)
-        assert np.abs(unmoved.normalized - results[0].normalized).max() > 0.01
+        assert np.abs(unmoved.belief - results[0].belief).max() > 0.01
 
 
 @pytest.mark.train
@@ -212,11 +219,9 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     before = sharpened.predict(*inputs(segments))
     after = sharpened.adapt(worse()).predict(*inputs(segments))
     # Rows that were unknown have no probability to move.
-    was_known = before.calibrated > 0.0
-    published, grid = (
-        (getattr(after, name) - getattr(before, name))[was_known]
-        for name in ("calibrated", "normalized")
-    )
+    was_known = before.probability > 0.0
+    published = (after.probability - before.probability)[was_known]
+    grid = (safe_share(after.belief) - safe_share(before.belief))[was_known]
     assert published.mean() < -0.05
     assert grid.mean() < -0.05
     assert np.corrcoef(published, grid)[0, 1] > 0.7

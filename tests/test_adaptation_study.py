@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import Episodes
 from lip_assessments import QUICK, pairs_with, worse
@@ -30,7 +31,10 @@ def test_scores_are_those_of_what_is_published(assessment, judged):
     segments = judged.segments
     result = assessment.predict(segments.state, segments.desired_preview, segments.features)
     found = scores(assessment, judged)
-    for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
+    for name, probability in (
+        ("calibrated", result.probability),
+        ("grid", safe_share(result.belief)),
+    ):
         unsafe = 1.0 - probability
         assert found[name]["brier"] == pytest.approx(np.mean((unsafe - segments.is_unsafe) ** 2))
         caught = (unsafe > 0.5)[segments.is_unsafe].mean()

@@ -89,7 +89,7 @@ def test_an_accepted_target_is_told_with_its_belief_and_ends_with_zero(call, fol
     code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)
     assert code == 0
     assert "0.6 0.5 1.05 m of the left hand" in told
-    assert re.search(r"verdict +safe: calibrated Γ \d\.\d+ ≥ threshold 0\.400", told)
+    assert re.search(r"verdict +safe: probability \d\.\d+ ≥ threshold 0\.400", told)
     assert "belief" in told
     assert "nearest accepted" not in told
     assert "at most 1 % of unsafe episodes called safe" in told
@@ -98,13 +98,13 @@ def test_an_accepted_target_is_told_with_its_belief_and_ends_with_zero(call, fol
 def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call, folder):
     code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
     assert code == 1
-    assert re.search(r"verdict +unsafe: calibrated Γ \d\.\d+ < threshold 0\.500", told)
+    assert re.search(r"verdict +unsafe: probability \d\.\d+ < threshold 0\.500", told)
     assert re.search(rf"likely cause +{CAUSE}", told)
     nearest = re.search(r"nearest accepted +(\S+ \S+ \S+) m, \S+ cm away", told)[1]
     # What is told can be typed, and is accepted then.
     assert call("ask", SCENARIO, "--assessment", folder, "--target", *nearest.split())[0] == 0
     assert float(nearest.split()[0]) < FAR[0]
-    gamma = re.search(r"cm away, calibrated Γ (\S+)", told)[1]
+    gamma = re.search(r"cm away, probability (\S+)", told)[1]
     assert float(gamma) >= 0.5 + 0.8 * 0.5
 
 
@@ -118,7 +118,6 @@ def test_the_answer_as_json_is_the_library_s_own(call, folder, trained, loop, ta
     assert answer.pop("hand") == "left"
     assert answer.pop("assessment") == str(folder)
     assert "promises nothing" in answer.pop("threshold_origin")
-    assert answer["quantity"] == "calibrated"
     assert answer.pop("nearest_accepted") == (None if verdict.is_accepted else list(target))
     assert answer == json.loads(json.dumps(verdict.to_json()))
     assert code == (0 if verdict.is_accepted else 1)
@@ -304,9 +303,7 @@ def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
     gamma = trained[1]
     assert goal_threshold(folder, gamma).threshold == DEFAULT_THRESHOLD
     told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
-    assert re.search(
-        r"threshold +0\.500 of calibrated Γ, the default, which promises nothing", told
-    )
+    assert re.search(r"threshold +0\.500, the default, which promises nothing", told)
     threshold, unsafe_below, origin = goal_threshold(folder, calibrate(folder, 0.25))
     assert (threshold, unsafe_below) == (0.25, 0.25)
     assert re.match(r"calibrated on \d+ episodes for a promised miss rate: at most 1 % of", origin)
@@ -365,6 +362,6 @@ def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, row):
         leave_time_s=np.inf,
         cause="",
         fall_time_s=np.inf,
-        extra={"calibrated_safety_probability": np.array(gamma)[:, None]},
+        extra={"safety_probability": np.array(gamma)[:, None]},
     )
     assert alarm_row(motion, 0.5) == row

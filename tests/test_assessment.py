@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import split
 from drake_safety.learning.training import segments_for
 from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
@@ -46,7 +47,7 @@ def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
 
 def test_held_out_episodes_are_told_apart(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
-    area = area_under_curve(result.literal, ~held_out.is_unsafe)
+    area = area_under_curve(result.belief[:, 0], ~held_out.is_unsafe)
     assert area > (0.88 if assessment.parameters.is_sharpened else 0.75)
 
 
@@ -54,16 +55,33 @@ def test_masses_sum_to_one_and_causes_to_the_unsafe_mass(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
     np.testing.assert_allclose(result.belief.sum(axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(result.cause_probability.sum(axis=1), result.belief[:, 1])
-    np.testing.assert_array_equal(result.literal, result.belief[:, 0])
     assert np.all(result.belief >= 0.0)
-    assert np.all(result.literal <= 0.7 + 1e-9)
+    assert np.all(result.belief[:, 0] <= 0.7 + 1e-9)
 
 
-def test_the_normalised_probability_is_the_safe_share_of_what_is_known(assessment, held_out):
+def test_the_probability_is_b_safe_without_heads_and_zero_where_it_is_dont_know(
+    assessment, held_out
+):
     result = assessment.predict(*inputs(held_out))
-    known = result.belief[:, :2].sum(axis=1)
-    np.testing.assert_allclose(result.normalized * known, result.belief[:, 0], atol=1e-9)
-    assert np.all((result.normalized >= 0.0) & (result.normalized <= 1.0 + 1e-9))
+    assert np.all((result.probability >= 0.0) & (result.probability <= 1.0))
+    unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
+    assert unknown.any() and not unknown.all()
+    np.testing.assert_array_equal(result.probability[unknown], 0.0)
+    if not assessment.parameters.is_sharpened:
+        np.testing.assert_array_equal(result.probability, result.belief[:, 0])
+
+
+@pytest.mark.parametrize("num_maps", [2, 4, 6, 10])
+@pytest.mark.parametrize("initial", [0.1, 0.3, 0.55, 0.7])
+def test_it_is_dont_know_if_half_of_the_maps_know_nothing(num_maps, initial):
+    # As `predict` averages a filled cell of every map that has one, and the empty belief.
+    def mean_uncertainty(num_outside):
+        masses = np.add.reduce(np.full(num_maps - num_outside, initial)) / num_maps
+        return masses + (1.0 - (num_maps - num_outside) / num_maps)
+
+    half = num_maps // 2
+    beliefs = [(0.0, 0.0, mean_uncertainty(n)) for n in (half - 1, half, half + 1)]
+    np.testing.assert_array_equal(is_unknown(np.array(beliefs), initial), [False, True, True])
 
 
 def test_one_input_alone_has_the_same_bits_as_among_many(assessment, held_out):
@@ -93,13 +111,12 @@ def test_an_input_that_is_not_finite_gets_the_empty_belief(assessment, held_out,
     state[1, 2] = bad
     result = assessment.predict(state, preview, features)
     one = assessment.predict_one(state[1], preview[1], features[1])
-    for belief, gamma, normalized in (
-        (result.belief[1], result.literal[1], result.normalized[1]),
-        (one.belief, one.literal, one.normalized),
+    for belief, probability in (
+        (result.belief[1], result.probability[1]),
+        (one.belief, one.probability),
     ):
         np.testing.assert_array_equal(belief, EMPTY)
-        assert gamma == 0.0
-        assert normalized == 0.0
+        assert probability == 0.0
     assert np.all(np.isfinite(result.belief))
     np.testing.assert_array_equal(
         result.belief[[0, 2]], assessment.predict(*inputs(held_out, known)).belief[[0, 2]]

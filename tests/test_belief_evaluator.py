@@ -62,15 +62,13 @@ class AssessmentDouble:
         else:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
-        calibrated = safe + correction.hidden[0, 3] * correction.guard[0, 5]
+        probability = safe + correction.hidden[0, 3] * correction.guard[0, 5]
         return Assessment(
-            literal=safe,
-            normalized=safe / 0.9,
             belief=np.array(belief),
+            probability=probability,
             cause_probability=np.array([0.2, 0.3]),
             embedding=np.array([3.0, -4.0]),
             predicted_margins=np.array([0.01, np.nan]),
-            calibrated=calibrated,
             novelty=NOVELTY,
         )
 
@@ -97,12 +95,10 @@ def test_its_ports_have_the_sizes_the_assessment_was_learned_with():
     evaluator = BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
     outputs = {
         "safety_probability": 1,
-        "normalized_safety_probability": 1,
         "belief": 3,
         "embedding": 2,
         "cause_probability": 2,
         "predicted_margins": 2,
-        "calibrated_safety_probability": 1,
         "novelty": 1,
     }
     assert evaluator.num_input_ports() == len(INPUTS)
@@ -121,12 +117,10 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
     simulator.Initialize()
     expected = {
         "safety_probability": [0.25],
-        "normalized_safety_probability": [0.25 / 0.9],
         "belief": [0.25, 0.65, 0.1],
         "embedding": [3.0, -4.0],
         "cause_probability": [0.2, 0.3],
         "predicted_margins": [0.01, np.nan],
-        "calibrated_safety_probability": [0.25],
         "novelty": [NOVELTY],
     }
     for name, numbers in expected.items():
@@ -218,8 +212,7 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     evaluator.adopt(context, adapted)
     assert value(evaluator, context, "safety_probability")[0] == 0.25
     simulator.AdvanceTo(PERIOD_S + 0.001)
-    assert value(evaluator, context, "safety_probability")[0] == 0.5
-    assert value(evaluator, context, "calibrated_safety_probability")[0] == 0.625
+    assert value(evaluator, context, "safety_probability")[0] == 0.625
     assert assessment.novelties[0] is assessment.novelty_
     assert assessment.novelties[-1] is adapted.novelty_
     found = evaluator.get_correction(context)
@@ -277,9 +270,8 @@ def test_an_alarm_makes_the_belief_unknown():
     evaluator.GetInputPort("alarm").FixValue(context, [1.0])
     simulator.Initialize()
     np.testing.assert_array_equal(value(evaluator, context, "belief"), [0.0, 0.0, 1.0])
-    for name in ("safety_probability", "normalized_safety_probability", "cause_probability"):
+    for name in ("safety_probability", "cause_probability"):
         assert not value(evaluator, context, name).any()
-    assert value(evaluator, context, "calibrated_safety_probability") == 0.0
     assert value(evaluator, context, "novelty") == NOVELTY
 
 
@@ -293,7 +285,6 @@ def test_outside_the_safe_set_nothing_is_safe_until_it_has_been_entered_again(ma
     # The mass goes to the most violated constraint.
     np.testing.assert_allclose(value(evaluator, context, "cause_probability"), [0.2, 0.55])
     assert value(evaluator, context, "safety_probability") == 0.0
-    assert value(evaluator, context, "calibrated_safety_probability") == 0.0
     port.FixValue(context, [0.1, 0.2])
     simulator.AdvanceTo(PERIOD_S)
     np.testing.assert_allclose(value(evaluator, context, "belief"), [0.25, 0.65, 0.1])

@@ -32,13 +32,13 @@ class SlowIsSafe:
         self.seen.append(len(state))
         gamma = (features[:, 0] <= self.fastest + 1e-9).astype(float)
         n = len(gamma)
+        if self.novelty > 1.0:
+            gamma = np.zeros(n)
         return Assessments(
-            literal=0.7 * gamma,
-            normalized=gamma,
             belief=np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(n, 0.3)]),
             embedding=np.zeros((n, 2)),
             cause_probability=np.zeros((n, 1)),
-            calibrated=gamma,
+            probability=gamma,
             predicted_margins=np.zeros((n, 1)),
             novelty=np.full(n, self.novelty),
         )

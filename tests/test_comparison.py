@@ -1,7 +1,5 @@
 """The table over several scenarios, and that finished rows are not made again."""
 
-import csv
-import io
 import json
 
 import numpy as np
@@ -37,13 +35,6 @@ def test_markdown_has_shares_in_percent_and_a_dash_where_nothing_was_found():
     assert cells["auc"] == "0.950 (0.930–0.970)"
     assert cells["falls without recovery"] == "40.0 % (25.0–55.0)"
     assert cells["falls with recovery"] == "–"
-
-
-def test_csv_has_every_figure_with_its_interval():
-    (row,) = csv.DictReader(io.StringIO(comparison_table([ROW]).to_csv()))
-    assert (row["scenario"], float(row["episodes"])) == (NAME, 256)
-    assert [float(row[f"auc{end}"]) for end in ("", ".low", ".high")] == [0.95, 0.93, 0.97]
-    assert row["falls_with_recovery"] == ""
 
 
 def test_a_finished_row_is_read_again_and_another_effort_makes_another(tmp_path, monkeypatch):

@@ -179,10 +179,7 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
     assert judged == {
         "motions",
         "sharpened",
-        "sharpened_literal",
-        "sharpened_calibrated",
         "paper",
-        "paper_literal",
         "gradient_boosting",
         "mlp",
         "front_margin",

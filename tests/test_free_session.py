@@ -79,8 +79,8 @@ def ticks(session, seconds):
         assert session.tick()
 
 
-def test_the_verdict_is_that_of_calibrated_gamma(session):
-    gamma = session.loop.GetOutputPort("calibrated_safety_probability")
+def test_the_verdict_is_that_of_the_probability(session):
+    gamma = session.loop.GetOutputPort("safety_probability")
     seen = set()
     for tick in range(300):
         if tick % 50 == 20:
@@ -95,7 +95,6 @@ def test_the_verdict_is_that_of_calibrated_gamma(session):
             assert status.tone == (status.state if is_known else "plain")
             seen.add(status.state)
     assert {"safe", "unsafe"} <= seen
-    assert session.panel.quantity == "calibrated Γ"
 
 
 def test_a_state_unlike_training_is_not_called_unsafe_but_unknown(session):
@@ -183,11 +182,11 @@ def test_goals_need_no_legs(shuttle_loop, meshcat):
 def test_ports_that_are_not_exported_are_named(meshcat):
     scenario = quick(gliding())
     loop = FewPorts(scenario, assessment=learned(scenario))
-    message = r"'FewPorts' exports no port \['calibrated_safety_probability'"
+    message = r"'FewPorts' exports no port \['safety_probability'"
     with pytest.raises(ValueError, match=message):
         LiveEpisodes(loop, meshcat, threshold=0.5)
     with pytest.raises(ValueError, match=message):
-        run_free(loop, seed=0, duration_s=0.4, ports=("calibrated_safety_probability",))
+        run_free(loop, seed=0, duration_s=0.4, ports=("safety_probability",))
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +232,6 @@ def test_such_a_task_can_be_played_and_an_empty_scene_is_warned_of(
     arguments = trained(task)
     assert call(monkeypatch, "play", *arguments) in (0, None)
     told = capsys.readouterr().out
-    assert "of calibrated Γ" in told
     assert "real-time factor" in told
     assert ("draws nothing" in told) == bool(warning)
     assert warning in told

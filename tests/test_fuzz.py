@@ -3,6 +3,7 @@
 FUZZ_FILES is the number of damaged files of all formats together, 1000 by default.
 """
 
+import math
 import os
 import random
 import shutil
@@ -13,7 +14,8 @@ import pytest
 from cart_episodes import make_episode, make_info
 from drake_safety import SafetyAssessment, load_scenario
 from drake_safety.assessments import shipped_folder
-from drake_safety.evaluation.report.results import read_evaluation
+from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.results import Results
 from drake_safety.logs.log_map import load_log_map
 from drake_safety.logs.robot_log import read_log
 from drake_safety.models import load_robot
@@ -82,11 +84,9 @@ def formats(tmp_path_factory):
     found["info"] = episodes, episodes / "info.json", load_episodes
     found["shard"] = episodes, episodes / "episodes-00000.parquet", load_episodes
     evaluation = folder / "evaluation.json"
-    evaluation.write_text(
-        '{"command": "c", "scenario": "s", "seed": 1, "a.b": {"value": 0.5, "low": 0.4, "high": 0.6'
-        ', "n": 10}, "c": {"value": null, "low": null, "high": null, "n": 0}}'
-    )
-    found["evaluation"] = evaluation, evaluation, read_evaluation
+    judged = {"a.b": proportion(5, 10), "c": Estimate.exact(math.nan, 0)}
+    Results(judged, {"command": "c", "seed": 1}).write(evaluation)
+    found["evaluation"] = evaluation, evaluation, Results.read
     shipped = shipped_folder("laikago_balancing") / "paper.safetensors"
     found["assessment"] = shipped, shipped, SafetyAssessment.load
     for path, _, reader in found.values():

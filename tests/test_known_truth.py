@@ -104,7 +104,7 @@ class SaysTheState:
     uses_features = True
 
     def predict(self, state, desired_preview, features):
-        return SimpleNamespace(normalized=state[:, 0])
+        return SimpleNamespace(belief=np.stack([state[:, 0], 1.0 - state[:, 0]], axis=1))
 
 
 def test_random_plans_are_judged_by_their_first_rows_alone():

@@ -24,7 +24,7 @@ WITHIN_S = 120
 
 @pytest.fixture
 def panel():
-    panel = LivePanel(title="a robot", quantity="normalised Γ", threshold=0.3)
+    panel = LivePanel(title="a robot", threshold=0.3)
     panel.add_button("Stop", "Escape")
     panel.add_button("Throw", "Space")
     panel.add_slider("mass [kg]", 1.0, 5.0, 0.5, 3.0)

@@ -70,7 +70,7 @@ def goals(goals_loop, meshcat):
 def test_a_tick_goes_on_by_its_time_and_the_panel_shows_the_gamma_of_the_loop(throws):
     assert throws.tick()
     assert throws.context.get_time() == pytest.approx(TICK_S)
-    gamma = throws.loop.GetOutputPort(throws.loop.trigger_port).Eval(throws.context)[0]
+    gamma = throws.loop.GetOutputPort("safety_probability").Eval(throws.context)[0]
     assert throws.probability == gamma
     assert throws.panel.probability == gamma
     assert throws.panel.curve()[-1] == (0.0, pytest.approx(gamma, abs=0.001))
@@ -141,7 +141,7 @@ def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
     move(goals, NEAR)
     assert not goals.tick()
     assert goals.verdict.is_accepted
-    assert goals.panel.status.state == f"accepted: Γ {goals.verdict.calibrated:.2f}"
+    assert goals.panel.status.state == f"accepted: probability {goals.verdict.probability:.2f}"
     move(goals, FAR)
     assert not goals.tick()
     assert not goals.verdict.is_accepted

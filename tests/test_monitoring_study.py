@@ -16,9 +16,9 @@ from drake_safety.evaluation.monitoring_study import (
     lowest_value,
     rate_per_hour,
 )
-from drake_safety.evaluation.report.results import Results
-from drake_safety.evaluation.report.verdicts import alarm_table
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.verdict_tables import verdict_table
 from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
@@ -207,11 +207,10 @@ def test_what_an_engineer_would_watch_is_found_by_name():
 
 def test_the_table_says_where_another_alarm_is_ahead():
     study = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST)
-    table = alarm_table(Results(estimates=study.estimates))
+    table = verdict_table(Results(study.estimates), "monitoring")
     assert [row.key for row in table.rows] == ["sharpened", "tilt"]
     (first, *_) = table.better_baselines()
     assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
-    assert "4 of" not in table.meaning and "66.7 % leave the safe set" in table.meaning
 
 
 def test_the_figure_marks_the_threshold_on_its_own_curve():

@@ -100,7 +100,7 @@ def test_the_nearest_accepted_goal_of_a_plane_is_found_with_few_judged():
     found = descend(task, PlaneAssessment())
     # Γ ≥ 0.9 is ln 9 below the middle of the slope.
     expected = GOAL @ NORMAL - (OFFSET - np.log(9.0) / STEEPNESS)
-    assert found.calibrated >= 0.9
+    assert found.probability >= 0.9
     assert found.threshold == 0.5
     assert distance(found) == pytest.approx(expected, abs=0.02)
     searched = search(whole, PlaneAssessment())
@@ -121,7 +121,7 @@ def test_a_suggestion_is_as_near_as_that_of_the_search_with_fewer_goals_judged()
     task, whole = GoalTask(), GoalTask()
     found, searched = suggest(task, PlaneAssessment()), search(whole, PlaneAssessment())
     assert distance(found) <= distance(searched) + 0.002
-    assert found.calibrated >= 0.9
+    assert found.probability >= 0.9
     assert found.threshold == 0.5
     assert task.num_resets < 0.6 * whole.num_resets
 

@@ -203,20 +203,19 @@ def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(robot, mode):
     result = assessment.predict(*(rng.permuted(part, axis=0) for part in parts))
     assert (result.novelty > 1.0).all()
     np.testing.assert_array_equal(result.belief, np.tile(EMPTY, (30, 1)))
-    for published in (result.literal, result.normalized, result.calibrated):
-        assert not published.any()
+    assert not result.probability.any()
     assert not result.cause_probability.any()
 
 
-def test_what_is_not_known_is_not_taken_for_safe_in_any_calibrated_output(robot):
+def test_what_is_not_known_is_not_taken_for_safe(robot):
     name, parts = robot
     assessment = load_assessment(name, "sharpened")
     beliefs = 0.1 * assessment.beliefs_
     beliefs[..., UNCERTAINTY] = 1.0 - beliefs[..., SAFE] - beliefs[..., UNSAFE]
     known, unknown = assessment.predict(*parts), assessment.predict(*parts, beliefs=beliefs)
-    assert known.calibrated.max() > 0.5
-    assert unknown.normalized.max() > 0.5
-    assert not unknown.calibrated.any()
+    assert known.probability.max() > 0.5
+    assert unknown.belief[:, SAFE].any()
+    assert not unknown.probability.any()
 
 
 def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):

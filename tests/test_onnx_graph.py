@@ -24,7 +24,7 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="the extra 'walking' is 
 DOCUMENTED = Path(__file__).resolve().parents[1] / "docs/export.md"
 FIELDS = {
     "belief": "belief",
-    "safety_probability": "calibrated",
+    "safety_probability": "probability",
     "cause_probability": "cause_probability",
     "predicted_margins": "predicted_margins",
     "novelty": "novelty",
@@ -135,7 +135,7 @@ def test_the_graph_of_a_shipped_assessment_says_what_predict_says_of_every_kind_
     assert np.sum(unknown & ~is_novel) > 0
     assert np.sum(is_novel & np.isfinite(expected.novelty)) > 50
     assert 20 < np.sum(np.isinf(expected.novelty)) < 100
-    assert np.ptp(expected.calibrated) > 0.5
+    assert np.ptp(expected.probability) > 0.5
 
 
 def with_maps(assessment, weights, num_margins):
@@ -213,12 +213,12 @@ def test_the_graph_of_an_adapted_assessment_is_that_of_its_present_adaptation(ha
     ports = every_kind_of_input(before)
     said = check_equal(adapted, exported(adapted, tmp_path / "gamma.onnx"), ports)
     earlier = before.predict(**ports)
-    assert np.abs(said.calibrated - earlier.calibrated).max() > 0.1
+    assert np.abs(said.probability - earlier.probability).max() > 0.1
     assert np.sum((said.novelty <= 1.0) & (earlier.novelty > 1.0)) > 20
     # The guard holds some of it back.
     free = dataclasses.replace(adapted.correction_, guard=np.zeros_like(adapted.correction_.guard))
-    unheld = adapted.predict(**ports, correction=free).calibrated
-    assert np.max(unheld - said.calibrated) > 0.01
+    unheld = adapted.predict(**ports, correction=free).probability
+    assert np.max(unheld - said.probability) > 0.01
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_the_graph_of_an_adapted_assessment_is_that_of_its_present_adaptation(ha
 def test_the_graph_has_the_heads_and_the_inputs_that_the_maps_have(mode, change, tmp_path):
     assessment = change(load_assessment("laikago_balancing", mode))
     expected = check_equal(assessment, exported(assessment, tmp_path / "gamma.onnx"))
-    assert np.ptp(expected.calibrated) > 0.5
+    assert np.ptp(expected.probability) > 0.5
 
 
 def test_whole_numbers_among_the_settings_are_numbers_like_others(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 
 from drake_safety.cli.training_folder import episodes_folder, training_options
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.simulation.scenario import load_scenario
 from lip_assessments import QUICK
@@ -83,15 +83,15 @@ def test_the_tables_of_the_papers_mode_say_what_was_found():
     entries |= {"feedback_episodes": 9, "feedback_pairs": 8, "names": ["default", "raw x"]}
     estimates = {f"readings.{i}.{key}": one for i in range(2) for key in keys}
     estimates |= {f"converged.{key}": one for key in keys}
-    found = Results(estimates=estimates, entries={"readings": entries, "converged": entries})
+    found = Results(estimates, {"readings": entries, "converged": entries})
     text = readings_text(found)
     assert "python -m studies x" in text and "| raw x | 0.500 (0.400–0.600) |" in text
     assert "64 episodes" in text and "100 fresh ones of seed 3" in text
     text = converged_text(found)
-    assert "k = 0: literal Γ < 0.6, after adaptation | 0.50 | 0.500" in text
+    assert "k = 0: b_safe < 0.6, after adaptation | 0.50 | 0.500" in text
     assert "fair" not in text and "throws" not in text
     estimates |= {f"converged.{key}": one for key in [*throws, "throws.falls_without_recovery"]}
-    text = converged_text(found)
+    text = converged_text(Results(estimates, found.entries))
     assert "| after adaptation | 50.0 % (40.0–60.0) | 50.0 % (40.0–60.0) |" in text
     assert "after 8 pairs" in text
 
@@ -103,11 +103,11 @@ def test_the_summary_shows_the_papers_mode_after_its_adaptation():
     keys += ["converged.throws.converged.falls_with_recovery"]
     keys += ["converged.throws.converged.false_triggers"]
     found = Results(
-        estimates=dict.fromkeys(keys, one),
-        entries=entries | {"converged": entries | {"training_episodes": 9}},
+        dict.fromkeys(keys, one),
+        entries | {"converged": entries | {"training_episodes": 9}},
     )
     text = summary_text(found)
     assert "`paper` has learned from 9 episodes." in text
     rates = "25.0 % (20.0–30.0) | 25.0 % (20.0–30.0)"
     auc = "0.250 (0.200–0.300) | 0.250 (0.200–0.300)"
-    assert f"| `paper`, literal Γ < 0.6 after adaptation | {auc} | {rates} |" in text
+    assert f"| `paper`, b_safe < 0.6 after adaptation | {auc} | {rates} |" in text

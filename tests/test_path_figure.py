@@ -19,10 +19,10 @@ def test_the_path_is_that_of_the_points_and_events_are_marked_where_they_happen(
     time_s = one.time_s
     middle = len(time_s) // 2
     events = {"ball": float(time_s[middle]), "start": 0.0}
-    fig = path_figure(assessment, time_s, found.embedding, found.normalized, 0.6, events)
+    fig = path_figure(assessment, time_s, found.embedding, found.probability, 0.6, events)
     plane, history = fig.axes[:2]
     np.testing.assert_array_equal(plane.lines[1].get_xydata(), found.embedding)
-    np.testing.assert_array_equal(history.lines[0].get_ydata(), found.normalized)
+    np.testing.assert_array_equal(history.lines[0].get_ydata(), found.probability)
     marks = {text.get_text(): text.xy for text in plane.texts}
     assert marks["1"] == pytest.approx(found.embedding[0])
     assert marks["2"] == pytest.approx(found.embedding[middle])

@@ -47,7 +47,7 @@ def test_the_plan_with_the_highest_gamma_is_set_and_the_state_stays(loop, contex
     )
     slowest = min(range(8), key=lambda i: plans[i][0])
     assert choice.index == slowest != 0
-    np.testing.assert_allclose(choice.calibrated, np.exp([-plan[0] for plan in plans]))
+    np.testing.assert_allclose(choice.probability, np.exp([-plan[0] for plan in plans]))
     after = state(loop, context)
     np.testing.assert_array_equal(after[:3], before[:3])
     np.testing.assert_array_equal(after[3:], plans[slowest])

@@ -87,11 +87,11 @@ def test_outside_what_was_trained_the_answer_is_the_region_and_no_number(goal, w
     assert verdict.verdict == UNKNOWN
     assert words in verdict.reason
     assert "x 0…1, y -1…1, z 0…2 m" in verdict.reason
-    assert math.isnan(verdict.calibrated)
+    assert math.isnan(verdict.probability)
     np.testing.assert_array_equal(verdict.belief, [0.0, 0.0, 1.0])
     assert task.num_resets == 0
     told = json.loads(json.dumps(verdict.to_json(), allow_nan=False))
-    assert told["calibrated"] is None
+    assert told["probability"] is None
     assert told["cause_margin"] is None
     assert told["cause"] is None
 
@@ -185,7 +185,7 @@ def test_an_accepted_goal_stays_one_when_it_is_typed_to_the_millimetre():
 def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve(reserve, x_m):
     # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, 0.5 + 0.5 reserve further down.
     found = search(lambda goals: 1.0 - goals[:, 0], np.array([0.9, 0.0, 1.0]), reserve=reserve)
-    assert found.calibrated >= 0.5 + 0.5 * reserve
+    assert found.probability >= 0.5 + 0.5 * reserve
     assert x_m - 0.05 <= found.goal[0] <= x_m + 1e-9
     assert found.threshold == 0.5
     assert found.is_accepted

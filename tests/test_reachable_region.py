@@ -35,7 +35,7 @@ def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(r
         # Every simulated target is one of the fine ones.
         assert np.abs(coarse[:, None] - fine).min(axis=1).max() < 1e-12
         assert len(fine) > 2 * len(coarse)
-    assert region.calibrated.shape == (len(region.z_m), len(region.y_m))
+    assert region.probability.shape == (len(region.z_m), len(region.y_m))
 
 
 @pytest.mark.train
@@ -65,14 +65,14 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
         loop.GetOutputPort(name).Eval(context)[None]
         for name in ("state", "desired_preview", "features")
     )
-    (expected,) = assessment_scorer("sharpened", assessment, "calibrated").probability(*inputs)
-    assert region.calibrated[row, column] == pytest.approx(expected, abs=1e-6)
+    (expected,) = assessment_scorer("sharpened", assessment).probability(*inputs)
+    assert region.probability[row, column] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.train
 def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
     estimates = region.estimates()
-    verdict = region.calibrated >= region.threshold
+    verdict = region.probability >= region.threshold
     rows = [int(np.argmin(np.abs(region.z_m - z))) for z in region.simulated_z_m]
     columns = [int(np.argmin(np.abs(region.y_m - y))) for y in region.simulated_y_m]
     is_right = verdict[np.ix_(rows, columns)] == (region.outcomes == SAFE)
@@ -114,16 +114,18 @@ def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(regi
     share = np.mean(region.outcomes == "flank")
     assert f"flank {100 * share:.0f} %" in labels
     assert not any(label.startswith("front") for label in labels)
-    assert f"calibrated Γ = {region.threshold:.2f}" in labels
+    assert f"probability {region.threshold:.2f}" in labels
     assert not any(label.startswith("inverse kinematics") for label in labels)
-    assert any("don't know" in label for label in labels) == bool(np.isnan(region.calibrated).any())
+    assert any("don't know" in label for label in labels) == bool(
+        np.isnan(region.probability).any()
+    )
 
 
 @pytest.mark.train
 def test_what_is_not_known_is_hatched_and_not_accepted(region):
-    probability = np.full_like(region.calibrated, 0.9)
+    probability = np.full_like(region.probability, 0.9)
     probability[: len(probability) // 2] = np.nan
-    half = replace(region, calibrated=probability)
+    half = replace(region, probability=probability)
     labels = [text.get_text() for text in region_figure(half, ["flank"]).legends[0].get_texts()]
     share = 100 * np.isnan(probability).mean()
     assert f"Γ: don't know, {share:.0f} %" in labels

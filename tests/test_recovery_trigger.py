@@ -64,9 +64,11 @@ def test_with_a_persistence_dont_know_must_last_that_long_and_danger_fires_at_on
     assert not bench.look()
     bench.set(0.0, belief=EMPTY)
     assert [bench.look() for _ in range(3)] == [False, False, True]
-    known = (0.1, 0.6, 0.3)
-    assert Bench(0.1, belief=known, persistence_s=2 * PERIOD_S).look()
-    # Without the port every Γ is known.
+    # A belief that is mostly of empty cells is "don't know", as for whoever else asks.
+    for mu, fires in ((0.3, True), (0.6, True), (0.7, False)):
+        belief = (0.1, 0.9 - mu, mu)
+        assert Bench(0.0, belief=belief, persistence_s=2 * PERIOD_S).look() == fires
+    # Without the port every probability is known.
     assert Bench(0.0, persistence_s=2 * PERIOD_S).look()
 
 

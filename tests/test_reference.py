@@ -108,5 +108,5 @@ def test_the_reference_builds_without_a_warning(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "reference" / "systems" / "safety_assessor" / "index.html").read_text()
-    assert "normalized_safety_probability" in page
+    assert "predicted_margins" in page
     assert "<svg" in page

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from drake_safety.evaluation.metrics import Estimate, proportion
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 from report_runs import make_figures
 from studies.readme import generate, rewrite_readme
-from studies.stored_results import read_results, store_results
+from studies.stored_results import store_results
 
 ROOT = Path(__file__).resolve().parents[1]
 STORED = sorted((ROOT / "docs/results").glob("*.json"))
@@ -24,7 +24,7 @@ BLOCK = "<!-- results: lip -->\nstale words\n<!-- end -->\n"
 
 def write_readme(folder, estimates, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
     store_results(
-        Results(estimates=estimates, entries=ENTRIES),
+        Results(estimates, ENTRIES),
         folder / "docs/results/lip.json",
         train_command="drake-safety train lip --resume --out=/somebodys/own/lip",
     )
@@ -62,10 +62,10 @@ def test_a_summary_is_one_table_with_and_without_targets(tmp_path):
 
 def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
     write_readme(tmp_path, make_figures())
-    results = read_results(tmp_path / "docs/results/lip.json")
-    assert list(results.estimates) == list(make_figures())
+    results = Results.read(tmp_path / "docs/results/lip.json")
+    assert list(results) == list(make_figures())
     for key, estimate in make_figures().items():
-        stored = results.estimates[key]
+        stored = results[key]
         assert (stored.value, stored.low) == pytest.approx((estimate.value, estimate.low), rel=1e-5)
         assert stored.n == estimate.n
     assert results.entries["command"] == (
@@ -147,10 +147,3 @@ def test_a_readme_that_cannot_be_filled_in_is_refused_and_left_alone(tmp_path, t
     with pytest.raises(ValueError, match=message):
         rewrite_readme(readme, tmp_path / "docs/results")
     assert readme.read_text() == text
-
-
-def test_a_file_that_holds_no_results_is_refused(tmp_path):
-    file = tmp_path / "a.json"
-    file.write_text('{"schema": "another"}')
-    with pytest.raises(ValueError, match="holds no results: its schema is 'another'"):
-        read_results(file)

@@ -5,7 +5,6 @@ import pytest
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer, classifier_scorers
-from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
 
@@ -26,11 +25,11 @@ class StandIn:
     def predict(self, state, desired_preview, features):
         assert (features is not None) == self.uses_features
         return SimpleNamespace(
-            literal=state[:, 0],
-            normalized=2.0 * state[:, 0],
-            calibrated=3.0 * state[:, 0],
-            # Nothing is known of every third input.
-            belief=np.where(np.arange(len(state))[:, None] % 3 == 2, EMPTY, (0.6, 0.1, 0.3)),
+            probability=state[:, 0],
+            # More than half of the belief about every third input is of empty cells.
+            belief=np.where(
+                np.arange(len(state))[:, None] % 3 == 2, (0.2, 0.1, 0.7), (0.6, 0.1, 0.3)
+            ),
         )
 
 
@@ -45,24 +44,16 @@ def test_the_unsafe_score_is_what_the_probability_of_safety_leaves(episodes):
 
 
 @pytest.mark.parametrize("uses_features", [True, False])
-def test_gamma_scores_by_any_of_its_forms_on_what_its_mode_sees(episodes, uses_features):
+def test_an_assessment_scores_by_its_probability_on_what_its_mode_sees(episodes, uses_features):
     segments = split(episodes, stride=1, discount=1.0)
-    literal, normalised, calibrated = (
-        assessment_scorer("gamma", StandIn(uses_features), published)
-        for published in ("literal", "normalized", "calibrated")
-    )
+    scorer = assessment_scorer("gamma", StandIn(uses_features))
     # The paper's mode has no noise in its data.
-    assert literal.uses_true_state is not uses_features
-    inputs = (segments.state, segments.desired_preview, segments.features)
-    np.testing.assert_array_equal(
-        2.0 * literal.probability(*inputs), normalised.probability(*inputs)
-    )
-    np.testing.assert_array_equal(
-        3.0 * literal.probability(*inputs), calibrated.probability(*inputs)
-    )
+    assert scorer.uses_true_state is not uses_features
+    probability = scorer.probability(segments.state, segments.desired_preview, segments.features)
     is_unknown = np.arange(len(segments)) % 3 == 2
-    np.testing.assert_array_equal(np.isnan(literal.probability(*inputs)), is_unknown)
-    score = literal.unsafe_score(segments)
+    np.testing.assert_array_equal(np.isnan(probability), is_unknown)
+    np.testing.assert_array_equal(probability[~is_unknown], segments.state[~is_unknown, 0])
+    score = scorer.unsafe_score(segments)
     assert (score[is_unknown] == 1.0).all()
     assert not np.isnan(score).any()
 

@@ -134,7 +134,7 @@ def test_what_has_been_used_otherwise_is_neither_calibrated_nor_adapted_with(ass
 @pytest.mark.train
 def test_who_is_judged_has_not_seen_the_episodes(assessment):
     calibrated(assessment, 30)
-    gamma = assessment_scorer("gamma", assessment, "calibrated")
+    gamma = assessment_scorer("gamma", assessment)
     fresh = make_episodes(20, seed=5)
     for calibration, test in (
         (fresh, make_episodes(20, seed=30)),

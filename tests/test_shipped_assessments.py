@@ -13,6 +13,7 @@ from drake_safety import assessments
 from drake_safety.assessments import assessed_scenarios, load_assessment, shipped_folder
 from drake_safety.cli import main
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
@@ -21,7 +22,7 @@ from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
 from studies.cards import CARD_FILE, card_text
 from studies.shipping import NUM_EPISODES, check_shipped
-from studies.stored_results import EVALUATION_FILE, read_results
+from studies.stored_results import EVALUATION_FILE
 
 NAME = "shuttling"
 MEGABYTE = 1e6
@@ -35,7 +36,7 @@ def test_what_is_shipped_is_what_was_evaluated(name):
     assert set(results.entries["assessment_sha256"]) == set(MODES)
     assert len(results.entries["first_episodes"]) == NUM_EPISODES
     assert {"command", "train_command", "seed", "versions"} <= set(results.entries)
-    assert any(key.endswith(".sharpened.unsafe_recall") for key in results.estimates)
+    assert any(key.endswith(".sharpened.unsafe_recall") for key in results)
     assert load_assessment(name).info_.scenario == name
 
 
@@ -149,12 +150,12 @@ def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped
         assert {one["kind"] for one in entries["calibrations"][mode]} == {"plan", "motion"}
     assert entries["train_command"] == f"drake-safety train {NAME} --out runs/own"
     assert entries["seed"] == 1_000_000
-    assert results.estimates["plans.sharpened.unsafe_recall"].n > 0
+    assert results["plans.sharpened.unsafe_recall"].n > 0
 
 
 @pytest.mark.slow
 def test_the_first_verdicts_are_those_of_the_first_fresh_episodes(run, shipped, scenario):
-    stored = read_results(shipped / NAME / "evaluation.json").entries["first_episodes"]
+    stored = Results.read(shipped / NAME / "evaluation.json").entries["first_episodes"]
     assert [entry["episode"] for entry in stored] == list(range(NUM_EPISODES))
     # Those that `evaluate` kept, and the numbers as a user would get them.
     (fresh,) = (run[1] / "fresh").glob("*-1000000")
@@ -169,7 +170,7 @@ def test_the_first_verdicts_are_those_of_the_first_fresh_episodes(run, shipped, 
                 episode.features[0] if mode == "sharpened" else None,
             )
             is_known = said.belief[2] <= 0.5 * (1.0 + assessment.parameters.initial_uncertainty)
-            gamma = said.calibrated if is_known else 0.0
+            gamma = said.probability if is_known else 0.0
             assert entry[mode]["safety_probability"] == pytest.approx(gamma, abs=1e-5)
             (verdict,) = assessment.calibrations_["plan"].verdicts(np.array([gamma]))
             assert entry[mode]["verdict"] == verdict

@@ -8,13 +8,13 @@ import pytest
 import typer
 
 from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.results import Results
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
 from studies import ablation_study, planning_study
 from studies.__main__ import app, main
 from studies.learning_curve import parse_sizes
-from studies.stored_results import read_results
 
 
 def call(monkeypatch, *arguments):
@@ -92,21 +92,20 @@ def test_a_learning_curve_is_drawn_and_stored_with_the_evaluation(monkeypatch, c
     options += ("--workers", 1, "--seed", 100)
     assert call(monkeypatch, "learning-curve", file, *options, "--sizes", "40,60") in (0, None)
     assert "Learning curve" in capsys.readouterr().out
-    curve = json.loads((folder / "learning_curve.json").read_text())
+    curve = Results.read(folder / "learning_curve.json")
     assert {"plans.learning_curve.40.auc", "plans.learning_curve.60.fair.brier"} <= curve.keys()
-    assert curve["command"].startswith("python -m studies learning-curve ")
+    assert curve.entries["command"].startswith("python -m studies learning-curve ")
     assert (folder / "learning_curve.png").is_file()
     assert call(monkeypatch, "learning-curve", file, *options, "--sizes", "61") == 2
     assert "60 training episodes; got sizes [61]" in capsys.readouterr().out
     # Stored beside the evaluation that it belongs to, and refused beside another.
-    report = {key: curve[key] for key in ("scenario", "scenario_hash", "seed", "assessment_sha256")}
-    report["plans.sharpened.auc"] = proportion(29, 30).to_json()
-    (folder / "evaluation.json").write_text(json.dumps(report))
+    judged = {"plans.sharpened.auc": proportion(29, 30)}
+    Results(judged, curve.entries).write(folder / "evaluation.json")
     stored = folder / "stored.json"
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) in (0, None)
-    found = read_results(stored).estimates
+    found = Results.read(stored)
     assert {"plans.sharpened.auc", "plans.learning_curve.40.auc"} <= found.keys()
-    (folder / "evaluation.json").write_text(json.dumps(report | {"seed": 7}))
+    Results(judged, curve.entries | {"seed": 7}).write(folder / "evaluation.json")
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) == 2
     assert "is of another training or other seeds" in " ".join(capsys.readouterr().out.split())
     for name in ("evaluation.json", "learning_curve.json"):

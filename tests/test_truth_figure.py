@@ -89,9 +89,9 @@ def test_points_have_the_calibrated_value_of_their_start_and_the_titles_sum_them
     figure = truth_figure(assessment, fresh, x, y)
     left, right = figure.axes[:2]
     values = np.sort(drawn(left, PathCollection)[-1].get_array())
-    expected = np.sort(found.calibrated[found.calibrated > 0])
+    expected = np.sort(found.probability[found.probability > 0])
     np.testing.assert_allclose(values, expected)
-    assert re.fullmatch(r"Starts by calibrated Γ, AUC [01]\.\d{3}", left.get_title(loc="left"))
+    assert re.fullmatch(r"Starts by probability, AUC [01]\.\d{3}", left.get_title(loc="left"))
     share = 100 * fresh.num_safe / FRESH
     assert right.get_title(loc="left") == f"Simulated: {share:.0f} % of {FRESH} stay safe"
     assert left.get_ylabel() == y.replace("_", " ")

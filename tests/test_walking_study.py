@@ -1,7 +1,6 @@
 """Figures of the study of walking, from motions made by hand."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from drake_safety import load_scenario
 from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.report.results import Results
+from drake_safety.evaluation.results import Results
 from studies.walking_alarms import (
     alarm_estimates,
     alarm_thresholds,
@@ -130,7 +129,7 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
     assert text.count("50.0 % (40.0–60.0)") == 9
     plans = {f"plans.mlp.{key}": estimate for key in ("auc", "safe_recall", "unsafe_recall")}
     plans["plans.outcomes.safe"] = estimate
-    with_plans = walking_text(replace(results, estimates=results.estimates | plans))
+    with_plans = walking_text(Results({**results, **plans}, results.entries))
     assert "| MLP | 0.500 (0.400–0.600) | 0.500" in with_plans
     for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| crouch |"):
         assert row in text

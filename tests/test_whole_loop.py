@@ -54,7 +54,7 @@ def test_gamma_tells_unsafe_episodes_from_safe_ones_shortly_before_the_end(scena
             episode.desired_preview[row : row + 1],
             episode.features[row : row + 1],
         )
-        last.append(result.normalized[0])
+        last.append(result.probability[0])
     is_safe = np.array([episode.is_safe for episode in fresh])
     assert np.mean(np.array(last)[is_safe]) - np.mean(np.array(last)[~is_safe]) > 0.3
 
@@ -64,7 +64,7 @@ def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
     quiet = copy.deepcopy(scenario)
     quiet.variations["quiet"] = PlantVariation(joint_friction_nm=0.4)
     loop = quiet.make_loop("quiet", assessment=assessment, recovery=False, ball=True)
-    ports = ("safety_probability", "normalized_safety_probability", "belief")
+    ports = ("safety_probability", "belief")
     log = run_throw(loop, 0, seed=8, throws=[HARD], duration_s=1.0, ports=ports)
     result = assessment.predict(log.state, log.desired_preview, log.features)
     # Outside the safe set nothing is safe.
@@ -76,12 +76,11 @@ def test_gamma_in_the_diagram_is_gamma_on_the_log(scenario, assessment):
     inside = ~is_outside[:, None]
     # A row shows the state before the updates of its instant: Γ of a row is published in the next.
     for name, expected in (
-        ("safety_probability", result.literal[:, None] * inside),
-        ("normalized_safety_probability", result.normalized[:, None] * inside),
+        ("safety_probability", result.probability[:, None] * inside),
         ("belief", belief),
     ):
         np.testing.assert_allclose(log.extra[name][1:], expected[:-1], atol=1e-5)
-    assert np.ptp(result.normalized) > 0.5
+    assert np.ptp(result.probability) > 0.5
 
 
 def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot():
@@ -127,4 +126,4 @@ def test_an_input_that_is_not_finite_is_answered_with_dont_know(assessment):
         state, np.zeros(3 * info.horizon), np.zeros(len(info.feature_names))
     )
     np.testing.assert_array_equal(result.belief, [0.0, 0.0, 1.0])
-    assert result.literal == 0.0
+    assert result.probability == 0.0

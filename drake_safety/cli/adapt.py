@@ -35,7 +35,6 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
-from drake_safety.learning.prediction import CALIBRATED, GAMMA, NORMALIZED
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
@@ -304,7 +303,7 @@ def _print_cuts(log: Path, found: LogPieces) -> None:
 
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
-    """Estimates of calibrated and, as "grid", normalised Γ on every segment of fresh episodes."""
+    """Estimates of the probability on every segment of fresh episodes."""
     from drake_safety.evaluation.metrics import segment_estimates
     from drake_safety.learning.segments import split
 
@@ -315,11 +314,7 @@ def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]
         segments.desired_preview,
         segments.features if assessment.uses_features else None,
     )
-    found: dict[str, Estimate] = {}
-    for name, probability in (("calibrated", result.calibrated), ("grid", result.normalized)):
-        estimates = segment_estimates(segments, 1.0 - probability, threshold=1.0 - _THRESHOLD)
-        found |= {f"{name}.{key}": estimate for key, estimate in estimates.items()}
-    return found
+    return segment_estimates(segments, 1.0 - result.probability, threshold=1.0 - _THRESHOLD)
 
 
 def _adaptation_table(
@@ -345,15 +340,12 @@ def _adaptation_table(
 
 
 def _judged_table(judged: dict[str, Estimate], variation: str) -> Table:
-    n = judged[f"{MODES[0]}.before.grid.auc"].n
+    n = judged[f"{MODES[0]}.before.auc"].n
     table = new_table(
         "", *_COLUMNS, title=f"{n} fresh episodes of '{variation}', recalls at {_THRESHOLD:g}"
     )
     for mode in MODES:
-        # Without heads both are the same.
-        for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
-            quantity = GAMMA[CALIBRATED if published == "calibrated" else NORMALIZED]
-            for who, label in _JUDGED.items():
-                estimates = (judged[f"{mode}.{who}.{published}.{key}"] for key in _COLUMNS)
-                table.add_row(f"{mode}, {quantity}, {label}", *map(interval, estimates))
+        for who, label in _JUDGED.items():
+            estimates = (judged[f"{mode}.{who}.{key}"] for key in _COLUMNS)
+            table.add_row(f"{mode}, {label}", *map(interval, estimates))
     return table

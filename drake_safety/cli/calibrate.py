@@ -28,7 +28,6 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.prediction import CALIBRATED, GAMMA
 from drake_safety.learning.seeds import CALIBRATION
 
 if TYPE_CHECKING:
@@ -113,7 +112,7 @@ def calibrate(
     found: dict[str, list[Calibration]] = {}
     kept: dict[str, list[PromiseKept]] = {}
     for mode, gamma in learned.items():
-        score = assessment_scorer(mode, gamma, CALIBRATED).unsafe_score(segments)
+        score = assessment_scorer(mode, gamma).unsafe_score(segments)
         for kind in KINDS:
             of_episodes, is_unsafe = episode_scores(segments, score, kind)
             one = choose(
@@ -151,7 +150,7 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
     table = new_table(
         "mode",
         "score",
-        f"safe from {GAMMA[CALIBRATED]}",
+        "safe from probability",
         "unsafe below",
         "misses",
         "safe recall",

@@ -13,7 +13,6 @@ from drake_safety.cli.console import (
     WorkersOption,
     command_line,
     console,
-    figures_table,
     open_stages,
     print_path,
     versions,
@@ -21,7 +20,7 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import check_writable
 
 if TYPE_CHECKING:
-    from drake_safety.evaluation.report.tables import Table
+    from drake_safety.evaluation.tables import Table
 
 
 def compare(
@@ -68,8 +67,8 @@ def compare(
             rows.append(row)
             # After every row, so that finished rows can be read during the next.
             _write(out, rows, comparison_table(rows))
-    console.print(figures_table(comparison_table(rows)))
-    for suffix in ("json", "csv", "md"):
+    console.print(comparison_table(rows).to_rich())
+    for suffix in ("json", "md"):
         print_path("table", out / f"comparison.{suffix}")
     found = {scenario.name: standing_still(scenario.make_loop()) for scenario in loaded}
     stills = {name: still for name, still in found.items() if still is not None}
@@ -82,7 +81,6 @@ def _write(out: Path, rows: list[dict[str, object]], table: Table) -> None:
     report = {"command": command_line(), "versions": versions(), "rows": rows}
     texts = {
         "json": json.dumps(report, indent=2) + "\n",
-        "csv": table.to_csv(),
         "md": table.to_markdown() + "\n",
     }
     for suffix, text in texts.items():

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from drake_safety.cli.training_folder import AssessmentFolder
     from drake_safety.evaluation.metrics import Estimate
-    from drake_safety.evaluation.report.tables import Table as Figures
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -111,26 +110,6 @@ def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:
 def new_table(*columns: str, title: str | None = None) -> Table:
     """A table whose cells fold if they do not fit, so that no number is truncated."""
     return Table(*(Column(name, overflow="fold") for name in columns), title=title)
-
-
-def figures_table(found: Figures) -> Table:
-    """A table of the report for the console, with its explanation.
-
-    Args:
-        found: The table.
-    """
-    table = new_table(found.corner, *(column.title for column in found.columns), title=found.title)
-    for row in found.rows:
-        cells = [
-            column.text(estimate)
-            for column, estimate in zip(found.columns, row.estimates, strict=True)
-        ]
-        table.add_row(row.label, *cells)
-    ahead = found.better_baselines()
-    table.caption = found.meaning or None
-    if ahead:
-        table.caption = f"{found.meaning}\nBetter than sharpened: {'; '.join(ahead)}"
-    return table
 
 
 def interval(estimate: Estimate, scale: float = 1.0, digits: int = 3) -> str:

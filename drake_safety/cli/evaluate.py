@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +16,6 @@ from drake_safety.cli.console import (
     WorkersOption,
     command_line,
     console,
-    figures_table,
     open_stages,
     print_path,
     versions,
@@ -39,7 +37,6 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.seeds import EVALUATION
 
 if TYPE_CHECKING:
@@ -126,10 +123,10 @@ def evaluate(
     """
     from drake_safety.evaluation.embedding_figure import embedding_figure
     from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.report.results import Results
-    from drake_safety.evaluation.report.verdicts import verdict_tables
+    from drake_safety.evaluation.results import Results
     from drake_safety.evaluation.scorers import classifier_scorers
-    from drake_safety.learning.assessment_file import file_hash, replacing
+    from drake_safety.evaluation.verdict_tables import verdict_tables
+    from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.capabilities import (
         CanBePushed,
         HasBall,
@@ -232,7 +229,7 @@ def evaluate(
                     calibration_seed=seeds["disturbance thresholds"],
                 )
             )
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "scenario_hash": sharpened.info_.scenario_hash,
@@ -242,13 +239,12 @@ def evaluate(
         "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
         "versions": versions(),
         **findings.entries,
-        **{key: estimate.to_json() for key, estimate in findings.estimates.items()},
     }
+    results = Results(findings.estimates, entries)
     file = folder / "evaluation.json"
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for table in verdict_tables(Results(estimates=findings.estimates)):
-        console.print(figures_table(table))
+    results.write(file)
+    for table in verdict_tables(results):
+        console.print(table.to_rich())
     print_path("figures", file)
     for picture in findings.pictures:
         print_path("picture", picture)
@@ -262,8 +258,8 @@ def _evaluate_segments(judged: Judged) -> Findings:
     from drake_safety.evaluation.scorers import assessment_scorer
 
     scorers = [
-        assessment_scorer("sharpened", judged.sharpened, CALIBRATED),
-        assessment_scorer("paper", judged.paper, CALIBRATED),
+        assessment_scorer("sharpened", judged.sharpened),
+        assessment_scorer("paper", judged.paper),
         *judged.classifiers,
     ]
     estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
@@ -288,7 +284,6 @@ def _evaluate_throws(
         judged.paper,
         judged.classifiers,
         threshold=recovery.threshold,
-        is_normalized=recovery.is_normalized,
     )
     study = evaluate_throws(
         judged.scenario,
@@ -346,7 +341,7 @@ def _evaluate_calibration(judged: Judged) -> Findings:
     estimates: dict[str, Estimate] = {}
     curves = {}
     for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
-        score = assessment_scorer(mode, gamma, CALIBRATED).unsafe_score(segments)
+        score = assessment_scorer(mode, gamma).unsafe_score(segments)
         expected, is_unsafe = episode_scores(segments, score, PLAN)
         curves[mode] = reliability(expected, is_unsafe)
 
@@ -362,7 +357,7 @@ def _evaluate_calibration(judged: Judged) -> Findings:
         for kind, one in gamma.calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
             estimates |= {
-                f"calibration.{mode}.{kind}.{key}": value for key, value in shares.items()
+                f"calibration.{kind}.{mode}.{key}": value for key, value in shares.items()
             }
     return Findings(
         estimates=estimates,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import fresh_episodes_folder
-from drake_safety.learning.prediction import CALIBRATED
 
 if TYPE_CHECKING:
     from drake_safety.simulation.watched_motion import WatchedMotion
@@ -34,7 +33,7 @@ def evaluate_pushes(
         judged: The evaluated assessments.
         num_motions: Number of test motions, each undisturbed and pushed.
         num_calibration: Number of calibration motions.
-        threshold: Lowest calibrated Γ of an accepted goal.
+        threshold: Lowest probability of an accepted goal.
         seed: Seed of the test motions.
         calibration_seed: Seed of the calibration motions.
     """
@@ -60,7 +59,7 @@ def evaluate_pushes(
             progress=partial(judged.stages, what),
         )
 
-    verdict = assessment_scorer("sharpened", judged.sharpened, CALIBRATED)
+    verdict = assessment_scorer("sharpened", judged.sharpened)
     test = run("pushes", num_motions, seed)
     calibration = run("calibration pushes", num_calibration, calibration_seed)
     accepted = begun(test, verdict, threshold)
@@ -81,10 +80,11 @@ def evaluate_monitoring(
         calibration: Motions on which thresholds are chosen.
         test: Test motions.
     """
-    from drake_safety.evaluation.alarms import assessment_alarms, scorer_alarm, threshold_alarms
+    from drake_safety.evaluation.alarms import scorer_alarm, threshold_alarms
     from drake_safety.evaluation.figure_style import save
     from drake_safety.evaluation.monitoring_figure import monitoring_figure
     from drake_safety.evaluation.monitoring_study import evaluate_alarms
+    from drake_safety.evaluation.scorers import assessment_scorer
     from drake_safety.simulation.capabilities import CanFall
 
     if all(motion.has_left for motion in calibration):
@@ -93,8 +93,8 @@ def evaluate_monitoring(
     loop = judged.scenario.make_loop()
     watched = loop.watched_features if isinstance(loop, CanFall) else {}
     alarms = [
-        *assessment_alarms("sharpened", judged.sharpened),
-        *assessment_alarms("paper", judged.paper),
+        scorer_alarm(assessment_scorer("sharpened", judged.sharpened)),
+        scorer_alarm(assessment_scorer("paper", judged.paper)),
         *(scorer_alarm(scorer) for scorer in judged.classifiers),
         *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]

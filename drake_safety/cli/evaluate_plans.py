@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.cli.findings import Findings, Judged
-from drake_safety.learning.prediction import CALIBRATED
 
 if TYPE_CHECKING:
     from drake_safety.evaluation.plan_study import PlanRule, Plans, PlanStudy
@@ -140,7 +139,7 @@ def _rules(judged: Judged, loop: ClosedLoop, hands: Sequence[str | None]) -> lis
     from drake_safety.evaluation.scorers import assessment_scorer
 
     rules = [
-        scorer_rule(assessment_scorer(mode, gamma, CALIBRATED), gamma.calibrations_.get("plan"))
+        scorer_rule(assessment_scorer(mode, gamma), gamma.calibrations_.get("plan"))
         for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items()
     ]
     rules += [scorer_rule(scorer) for scorer in judged.classifiers]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -75,10 +74,11 @@ def evaluate_shifts_command(
         workers: Number of worker processes; None for one a core.
     """
     from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.results import Results
     from drake_safety.evaluation.scorers import classifier_scorers
     from drake_safety.evaluation.shift_study import evaluate_shifts, false_alarms
     from drake_safety.evaluation.shifts_figure import shifts_figure
-    from drake_safety.learning.assessment_file import file_hash, replacing
+    from drake_safety.learning.assessment_file import file_hash
     from drake_safety.simulation.dataset import load_episodes
 
     gamma = load_assessment(assessment, "sharpened")
@@ -99,21 +99,20 @@ def evaluate_shifts_command(
         alarms = false_alarms(every, gamma)
         results["nominal"].estimates["monitor.false_alarms_per_hour"] = alarms
     file = folder / SHIFTS_FILE
-    content = {
+    entries = {
         "command": command_line(),
         "scenario": scenario.name,
         "seed": seeds["shifts"],
         "assessment_sha256": file_hash(assessment_file(assessment, "sharpened")),
         "versions": versions(),
         "kinds": {name: result.kind for name, result in results.items()},
-        **{
-            f"shifts.{name}.{key}": estimate.to_json()
-            for name, result in results.items()
-            for key, estimate in result.estimates.items()
-        },
     }
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    estimates = {
+        f"shifts.{name}.{key}": estimate
+        for name, result in results.items()
+        for key, estimate in result.estimates.items()
+    }
+    Results(estimates, entries).write(file)
     _print_table(results)
     print_path("figures", file)
     for picture in save(shifts_figure(results), folder / "shifts"):

@@ -12,7 +12,6 @@ from drake_safety.cli.run_settings import (
     events_table,
     first_below,
 )
-from drake_safety.learning.prediction import CALIBRATED, GAMMA, PORTS
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,8 +21,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.free_motion import FreeMotion
 
-_GAMMA = PORTS[CALIBRATED]
-_PORTS = (_GAMMA, "belief", "cause_probability", "predicted_margins")
+_PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 
 
 def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
@@ -31,7 +29,7 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
 
     Args:
         settings: Settings of the run.
-        rule: Thresholds on Γ.
+        rule: Thresholds.
 
     Raises:
         ValueError: The task exports a port of the assessor under another name, or not at all.
@@ -56,15 +54,14 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
         ports=_PORTS,
         realtime_rate=settings.realtime_rate,
     )
-    gamma = motion.extra[_GAMMA][:, 0]
-    row = first_below(gamma, rule.threshold)
+    probability = motion.extra["safety_probability"][:, 0]
+    row = first_below(probability, rule.threshold)
     timeline = timeline_figure(
         motion.time_s,
-        gamma,
+        probability,
         rule.threshold,
-        quantity=GAMMA[CALIBRATED],
         trigger_times_s=[] if row is None else [float(motion.time_s[row])],
-        trigger_label="Γ falls",
+        trigger_label="probability falls",
         leave_time_s=motion.leave_time_s,
         belief=motion.extra["belief"],
         margins=motion.margins,
@@ -74,7 +71,7 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
     recording.save(
         {"timeline": timeline},
         _table_of_events(loop, settings.assessment, motion, row),
-        f"{rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.origin}",
+        f"{rule.threshold:.3g}, {rule.origin}",
     )
 
 
@@ -89,11 +86,11 @@ def _table_of_events(
             motion.extra["cause_probability"][row],
             motion.extra["predicted_margins"][row],
         )
-        told = f"Γ below the threshold; expected violation: {expected}"
+        told = f"probability below the threshold; expected violation: {expected}"
         events.append((float(motion.time_s[row]), told))
     if motion.cause:
         events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
     end = motion.failure and f"the simulation failed: {motion.failure}"
     inside = "the end, inside the safe set throughout"
     events.append((float(motion.time_s[-1]), end or ("the end" if motion.cause else inside)))
-    return events_table(events, motion.time_s, motion.extra[_GAMMA][:, 0], GAMMA[CALIBRATED])
+    return events_table(events, motion.time_s, motion.extra["safety_probability"][:, 0])

@@ -53,7 +53,6 @@ def play(
     push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
     verdict are shown.
     """
-    from drake_safety.learning.prediction import CALIBRATED, GAMMA
     from drake_safety.live.commanded_session import LiveCommands
     from drake_safety.live.free_session import LiveEpisodes
     from drake_safety.live.page import serve_page
@@ -87,7 +86,7 @@ def play(
         session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
     else:
         rule = goal_threshold(folder.path, gamma)
-        told = f"threshold {rule.threshold:.3g} of {GAMMA[CALIBRATED]}, {rule.origin}"
+        told = f"threshold {rule.threshold:.3g}, {rule.origin}"
         console.print(told, highlight=False, soft_wrap=True)
         if has_goals:
             session = LiveGoals(

@@ -27,7 +27,6 @@ from drake_safety.cli.run_settings import (
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
-from drake_safety.learning.prediction import LITERAL, NORMALIZED, PORTS, gamma_of_port
 from drake_safety.learning.seeds import DEMONSTRATION
 
 if TYPE_CHECKING:
@@ -42,8 +41,7 @@ if TYPE_CHECKING:
 
 _DURATION_S = 5.0  # Of a run with balls.
 _PORTS = (
-    PORTS[NORMALIZED],
-    PORTS[LITERAL],
+    "safety_probability",
     "belief",
     "cause_probability",
     "predicted_margins",
@@ -183,14 +181,14 @@ def _run_with_balls(settings: RunSettings) -> None:
     recording.save(
         figures,
         _table_of_events(loop, settings.assessment, log, throws),
-        f"recovery below {loop.scenario.parameters.recovery.threshold:g} of "
-        f"{gamma_of_port(loop.trigger_port)}, that of scenario '{loop.scenario.name}'",
+        f"recovery where the probability is below {loop.scenario.parameters.recovery.threshold:g}, "
+        f"that of scenario '{loop.scenario.name}'",
     )
     recording.save_animation(
         loop,
         log.time_s,
         {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]},
-        log.extra[loop.trigger_port][:, 0],
+        log.extra["safety_probability"][:, 0],
         loop.scenario.parameters.recovery.threshold,
         [start for start, _ in log.recovery_intervals_s],
     )
@@ -245,10 +243,9 @@ def _path(
         assessment,
         log.time_s,
         log.extra["embedding"],
-        log.extra[loop.trigger_port][:, 0],
+        log.extra["safety_probability"][:, 0],
         loop.scenario.parameters.recovery.threshold,
         {"start": 0.0, **events},
-        quantity=gamma_of_port(loop.trigger_port),
     )
 
 
@@ -263,9 +260,8 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
     instants = still_times(log.time_s, [throw.time_s for throw in throws], triggers)
     return timeline_figure(
         log.time_s,
-        log.extra[loop.trigger_port][:, 0],
+        log.extra["safety_probability"][:, 0],
         loop.scenario.parameters.recovery.threshold,
-        quantity=gamma_of_port(loop.trigger_port),
         throws=throws,
         trigger_times_s=triggers,
         recovery_intervals_s=log.recovery_intervals_s,
@@ -300,5 +296,4 @@ def _table_of_events(
         events.append((log.fall_time_s, "the robot fell"))
     else:
         events.append((float(log.time_s[-1]), "standing"))
-    port = loop.trigger_port
-    return events_table(events, log.time_s, log.extra[port][:, 0], gamma_of_port(port))
+    return events_table(events, log.time_s, log.extra["safety_probability"][:, 0])

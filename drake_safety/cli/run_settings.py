@@ -164,27 +164,26 @@ class Recording:
         print_path("animation", path)
 
 
-def first_below(gamma: np.ndarray, threshold: float) -> int | None:
-    """First row in which Γ is below a threshold or unknown; None for never."""
-    is_below = ~(gamma >= threshold)
+def first_below(probability: np.ndarray, threshold: float) -> int | None:
+    """First row in which the probability is below a threshold or NaN; None for never."""
+    is_below = ~(probability >= threshold)
     return int(np.argmax(is_below)) if is_below.any() else None
 
 
 def events_table(
-    events: Sequence[tuple[float, str]], time_s: np.ndarray, gamma: np.ndarray, quantity: str
+    events: Sequence[tuple[float, str]], time_s: np.ndarray, probability: np.ndarray
 ) -> Table:
-    """A table of events with Γ at their times.
+    """A table of events with the probability at their times.
 
     Args:
         events: Times [s] and descriptions.
         time_s: Instants of the log [s], (N,).
-        gamma: Γ, (N,).
-        quantity: Which Γ, as in `prediction.GAMMA`.
+        probability: Probability, (N,).
     """
-    table = new_table("time [s]", "event", quantity)
+    table = new_table("time [s]", "event", "probability")
     for instant, event in sorted(events, key=lambda one: one[0]):
         row = abs(time_s - instant).argmin()
-        table.add_row(f"{instant:.2f}", event, f"{gamma[row]:.2f}")
+        table.add_row(f"{instant:.2f}", event, f"{probability[row]:.2f}")
     return table
 
 

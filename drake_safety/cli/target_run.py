@@ -16,7 +16,6 @@ from drake_safety.cli.run_settings import (
     first_below,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
-from drake_safety.learning.prediction import CALIBRATED, GAMMA, PORTS
 from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.goal_motion import GoalMotion
 
 _MOTION_PORTS = (
-    PORTS[CALIBRATED],
+    "safety_probability",
     "belief",
     "cause_probability",
     "predicted_margins",
@@ -104,14 +103,14 @@ def run_to_target(
     recording.save(
         {"timeline": draw_motion(loop, motion, threshold)},
         table_of_motion(loop, settings.assessment, motion, threshold),
-        f"alarm below {threshold:.3f} of {GAMMA[CALIBRATED]} in any row, {origin}",
+        f"alarm where the probability is below {threshold:.3f} in any row, {origin}",
     )
     alarm = alarm_row(motion, threshold)
     recording.save_animation(
         loop,
         motion.time_s,
         {loop.robot.name: motion.plant_state},
-        motion.extra[PORTS[CALIBRATED]][:, 0],
+        motion.extra["safety_probability"][:, 0],
         threshold,
         [] if alarm is None else [float(motion.time_s[alarm])],
     )
@@ -145,18 +144,18 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
 
 
 def alarm_row(motion: GoalMotion, threshold: float) -> int | None:
-    """First row with calibrated Γ below the threshold, if it was above at the start, or None."""
+    """First row with the probability below the threshold, if it was above at the start, or None."""
     # Row 0 is no alarm: it was below from the start.
-    return first_below(motion.extra[PORTS[CALIBRATED]][:, 0], threshold) or None
+    return first_below(motion.extra["safety_probability"][:, 0], threshold) or None
 
 
 def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figure:
-    """Plots calibrated Γ along a motion, with stills.
+    """Plots the probability along a motion, with stills.
 
     Args:
         loop: The simulated closed loop.
-        motion: Log of the motion, with Γ and its predictions.
-        threshold: Calibrated Γ below which a row is an alarm.
+        motion: Log of the motion, with the assessor's outputs.
+        threshold: Probability below which a row is an alarm.
     """
     from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
     from drake_safety.evaluation.timeline_figure import timeline_figure
@@ -173,12 +172,11 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     alarm = alarm_row(motion, threshold)
     return timeline_figure(
         motion.time_s,
-        motion.extra[PORTS[CALIBRATED]][:, 0],
+        motion.extra["safety_probability"][:, 0],
         threshold,
-        quantity=GAMMA[CALIBRATED],
         pushes=[] if motion.push is None else [motion.push],
         trigger_times_s=[] if alarm is None else [float(motion.time_s[alarm])],
-        trigger_label="Γ falls",
+        trigger_label="probability falls",
         leave_time_s=motion.leave_time_s,
         stills=render_stills(loop, motion.time_s, positions, instants),
         belief=motion.extra["belief"],
@@ -191,18 +189,18 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
 def table_of_motion(
     loop: ClosedLoop, assessment: SafetyAssessment, motion: GoalMotion, threshold: float
 ) -> Table:
-    """A table of the events of a motion, with calibrated Γ at their times.
+    """A table of the events of a motion, with the probability at their times.
 
     Args:
         loop: The simulated closed loop.
         assessment: Γ.
-        motion: Log of the motion, with Γ and its predictions.
-        threshold: Calibrated Γ below which a row is an alarm.
+        motion: Log of the motion, with the assessor's outputs.
+        threshold: Probability below which a row is an alarm.
     """
     from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 
     words = goal_words(require(loop, HasGoals))
-    gamma = motion.extra[PORTS[CALIBRATED]][:, 0]
+    probability = motion.extra["safety_probability"][:, 0]
     events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         if port in motion.extra and (motion.extra[port] > 0).any():
@@ -224,7 +222,7 @@ def table_of_motion(
         events.append(
             (
                 float(motion.time_s[alarm]),
-                f"Γ below {threshold:.3f}; expected violation: {expected}",
+                f"probability below {threshold:.3f}; expected violation: {expected}",
             )
         )
     is_changed = motion.extra["alarm"][:, 0] > 0.5
@@ -245,4 +243,4 @@ def table_of_motion(
             reached = np.round(motion.output[len(motion.output) // 2 :].mean(axis=0), 2)
             missed = f"on its feet{place}; mean of the second half {words.value(reached)}"
         events.append((float(motion.time_s[-1]), missed))
-    return events_table(events, motion.time_s, gamma, GAMMA[CALIBRATED])
+    return events_table(events, motion.time_s, probability)

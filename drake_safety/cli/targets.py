@@ -10,7 +10,6 @@ import typer
 from typer.core import TyperCommand
 
 from drake_safety.cli.console import console
-from drake_safety.learning.prediction import CALIBRATED, GAMMA, LITERAL, NORMALIZED
 from drake_safety.robots.reading import did_you_mean
 
 if TYPE_CHECKING:
@@ -135,23 +134,18 @@ def print_verdict(
     if verdict.reason:
         lines["verdict"] = f"{verdict.verdict}: {verdict.reason}"
     else:
-        sign = "<" if verdict.calibrated < verdict.threshold else "≥"
+        sign = "<" if verdict.probability < verdict.threshold else "≥"
         lines["verdict"] = (
-            f"{verdict.verdict}: {GAMMA[CALIBRATED]} {verdict.calibrated:.3f} {sign} "
+            f"{verdict.verdict}: probability {verdict.probability:.3f} {sign} "
             f"threshold {verdict.threshold:.3f}"
         )
-    if np.isfinite(verdict.calibrated):
+    if np.isfinite(verdict.probability):
         safe, unsafe, unknown = verdict.belief.tolist()
-        known = safe + unsafe
-        lines["belief"] = (
-            f"safe {safe:.2f} ({GAMMA[LITERAL]}; {GAMMA[NORMALIZED]} "
-            f"{safe / known if known > 0 else 0.0:.2f}), unsafe {unsafe:.2f}, "
-            f"don't know {unknown:.2f}"
-        )
+        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if not verdict.is_accepted:
         lines |= _refusal(loop, words, verdict, nearest)
-    if nearest is not None or np.isfinite(verdict.calibrated):
-        lines["threshold"] = f"{verdict.threshold:.3f} of {GAMMA[CALIBRATED]}, {origin}"
+    if nearest is not None or np.isfinite(verdict.probability):
+        lines["threshold"] = f"{verdict.threshold:.3f}, {origin}"
     for name, text in lines.items():
         console.print(f"{name:<16}  {text}", highlight=False, soft_wrap=True)
 
@@ -177,6 +171,6 @@ def _refusal(
     else:
         lines["nearest accepted"] = (
             f"{words.value(nearest.goal)}, {words.distance(nearest.goal - verdict.goal)} away, "
-            f"{GAMMA[CALIBRATED]} {nearest.calibrated:.3f}"
+            f"probability {nearest.probability:.3f}"
         )
     return lines

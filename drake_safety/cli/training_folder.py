@@ -35,8 +35,8 @@ class GoalThreshold(NamedTuple):
     """Thresholds of verdicts on goals.
 
     Attributes:
-        threshold: Lowest calibrated Γ of an accepted goal.
-        unsafe_below: Calibrated Γ below which a goal is unsafe; in between the verdict is "don't
+        threshold: Lowest probability of an accepted goal.
+        unsafe_below: Probability below which a goal is unsafe; in between the verdict is "don't
             know".
         origin: Where they come from.
     """
@@ -49,7 +49,7 @@ class GoalThreshold(NamedTuple):
 MODES = ("sharpened", "paper")
 """Modes, the default first."""
 DEFAULT_THRESHOLD = 0.5
-"""Lowest calibrated Γ of an accepted goal where no promise has chosen one."""
+"""Lowest probability of an accepted goal where no promise has chosen one."""
 
 
 def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:

@@ -1,7 +1,7 @@
 """Alarms: monitored values that raise an alarm when they fall below a threshold.
 
-A value is larger where the robot is safer: Γ, the probability of a baseline classifier, or a
-quantity that control engineers monitor, such as a margin.
+A value is larger where the robot is safer: the probability of an assessment or of a baseline
+classifier, or a quantity that control engineers monitor, such as a margin.
 """
 
 from __future__ import annotations
@@ -11,13 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.watched_motion import WatchedMotion
 
-PUBLISHED = {"": NORMALIZED, "_literal": LITERAL, "_calibrated": CALIBRATED}
-"""Fields of an assessment's result, by the suffix of the alarm's name."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _TRACKING = "tracking_error_"
 
@@ -33,21 +29,6 @@ class Alarm:
 
     name: str
     value: Callable[[WatchedMotion], np.ndarray]
-
-
-def assessment_alarms(name: str, assessment: SafetyAssessment) -> list[Alarm]:
-    """Alarms on normalised, literal and calibrated Γ.
-
-    Args:
-        name: Key of the first, and prefix of the others.
-        assessment: A fitted assessment; without heads there is no calibrated Γ.
-    """
-    has_heads = assessment.base_logit_ is not None
-    return [
-        scorer_alarm(assessment_scorer(f"{name}{suffix}", assessment, published))
-        for suffix, published in PUBLISHED.items()
-        if has_heads or published != CALIBRATED
-    ]
 
 
 def scorer_alarm(scorer: Scorer) -> Alarm:

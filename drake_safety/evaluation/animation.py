@@ -34,7 +34,7 @@ def save_animation(
     loop: LeggedLoop,
     time_s: np.ndarray,
     positions: np.ndarray,
-    gamma: np.ndarray,
+    probability: np.ndarray,
     threshold: float,
     path: Path,
     *,
@@ -47,8 +47,8 @@ def save_animation(
         loop: The closed loop that was simulated, or one with the same plant.
         time_s: Instants of the log [s], (N,), increasing.
         positions: All of the plant's positions at these instants, (N, n_q).
-        gamma: Γ as triggers or alarms take it, (N,).
-        threshold: Threshold on Γ of triggers or alarms.
+        probability: As triggers or alarms take it, (N,).
+        threshold: Threshold of triggers or alarms.
         path: Path of the GIF.
         event_times_s: Times of triggers or alarms, marked on the curve [s].
         frames_per_second: Frame rate.
@@ -62,10 +62,10 @@ def save_animation(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
-    if not len(time_s) == len(positions) == len(gamma) or len(time_s) < 2:
+    if not len(time_s) == len(positions) == len(probability) or len(time_s) < 2:
         raise ValueError(
-            f"animation: {len(time_s)} instants, {len(positions)} positions and {len(gamma)} "
-            "values of Γ; expected as many of each, two at least"
+            f"animation: {len(time_s)} instants, {len(positions)} positions and "
+            f"{len(probability)} probabilities; expected as many of each, two at least"
         )
     if not frames_per_second > 0.0:
         raise ValueError(f"animation: frames_per_second must be positive; got {frames_per_second}")
@@ -106,9 +106,9 @@ def save_animation(
             words.set_text(
                 f"the camera does not turn; the robot turned by {round(math.degrees(turn))}°"
             )
-            curve.set_data(time_s[: row + 1], gamma[: row + 1])
-            dot.set_data([time_s[row]], [gamma[row]])
-            dot.set_color(SAFE_COLOUR if gamma[row] >= threshold else UNSAFE_COLOUR)
+            curve.set_data(time_s[: row + 1], probability[: row + 1])
+            dot.set_data([time_s[row]], [probability[row]])
+            dot.set_color(SAFE_COLOUR if probability[row] >= threshold else UNSAFE_COLOUR)
             for mark, event in zip(marks, event_times_s, strict=True):
                 mark.set_visible(bool(event <= time_s[row]))
             canvas.draw()

@@ -13,13 +13,11 @@ from typing import Any
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.report.results import as_estimate
-from drake_safety.evaluation.report.tables import Column, Row, Table
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import replacing
-from drake_safety.learning.prediction import CALIBRATED, LITERAL, NORMALIZED
 from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
@@ -127,10 +125,7 @@ def compare_scenario(
             lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
         )
         assessment.save(folder / "sharpened.safetensors")
-        published = CALIBRATED
-        if recovery is not None:
-            published = NORMALIZED if recovery.is_normalized else LITERAL
-        scorer = assessment_scorer("sharpened", assessment, published)
+        scorer = assessment_scorer("sharpened", assessment)
         estimates, _, _ = evaluate_episodes([scorer], calibration, fresh)
         if recovery is not None:
             study = evaluate_throws(
@@ -169,23 +164,18 @@ def row_estimate(row: Mapping[str, Any], name: str) -> Estimate | None:
     stored = row.get(name)
     if not isinstance(stored, dict) or stored["value"] is None:
         return None
-    return as_estimate(stored)
+    return Estimate.from_json(stored)
 
 
 def comparison_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows as a table, shares in percent."""
     nothing = Estimate.exact(math.nan, 0)
-    counts = [Column(key=name, title=name, meaning="", unit="n") for name in ("episodes", "throws")]
+    counts = [Column(name, name, "n") for name in ("episodes", "throws")]
     columns = [
-        Column(key=name, title=spoken(name), meaning="")
-        if name == "auc"
-        else Column(key=name, title=spoken(name), meaning="", unit="%", digits=1)
+        Column(name, spoken(name)) if name == "auc" else Column(name, spoken(name), "%", digits=1)
         for name in _ESTIMATES
     ]
     return Table(
-        key="comparison",
-        title="",
-        meaning="",
         corner="scenario",
         columns=[*counts, *columns],
         rows=[

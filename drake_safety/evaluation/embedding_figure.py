@@ -78,7 +78,7 @@ def embedding_figure(
             safe,
             is_empty,
             count,
-            label="literal Γ",
+            label="belief: safe",
             most=most,
         )
         middle.set_title("Belief of each cell: safe")

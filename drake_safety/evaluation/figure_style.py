@@ -58,14 +58,15 @@ _STYLE: dict[Any, Any] = {
 }
 
 _LABELS = {
+    "auc": "AUC",
     "mlp": "MLP",
     "reachability": "inverse kinematics",
     "reachability_free": "inverse kinematics, free base",
-    "sharpened_literal_0.6": "sharpened, literal Γ",
-    "paper_literal_0.6": "paper, literal Γ",
-    "sharpened_literal": "sharpened, literal Γ",
-    "sharpened_calibrated": "sharpened, calibrated Γ",
-    "paper_literal": "paper, literal Γ",
+    "sharpened_literal_0.6": "sharpened, b_safe",
+    "paper_literal_0.6": "paper, b_safe",
+    "sharpened_literal": "sharpened, b_safe",
+    "sharpened_calibrated": "sharpened, probability",
+    "paper_literal": "paper, b_safe",
     "capture_point_margin": "capture-point margin",
     "support_margin": "support-polygon margin",
     "smallest_margin": "smallest margin (true state)",

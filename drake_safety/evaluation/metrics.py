@@ -8,7 +8,7 @@ likely. A segment is classified unsafe when its score exceeds a threshold, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,13 @@ class Estimate:
     def exact(cls, value: float, n: int) -> Estimate:
         """A value without uncertainty, such as a threshold: both ends of the interval equal it."""
         return cls(value, value, value, n)
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, float | int | None]) -> Estimate:
+        """The inverse of :meth:`to_json`."""
+        ends = (fields[name] for name in ("value", "low", "high"))
+        n = int(fields["n"] or 0)
+        return cls(*(math.nan if end is None else float(end) for end in ends), n)
 
     def to_json(self) -> dict[str, float | int | None]:
         """The estimate as JSON types; non-finite numbers become None."""

@@ -1,4 +1,4 @@
-"""The path of a motion through the embedding space, beside Γ over time."""
+"""The path of a motion through the embedding space, beside the probability over time."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from drake_safety.evaluation.figure_style import (
     label_threshold,
     new_figure,
 )
-from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
-from drake_safety.learning.prediction import GAMMA, NORMALIZED
+from drake_safety.learning.beliefs import UNCERTAINTY, safe_share
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,13 +27,11 @@ def path_figure(
     assessment: SafetyAssessment,
     time_s: np.ndarray,
     points: np.ndarray,
-    gamma: np.ndarray,
+    probability: np.ndarray,
     threshold: float,
     events: Mapping[str, float],
-    *,
-    quantity: str = "Γ",
 ) -> Figure:
-    """Plots Ψ(x) of a motion over the beliefs of the cells, and its Γ over time.
+    """Plots Ψ(x) of a motion over the beliefs of the cells, and its probability over time.
 
     As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble.
 
@@ -42,29 +39,27 @@ def path_figure(
         assessment: The fitted assessment of the motion.
         time_s: Times [s], (N,).
         points: Ψ(x), (N, 2).
-        gamma: Γ, (N,).
-        threshold: Threshold on Γ of triggers.
+        probability: Probability, (N,).
+        threshold: Threshold of triggers.
         events: Times of named events [s]; they are marked and numbered in both panels.
-        quantity: Which Γ, as in `prediction.GAMMA`.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     is_empty = cells[:, UNCERTAINTY] >= 1.0
-    known = np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY])
     with drawing_style():
         fig = new_figure(12.0, 5.0)
         left, right = fig.subplots(1, 2, width_ratios=(1.0, 1.25))
         no_count = np.zeros(grid.num_cells, dtype=int)
-        label = f"{GAMMA[NORMALIZED]} of a cell"
-        draw_safety(fig, left, grid, cells[:, SAFE] / known, is_empty, no_count, label=label)
+        label = "safe share of a cell's belief"
+        draw_safety(fig, left, grid, safe_share(cells), is_empty, no_count, label=label)
         left.plot(points[:, 0], points[:, 1], color="white", linewidth=2.0, alpha=0.6)
         left.plot(points[:, 0], points[:, 1], color=INK, linewidth=0.7, alpha=0.7)
         half = grid.half_width
         left.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
         left.set(title="Path through the embedding space", xlabel="hatched: don't know")
-        right.plot(time_s, gamma, color=INK, linewidth=1.4)
+        right.plot(time_s, probability, color=INK, linewidth=1.4)
         right.axhline(threshold, color=INK, linewidth=0.8, linestyle="--")
         label_threshold(right, threshold, INK)
-        right.set(title=f"{quantity} over time", xlabel="time [s]", ylim=(-0.04, 1.2))
+        right.set(title="Probability over time", xlabel="time [s]", ylim=(-0.04, 1.2))
         ordered = sorted(events.items(), key=lambda event: event[1])
         for number, (_, at_s) in enumerate(ordered, start=1):
             row = int(np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1))

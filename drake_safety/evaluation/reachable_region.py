@@ -13,7 +13,6 @@ from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import BASELINES, Reachability
 from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import CALIBRATED
 from drake_safety.learning.progress import shown
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
@@ -35,8 +34,8 @@ class ReachableRegion:
     Attributes:
         x_m: Position of the plane in the world [m].
         y_m, z_m: The fine grid, (n_y,), (n_z,) [m].
-        calibrated: Calibrated Γ there, (n_z, n_y); NaN for "don't know".
-        threshold: Lowest calibrated Γ of an accepted target.
+        probability: Probability there, (n_z, n_y); NaN for "don't know".
+        threshold: Lowest probability of an accepted target.
         is_reachable: Whether inverse kinematics reaches each point, by the names of `BASELINES`,
             (n_z, n_y); empty for a task without a hand.
         obstacle_y_m, obstacle_z_m: The grid of obstacle distances, (o_y,), (o_z,) [m].
@@ -49,7 +48,7 @@ class ReachableRegion:
     x_m: float
     y_m: np.ndarray
     z_m: np.ndarray
-    calibrated: np.ndarray
+    probability: np.ndarray
     threshold: float
     is_reachable: dict[str, np.ndarray]
     obstacle_y_m: np.ndarray
@@ -67,7 +66,7 @@ class ReachableRegion:
             of a grid are not a random sample: the intervals only indicate their number.
         """
         is_safe = self.outcomes == SAFE
-        verdicts = {"sharpened": self.calibrated >= self.threshold, **self.is_reachable}
+        verdicts = {"sharpened": self.probability >= self.threshold, **self.is_reachable}
         estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
         for name, verdict in verdicts.items():
             on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
@@ -91,7 +90,7 @@ def reachable_region(
     Args:
         scenario: A scenario of a task whose plans have a goal.
         assessment: Γ.
-        threshold: Lowest calibrated Γ of an accepted target.
+        threshold: Lowest probability of an accepted target.
         x_m: Position of the plane [m]; the middle of the fair box by default.
         step_m: Spacing of the simulated targets [m].
         variation: Variation of the plant.
@@ -127,14 +126,14 @@ def reachable_region(
         if isinstance(loop, LeggedLoop) and isinstance(loop, HasGoals) and loop.hand is not None:
             for name, is_base_free in BASELINES.items():
                 reachability[name] = Reachability(loop.robot, loop.hand, is_base_free=is_base_free)
-        scorer = assessment_scorer("sharpened", assessment, CALIBRATED)
-        probability = []
+        scorer = assessment_scorer("sharpened", assessment)
+        probabilities = []
         reachable: dict[str, list[np.ndarray]] = {name: [] for name in reachability}
         for start in range(0, len(targets), _REPORT_EVERY):
             if report is not None:
                 report("verdicts on the plane", start, len(targets))
             chunk = targets[start : start + _REPORT_EVERY]
-            probability.append(scorer.probability(*goal_inputs(loop, chunk)))
+            probabilities.append(scorer.probability(*goal_inputs(loop, chunk)))
             for name, kinematics in reachability.items():
                 reachable[name].append(kinematics.is_reachable(chunk))
         if report is not None:
@@ -146,7 +145,7 @@ def reachable_region(
         x_m=x_m,
         y_m=fine[0],
         z_m=fine[1],
-        calibrated=np.concatenate(probability).reshape(shape),
+        probability=np.concatenate(probabilities).reshape(shape),
         threshold=threshold,
         is_reachable={name: np.concatenate(one).reshape(shape) for name, one in reachable.items()},
         obstacle_y_m=edge[0],

@@ -60,7 +60,7 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
                 alpha=0.28,
             )
             handles.append(Patch(color=INK, alpha=0.28, label="inside an obstacle"))
-        is_unknown = np.isnan(region.calibrated)
+        is_unknown = np.isnan(region.probability)
         if is_unknown.any():
             axes.contourf(
                 region.y_m,
@@ -77,15 +77,13 @@ def region_figure(region: ReachableRegion, constraint_names: list[str]) -> Figur
         # A white edge separates the line from the areas below.
         for colour, width in (("white", 5.0), (UNSAFE_COLOUR, 2.4)):
             axes.contour(
-                *_closed(region.y_m, region.z_m, np.nan_to_num(region.calibrated)),
+                *_closed(region.y_m, region.z_m, np.nan_to_num(region.probability)),
                 levels=[region.threshold],
                 colors=[colour],
                 linewidths=width,
             )
         handles.append(
-            Line2D(
-                [], [], color=UNSAFE_COLOUR, lw=2.4, label=f"calibrated Γ = {region.threshold:.2f}"
-            )
+            Line2D([], [], color=UNSAFE_COLOUR, lw=2.4, label=f"probability {region.threshold:.2f}")
         )
         for name, is_reachable in region.is_reachable.items():
             dashes, label = _KINEMATICS[name]

@@ -46,7 +46,7 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
             )
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
         axes.set_aspect("equal")
-        axes.set_xlabel("predicted probability, 1 - calibrated Γ")
+        axes.set_xlabel("predicted probability, 1 - probability of safety")
         axes.set_ylabel("share of unsafe episodes, 95 % intervals")
         axes.grid(color="#eceef0", linewidth=0.7)
         axes.set_title("Reliability")

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import UNCERTAINTY
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
@@ -45,14 +45,12 @@ class Scorer:
         return 1.0 - np.nan_to_num(probability, nan=0.0)
 
 
-def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -> Scorer:
-    """Γ as a scorer.
+def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
+    """The probability of an assessment as a scorer.
 
     Args:
         name: Its key in tables.
         assessment: A fitted assessment.
-        published: "literal", "normalized" or "calibrated", see
-            :mod:`drake_safety.learning.prediction`.
     """
 
     def probability(
@@ -61,8 +59,8 @@ def assessment_scorer(name: str, assessment: SafetyAssessment, published: str) -
         result = assessment.predict(
             state, desired_preview, features if assessment.uses_features else None
         )
-        is_known = result.belief[:, UNCERTAINTY] < 1.0
-        return np.where(is_known, getattr(result, published), np.nan)
+        unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
+        return np.where(unknown, np.nan, result.probability)
 
     return Scorer(
         name=name,

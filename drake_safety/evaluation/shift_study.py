@@ -72,7 +72,9 @@ def assessment_judge(assessment: SafetyAssessment, *, is_novelty_used: bool = Tr
         )
         unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
         is_refused = is_outside & is_novelty_used
-        return Verdicts(probability=np.where(is_refused, 0.0, found.calibrated), is_unknown=unknown)
+        return Verdicts(
+            probability=np.where(is_refused, 0.0, found.probability), is_unknown=unknown
+        )
 
     return judge
 
@@ -312,7 +314,7 @@ def _first_probability(assessment: SafetyAssessment, motions: Sequence[Motion]) 
         np.stack([one.desired_preview[0] for one in motions]),
         features if assessment.uses_features else None,
     )
-    return found.calibrated
+    return found.probability
 
 
 def _mean(values: np.ndarray) -> Estimate:

@@ -12,13 +12,12 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import LITERAL, NORMALIZED
 from drake_safety.learning.progress import shown
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 
 PAPER_THRESHOLD = 0.6
-"""Γ_thre of the paper, on literal Γ."""
+"""Γ_thre of the paper, on b_safe, the probability in the paper's mode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +41,6 @@ def trigger_rules(
     classifiers: Sequence[Scorer],
     *,
     threshold: float,
-    is_normalized: bool,
 ) -> list[TriggerRule]:
     """The rules that are compared: the scenario's, the paper's and the baseline classifiers.
 
@@ -51,24 +49,14 @@ def trigger_rules(
         paper: An assessment in the paper's mode.
         classifiers: Baseline classifiers, whose thresholds are chosen on calibration throws.
         threshold: The scenario's Γ_thre.
-        is_normalized: Whether it applies to normalised rather than to literal Γ.
 
     Returns:
         The rules; the scenario's own is the first, named "sharpened".
     """
-    own = assessment_scorer("sharpened", sharpened, NORMALIZED if is_normalized else LITERAL)
-    literal = assessment_scorer("literal", sharpened, LITERAL)
-    paper_literal = assessment_scorer("paper_literal", paper, LITERAL)
+    own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
-        TriggerRule(
-            name=f"sharpened_literal_{PAPER_THRESHOLD}", scorer=literal, threshold=PAPER_THRESHOLD
-        ),
-        TriggerRule(
-            name=f"paper_literal_{PAPER_THRESHOLD}",
-            scorer=paper_literal,
-            threshold=PAPER_THRESHOLD,
-        ),
+        TriggerRule(name="paper", scorer=printed, threshold=PAPER_THRESHOLD),
         *(TriggerRule(name=scorer.name, scorer=scorer) for scorer in classifiers),
     ]
 

@@ -35,20 +35,19 @@ if TYPE_CHECKING:
     from drake_safety.plants.pushes import Push
 
 _WIDTH = 12.0  # All sizes are in inches.
-_GAMMA_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
+_CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT = 2.6, 0.35
 _AXIS_LABEL_HEIGHT = 0.6
 _LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels above the curve.
-_LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis of Γ without labels.
+_LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis without labels.
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
 def timeline_figure(
     time_s: np.ndarray,
-    gamma: np.ndarray,
+    probability: np.ndarray,
     threshold: float,
     *,
-    quantity: str = "Γ",
     throws: Sequence[Throw] = (),
     pushes: Sequence[Push] = (),
     trigger_times_s: Sequence[float] = (),
@@ -61,15 +60,14 @@ def timeline_figure(
     constraint_names: Sequence[str] = (),
     angular_constraints: Sequence[str] = (),
 ) -> Figure:
-    """Plots Γ over time, with stills of the robot.
+    """Plots the probability over time, with stills of the robot.
 
     Names of events are in rows above the curve.
 
     Args:
         time_s: Instants [s], (N,).
-        gamma: Γ, held until the next instant, (N,).
-        threshold: Threshold on Γ of triggers or alarms.
-        quantity: Which Γ, as in `prediction.GAMMA`.
+        probability: Held until the next instant, (N,).
+        threshold: Threshold of triggers or alarms.
         throws: Balls, marked at the time of impact.
         pushes: Pushes, marked for their duration.
         trigger_times_s: Times of triggers or alarms [s].
@@ -86,8 +84,8 @@ def timeline_figure(
         ValueError: Arrays have different lengths, the number of names is not that of margins, or
             a still is outside the time range.
     """
-    time_s, gamma = np.asarray(time_s, dtype=float), np.asarray(gamma, dtype=float)
-    for name, values in (("gamma", gamma), ("belief", belief), ("margins", margins)):
+    time_s, probability = (np.asarray(one, dtype=float) for one in (time_s, probability))
+    for name, values in (("probability", probability), ("belief", belief), ("margins", margins)):
         if values is not None and len(values) != len(time_s):
             raise ValueError(
                 f"timeline_figure: {name} has {len(values)} rows, expected {len(time_s)}"
@@ -107,17 +105,17 @@ def timeline_figure(
         _Label(start, "recovery steps", RECOVERY_COLOUR) for start, _ in recovery_intervals_s
     ]
     rows = _label_rows(labels, time_s[0], time_s[-1])
-    heights = [_GAMMA_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
+    heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
     if belief is not None:
         heights.append(_BELIEF_HEIGHT)
     if margins is not None:
         heights.append(_MARGINS_HEIGHT)
     with drawing_style():
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
-        gamma_axes, *others = panels
-        gamma_axes.set_xlim(time_s[0], time_s[-1])
-        _draw_gamma(gamma_axes, time_s, gamma, threshold)
-        gamma_axes.set_ylabel(quantity)
+        curve_axes, *others = panels
+        curve_axes.set_xlim(time_s[0], time_s[-1])
+        _draw_curve(curve_axes, time_s, probability, threshold)
+        curve_axes.set_ylabel("probability")
         remaining = iter(others)
         if belief is not None:
             _draw_belief(next(remaining), time_s, belief)
@@ -126,15 +124,15 @@ def timeline_figure(
         for panel in panels:
             _mark_instants(panel, throws, pushes, trigger_times_s, leave_time_s)
         for start, end in recovery_intervals_s:
-            gamma_axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
+            curve_axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
         for instant in trigger_times_s:
-            gamma_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
-        top = _draw_labels(gamma_axes, labels, rows)
+            curve_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
+        top = _draw_labels(curve_axes, labels, rows)
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
             _draw_still(axes, image, f"({letter})  {instant:.2f} s")
             row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
-            height = gamma[row] if np.isfinite(gamma[row]) else 0.0
-            _join(fig, axes, gamma_axes, (instant, height), top)
+            height = probability[row] if np.isfinite(probability[row]) else 0.0
+            _join(fig, axes, curve_axes, (instant, height), top)
         for panel in panels[:-1]:
             panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time [s]")
@@ -172,10 +170,10 @@ def _lay_out(
     return fig, pictures, panels
 
 
-def _draw_gamma(axes: Axes, time_s: np.ndarray, gamma: np.ndarray, threshold: float) -> None:
+def _draw_curve(axes: Axes, time_s: np.ndarray, probability: np.ndarray, threshold: float) -> None:
     axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
     label_threshold(axes, threshold, UNSAFE_COLOUR)
-    axes.step(time_s, gamma, where="post", color=SAFE_COLOUR, linewidth=2.0)
+    axes.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
     axes.set_yticks([0.0, 0.5, 1.0])
 
 
@@ -308,7 +306,7 @@ def _draw_labels(axes: Axes, labels: Sequence[_Label], rows: Sequence[int]) -> f
     """Writes labels in their rows above the curve; returns the upper end of the axis of Γ."""
     from matplotlib.patheffects import withStroke
 
-    row_height = (_HIGHEST - _LOWEST) * _LABEL_ROW_HEIGHT / _GAMMA_HEIGHT
+    row_height = (_HIGHEST - _LOWEST) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = _HIGHEST + row_height * (max(rows, default=-1) + 1)
     axes.set_ylim(_LOWEST, top)
     start_s, end_s = axes.get_xlim()
@@ -342,7 +340,7 @@ def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
 
 
 def _join(
-    fig: Figure, picture: Axes, gamma_axes: Axes, point: tuple[float, float], top: float
+    fig: Figure, picture: Axes, curve_axes: Axes, point: tuple[float, float], top: float
 ) -> None:
     """Draws a line from the lower edge of an image to its instant, and down to the curve of Γ."""
     from matplotlib.patches import ConnectionPatch
@@ -351,13 +349,13 @@ def _join(
         xyA=(0.5, 0.0),
         coordsA=picture.transAxes,
         xyB=(point[0], top),
-        coordsB=gamma_axes.transData,
+        coordsB=curve_axes.transData,
         color=FAINT_INK,
         linewidth=0.9,
     )
     line.set_in_layout(False)
     fig.add_artist(line)
-    gamma_axes.vlines(point[0], point[1], top, color=FAINT_INK, linewidth=0.9, alpha=0.6, zorder=1)
-    gamma_axes.plot(
+    curve_axes.vlines(point[0], point[1], top, color=FAINT_INK, linewidth=0.9, alpha=0.6, zorder=1)
+    curve_axes.plot(
         *point, "o", color="white", markeredgecolor=INK, markersize=6, clip_on=False, zorder=6
     )

@@ -9,7 +9,7 @@ import numpy as np
 from drake_safety.evaluation.embedding_figure import safety_colours
 from drake_safety.evaluation.figure_style import FAINT_INK, INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.metrics import area_under_curve
-from drake_safety.learning.prediction import CALIBRATED, GAMMA, is_unknown
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import DIVERGED
 
@@ -34,7 +34,7 @@ def truth_figure(
     *,
     labels: tuple[str, str] | None = None,
 ) -> Figure:
-    """Plots calibrated Γ of the episodes' starts and, beside it, whether they stayed safe.
+    """Plots the probability of the episodes' starts and, beside it, whether they stayed safe.
 
     A start is the episode's row `first_step`. Starts on a full grid of the two variables are drawn
     as cells, with the boundary of the outcomes in both panels; others as points, whatever their
@@ -73,14 +73,14 @@ def truth_figure(
     features = first("features") if assessment.uses_features else None
     found = assessment.predict(state, first("desired_preview"), features)
     is_known = ~is_unknown(found.belief, parameters.initial_uncertainty)
-    # Where it does not know, calibrated Γ is zero.
-    gamma, unsafe_score = np.where(is_known, found.calibrated, np.nan), 1.0 - found.calibrated
+    # Where it does not know, the probability is zero.
+    gamma, unsafe_score = np.where(is_known, found.probability, np.nan), 1.0 - found.probability
     is_safe = np.array([episode.is_safe for episode in starts])
     is_outside = ~inside
     area = area_under_curve(unsafe_score[inside], ~is_safe[inside])
     points = first("true_state")[:, [names.index(x), names.index(y)]]
     titles = (
-        f"Starts by {GAMMA[CALIBRATED]}" + ("" if np.isnan(area) else f", AUC {area:.3f}"),
+        "Starts by probability" + ("" if np.isnan(area) else f", AUC {area:.3f}"),
         f"Simulated: {100 * is_safe[inside].mean():.0f} % of {inside.sum()} stay safe",
     )
     panels = (gamma, is_known), (is_safe.astype(float), np.ones_like(is_known))

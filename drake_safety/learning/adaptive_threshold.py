@@ -1,4 +1,4 @@
-"""A threshold of calibrated Γ that follows an actual robot: online conformal prediction."""
+"""A threshold of the probability that follows an actual robot: online conformal prediction."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from drake_safety.learning.calibration import Calibration
 
-_LOGIT_LIMIT = 12.0  # Γ is clipped to within this logit.
+_LOGIT_LIMIT = 12.0  # The probability is clipped to within this logit.
 
 
 class AdaptiveThreshold:
@@ -24,7 +24,7 @@ class AdaptiveThreshold:
         step: Step of the threshold's logit; larger ones follow faster, and vary more.
 
     Attributes:
-        threshold: Present lower bound of calibrated Γ for the verdict "safe"; above 1 if none is.
+        threshold: Present lower bound of the probability for "safe"; above 1 if none is.
 
     Raises:
         ValueError: The step is not positive.
@@ -38,20 +38,20 @@ class AdaptiveThreshold:
 
     @property
     def threshold(self) -> float:
-        """Present lower bound of calibrated Γ for the verdict "safe"; above 1 if none is safe."""
+        """Present lower bound of the probability for "safe"; above 1 if none is."""
         if self._logit > _LOGIT_LIMIT:
             return math.nextafter(1.0, 2.0)
         return 1.0 / (1.0 + math.exp(-self._logit))
 
     def is_safe(self, safety_probability: float) -> bool:
-        """Whether the verdict on calibrated Γ is "safe"; never for NaN."""
+        """Whether the verdict on the probability is "safe"; never for NaN."""
         return _logit(safety_probability) >= self._logit
 
     def update(self, safety_probability: float, is_unsafe: bool) -> None:
         """Takes in the outcome of an episode; a safe one changes nothing.
 
         Args:
-            safety_probability: Calibrated Γ of the first row, or the least of a motion.
+            safety_probability: Probability of the first row, or the least of a motion.
             is_unsafe: Whether it ended unsafely.
         """
         if is_unsafe:

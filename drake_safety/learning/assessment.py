@@ -352,8 +352,8 @@ class SafetyAssessment:
             novelty: Says which inputs are novel; `novelty_` by default.
 
         Returns:
-            The assessments. Novel inputs and those that are not finite get the empty belief, where
-            Γ is 0 in all its forms. A row has the same bits whatever the others are.
+            The assessments. Novel inputs and those that are not finite get the empty belief, whose
+            probability is 0. A row has the same bits whatever the others are.
 
         Raises:
             ValueError: A width or a shape is wrong, or the assessment is not fitted.
@@ -438,7 +438,7 @@ class SafetyAssessment:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mean logit of an unsafe end and its gradient with respect to x.
 
-        Normalised Γ is constant where all corners of a cell agree; the safety heads' logit has a
+        The belief is constant where all corners of a cell agree; the safety heads' logit has a
         slope everywhere, for planners that need a gradient. The arguments are those of `predict`.
 
         Returns:

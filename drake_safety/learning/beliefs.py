@@ -24,6 +24,13 @@ def empty(shape: int | tuple[int, ...], num_causes: int = 0) -> np.ndarray:
     return beliefs
 
 
+def safe_share(beliefs: np.ndarray) -> np.ndarray:
+    """Returns b_safe / (1 - mu), the safe share of what is known, (...); 0 for empty beliefs."""
+    # A sum instead of 1 - mu, so that rounding cannot raise the share above one.
+    known = beliefs[..., SAFE] + beliefs[..., UNSAFE]
+    return np.asarray(beliefs[..., SAFE] / np.maximum(known, 1e-300))
+
+
 def from_scores(
     score: np.ndarray,
     uncertainty: float | np.ndarray,

@@ -44,10 +44,10 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Two thresholds of calibrated Γ, and their promised rates.
+    """Two thresholds of the probability, and their promised rates.
 
-    The verdict is "safe" for Γ ≥ `threshold`, "unsafe" for Γ < `unsafe_below`, and "don't know" in
-    between.
+    The verdict is "safe" for a probability of at least `threshold`, "unsafe" for one below
+    `unsafe_below`, and "don't know" in between.
 
     Attributes:
         kind: "plan" or "motion", the score of an episode.
@@ -55,8 +55,8 @@ class Calibration:
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
         confidence: Confidence of both rates for this calibration set; None for rates on average
             over calibration sets.
-        threshold: Lower bound of calibrated Γ for "safe".
-        unsafe_below: Upper bound of calibrated Γ for "unsafe"; at most `threshold`.
+        threshold: Lower bound of the probability for "safe".
+        unsafe_below: Upper bound of the probability for "unsafe"; at most `threshold`.
         num_unsafe: Number of unsafe calibration episodes.
         num_safe: Number of safe calibration episodes.
         num_missed: Number of unsafe calibration episodes with the verdict "safe".
@@ -113,7 +113,7 @@ class Calibration:
         return f"calibrated on {num_episodes} episodes for a promised miss rate: {self.promise}"
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
-        """Returns the verdicts for calibrated Γ (N,) as strings; "don't know" for NaN."""
+        """Returns the verdicts for probabilities (N,) as strings; "don't know" for NaN."""
         probability = np.asarray(safety_probability, dtype=float)
         verdicts = np.full(probability.shape, UNKNOWN, dtype=object)
         verdicts[probability >= self.threshold] = SAFE
@@ -140,7 +140,7 @@ def calibrate(
     """Chooses both thresholds on episodes that were not used for training.
 
     Args:
-        unsafe_score: 1 - calibrated Γ of each episode, (N,); NaN counts as most unsafe.
+        unsafe_score: 1 - probability of each episode, (N,); NaN counts as most unsafe.
         is_unsafe: Whether each episode ended unsafely, (N,).
         kind: "plan" or "motion", the score of an episode.
         miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).

@@ -18,7 +18,13 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import used_states
 from drake_safety.learning.novelty import Novelty
-from drake_safety.learning.prediction import LOGIT_LIMIT, SHIFT_LIMIT, BaseLogit, Correction
+from drake_safety.learning.prediction import (
+    LOGIT_LIMIT,
+    SHIFT_LIMIT,
+    BaseLogit,
+    Correction,
+    unknown_above,
+)
 from drake_safety.learning.segments import EpisodesInfo, installed_versions
 from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 
@@ -36,7 +42,7 @@ _DESCRIPTIONS = {
     "desired_preview": "Desired outputs over the horizon, row-major in time.",
     "features": "Features of state and preview, computed by the caller.",
     "belief": "Safe, unsafe, don't know; they sum to 1.",
-    "safety_probability": 'Calibrated probability of staying safe; 0 where it is "don\'t know".',
+    "safety_probability": 'Probability of staying safe; 0 where it is "don\'t know".',
     "cause_probability": "The belief's unsafe mass split by the violated constraint.",
     "predicted_margins": "Smallest margin of each constraint until the motion's end; negative is "
     "violated; NaN for maps that predict none.",
@@ -90,14 +96,12 @@ def write(path: Path, assessment: SafetyAssessment) -> None:
     nodes("Squeeze", share, [1], output="novelty")
     first = nodes("Gather", y, np.array(0), axis=0)
     nodes("Where", is_usable, first, np.full(2, np.nan), output="embedding")
-    safe, unsafe, uncertainty = (
+    safe, uncertainty = (
         nodes.columns(masses, column, column + 1)
-        for column in (belief_masses.SAFE, belief_masses.UNSAFE, belief_masses.UNCERTAINTY)
+        for column in (belief_masses.SAFE, belief_masses.UNCERTAINTY)
     )
-    known = nodes("Add", safe, unsafe)
-    is_any = nodes("Greater", known, 0.0)
     if base_logit is None:
-        probability = nodes("Div", safe, nodes("Where", is_any, known, 1.0))
+        probability = safe
     else:
         heads = _heads(nodes, logit, margins, base_logit)
         slopes = np.array([[base_logit.safety_slope], [base_logit.margin_slope]], dtype=float)
@@ -110,9 +114,8 @@ def write(path: Path, assessment: SafetyAssessment) -> None:
             shift = _shift(nodes, heads, activations, guard, correction)
             unsafe_logit = nodes("Add", unsafe_logit, shift)
         probability = nodes("Sigmoid", nodes("Neg", unsafe_logit))
-    is_sure = nodes("LessOrEqual", uncertainty, _unknown_above(parameters))
-    is_judged = nodes("And", is_any, is_sure)
-    probability = nodes("Where", is_judged, probability, 0.0)
+    is_known = nodes("LessOrEqual", uncertainty, unknown_above(parameters.initial_uncertainty))
+    probability = nodes("Where", is_known, probability, 0.0)
     nodes("Squeeze", probability, [1], output="safety_probability")
     outputs: dict[str, int | None] = {
         "belief": 3,
@@ -167,14 +170,9 @@ def _contract(assessment: SafetyAssessment, ports: Iterable[str]) -> dict[str, A
         "horizon": info.horizon,
         "step_s": info.step_s,
         "preview_step_s": info.preview_step_s,
-        "unknown_above": _unknown_above(parameters),
+        "unknown_above": unknown_above(parameters.initial_uncertainty),
         "calibrations": [one.to_json() | {"promise": one.promise} for one in calibrations],
     }
-
-
-def _unknown_above(parameters: AssessmentParameters) -> float:
-    """The uncertainty above which a belief is "don't know", see `prediction.is_unknown`."""
-    return 0.5 * (1.0 + parameters.initial_uncertainty)
 
 
 class _Nodes:

@@ -16,68 +16,40 @@ LOGIT_LIMIT = 8.0
 SHIFT_LIMIT = 100.0
 """Largest shift of the base logit, which keeps exp from overflowing."""
 
-_TINY = 1e-300
-
-LITERAL, NORMALIZED, CALIBRATED = "literal", "normalized", "calibrated"
-"""Fields of an assessment's result."""
-GAMMA = {LITERAL: "literal Γ", NORMALIZED: "normalised Γ", CALIBRATED: "calibrated Γ"}
-"""What messages, tables and figures call a field."""
-PORTS = {
-    LITERAL: "safety_probability",
-    NORMALIZED: "normalized_safety_probability",
-    CALIBRATED: "calibrated_safety_probability",
-}
-"""Output port of :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` for a field."""
-
-
-def gamma_of_port(port: str) -> str:
-    """What messages call the quantity of an output port.
-
-    Args:
-        port: One of `PORTS`.
-    """
-    return next(GAMMA[name] for name, its_port in PORTS.items() if its_port == port)
-
 
 @dataclass(kw_only=True, eq=False)
 class Assessments:
     """Assessments of N inputs.
 
     Attributes:
-        literal: Literal Γ, b_safe of the grid, (N,). At most 1 - mu.
-        normalized: Normalised Γ, b_safe / (1 - mu), the safe share of the known mass, (N,); 0 where
-            mu is 1.
-        belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs.
+        belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. Its first entry is the
+            paper's Γ.
+        probability: Probability of staying safe, (N,), from the base logit with the correction by
+            feedback; b_safe without heads, as in the paper's mode. 0 where the belief is "don't
+            know", see `is_unknown`.
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
-        calibrated: Calibrated Γ, a probability of safety from the base logit with the correction by
-            feedback, (N,); 0 where the belief is "don't know", see `is_unknown`. Without heads, as
-            in the paper's mode, otherwise equal to `normalized`.
         novelty: Distance of x from the training inputs in units of the largest known one, (N,);
             novel above 1, infinite for inputs that are not finite.
     """
 
-    literal: np.ndarray
-    normalized: np.ndarray
     belief: np.ndarray
+    probability: np.ndarray
     embedding: np.ndarray
     cause_probability: np.ndarray
     predicted_margins: np.ndarray
-    calibrated: np.ndarray
     novelty: np.ndarray
 
     def one(self, row: int) -> Assessment:
         """Returns the assessment in one row."""
         return Assessment(
-            literal=float(self.literal[row]),
-            normalized=float(self.normalized[row]),
             belief=self.belief[row],
+            probability=float(self.probability[row]),
             cause_probability=self.cause_probability[row],
             embedding=self.embedding[row],
             predicted_margins=self.predicted_margins[row],
-            calibrated=float(self.calibrated[row]),
             novelty=float(self.novelty[row]),
         )
 
@@ -86,22 +58,18 @@ class Assessments:
 class Assessment:
     """Assessment of one input; the fields of `Assessments` without the axis N."""
 
-    literal: float
-    normalized: float
     belief: np.ndarray
+    probability: float
     cause_probability: np.ndarray
     embedding: np.ndarray
     predicted_margins: np.ndarray
-    calibrated: float
     novelty: float
 
     def unknown(self) -> Assessment:
         """The assessment with the empty belief."""
         return replace(
             self,
-            literal=0.0,
-            normalized=0.0,
-            calibrated=0.0,
+            probability=0.0,
             belief=np.array([0.0, 0.0, 1.0]),
             cause_probability=np.zeros_like(self.cause_probability),
         )
@@ -117,9 +85,7 @@ class Assessment:
         cause_probability[cause] += safe
         return replace(
             self,
-            literal=0.0,
-            normalized=0.0,
-            calibrated=0.0,
+            probability=0.0,
             belief=np.array([0.0, unsafe + safe, uncertainty]),
             cause_probability=cause_probability,
         )
@@ -251,13 +217,18 @@ def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
-    """Returns where more than half of a belief comes from empty cells, (N,).
+    """Returns where a belief is "don't know": half of it or more comes from empty cells, (...).
 
     Args:
-        belief: (b_safe, b_unsafe, mu), (N, 3).
+        belief: (b_safe, b_unsafe, mu), (..., 3).
         initial_uncertainty: mu_ini, the uncertainty of a filled cell.
     """
-    return belief[:, belief_masses.UNCERTAINTY] > 0.5 * (1.0 + initial_uncertainty)
+    return belief[..., belief_masses.UNCERTAINTY] > unknown_above(initial_uncertainty)
+
+
+def unknown_above(initial_uncertainty: float) -> float:
+    """Returns the uncertainty above which a belief is "don't know", with room for rounding."""
+    return 0.5 * (1.0 + initial_uncertainty) - 1e-9
 
 
 def mean_of_maps(values: np.ndarray) -> np.ndarray:
@@ -321,10 +292,8 @@ def predict(
     if np.count_nonzero(is_novel):
         masses[is_novel] = belief_masses.empty((), num_columns - 3)
     safe = masses[:, belief_masses.SAFE]
-    # A sum instead of 1 - mu, so that rounding cannot raise the share above one.
-    known = safe + masses[:, belief_masses.UNSAFE]
-    normalized = safe / np.maximum(known, _TINY)
-    calibrated = normalized.copy()
+    # The paper's Γ(x) = b_safe of the cell of Psi(x).
+    probability = safe.copy()
     if output.margins.shape[2]:
         margins = mean_of_maps(output.margins)
     else:
@@ -333,21 +302,18 @@ def predict(
         heads = base_logit.heads(output, margins)
         logit = base_logit.of_heads(heads)
         if has_correction:
-            is_known = known > 0.0
+            is_known = safe + masses[:, belief_masses.UNSAFE] > 0.0
             guard = summed[:, num_columns] / np.maximum(np.add.reduce(is_inside, axis=0), 1)
             residual = np.zeros(len(x))
             residual[is_known] = correction.residual(embedding, x[is_known])
             logit += correction.shift(heads, residual, guard)
-        calibrated = 1.0 / (1.0 + np.exp(logit))
-    calibrated[is_unknown(masses, initial_uncertainty)] = 0.0
+        probability = 1.0 / (1.0 + np.exp(logit))
+    probability[is_unknown(masses, initial_uncertainty)] = 0.0
     return Assessments(
-        # The paper's Γ(x) = b_safe of the cell of Psi(x).
-        literal=safe,
-        normalized=normalized,
         belief=masses[:, :3],
+        probability=probability,
         embedding=output.embedding[0],
         cause_probability=masses[:, 3:],
         predicted_margins=margins,
-        calibrated=calibrated,
         novelty=distance,
     )

@@ -41,7 +41,6 @@ class LiveCommands(LiveSession):
     )
     """Name and key of each button, and the entry of the command that it changes by a step."""
     HALT, PUSH, GUARD, STAND = "Halt", "Push", "Guard on/off", "Stand up again"
-    probability_port = "calibrated_safety_probability"
 
     def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
@@ -115,4 +114,4 @@ class LiveCommands(LiveSession):
                 tone="recovery",
             )
         else:
-            self._show_by_gamma(note, state)
+            self._show_by_probability(note, state)

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import numpy as np
 from pydrake.geometry import Meshcat
 
-from drake_safety.learning.prediction import CALIBRATED, PORTS
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.live.session import BREAK_S, LiveSession
 from drake_safety.simulation.capabilities import CanBePushed
@@ -30,7 +29,7 @@ class LiveEpisodes(LiveSession):
     Args:
         loop: A closed loop, built with this Meshcat and with an assessment.
         meshcat: The Meshcat server.
-        threshold: Lowest calibrated Γ that is shown as safe.
+        threshold: Lowest probability that is shown as safe.
         seed: Seed of starts, noise and pushes.
 
     Attributes:
@@ -38,7 +37,6 @@ class LiveEpisodes(LiveSession):
     """
 
     NEW, PUSH = "New start", "Push"
-    probability_port = PORTS[CALIBRATED]
 
     def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
@@ -110,4 +108,4 @@ class LiveEpisodes(LiveSession):
             name = self.cause.replace("_", " ")
             self.panel.show(f"left the safe set: {name}", note=note, tone="unsafe")
         else:
-            self._show_by_gamma(note)
+            self._show_by_probability(note)

@@ -89,12 +89,12 @@ def build_page(panel: LivePanel, scene_port: int) -> None:
 
 
 def _build_readings(panel: LivePanel) -> Callable[[], None]:
-    """Builds what is shown: text, Γ, belief and its curve; returns what shows the present ones."""
+    """Builds what is shown: text, probability, belief and curve; returns its update."""
     with ui.element().classes("status") as box:
         with ui.element().classes("line"):
             state = ui.label().classes("state told")
             ui.label("disconnected").classes("state lost")
-            gamma = ui.label().classes("gamma told")
+            probability = ui.label().classes("probability told")
         cause = ui.label().classes("told")
         note = ui.label().classes("told")
         ui.label("The server of this page does not answer.").classes("lost")
@@ -102,7 +102,7 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         parts = [ui.element().style(f"background: var(--{key})") for key in _BELIEF]
     with ui.element().classes("line"):
         shares = [ui.label().classes("share").style(f"--colour: var(--{key})") for key in _BELIEF]
-    chart = ui.echart(_chart_options(panel.quantity, panel.threshold)).classes("chart")
+    chart = ui.echart(_chart_options(panel.threshold)).classes("chart")
     body = ui.query("body")  # Now: when the session ends, a browser may be too late to load it.
 
     def update() -> None:
@@ -110,7 +110,7 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         status = panel.status
         state.set_text(status.state)
         is_known = math.isfinite(panel.probability) and not panel.is_stopped
-        gamma.set_text(f"Γ {panel.probability:.2f}" if is_known else "")
+        probability.set_text(f"probability {panel.probability:.2f}" if is_known else "")
         cause.set_text("expected: " + status.cause.replace("_", " ") if status.cause else "")
         note.set_text(status.note)
         box.style(f"background: var(--{status.tone})")
@@ -157,13 +157,13 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
     return update
 
 
-def _chart_options(quantity: str, threshold: float) -> dict[str, Any]:
+def _chart_options(threshold: float) -> dict[str, Any]:
     line = {"yAxis": threshold, "name": f"threshold {threshold:.2f}"}
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
         "title": {
-            "text": f"{quantity} over time [s]",
+            "text": "probability over time [s]",
             "textStyle": {"fontSize": 13, "fontWeight": "normal"},
             "left": 0,
             "padding": 0,

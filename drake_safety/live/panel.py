@@ -63,21 +63,19 @@ class LivePanel:
 
     Args:
         title: Title of the page.
-        quantity: What messages call the Γ shown.
-        threshold: Its value at which the threshold line is drawn.
+        threshold: Probability at which the threshold line is drawn.
 
     Attributes:
         status: The text shown.
-        probability: Γ; NaN before the first.
+        probability: The probability; NaN before the first.
         belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
         sliders: Range of each slider by its name.
         is_stopped: Whether the session has ended.
     """
 
-    def __init__(self, *, title: str, quantity: str, threshold: float):
+    def __init__(self, *, title: str, threshold: float):
         self.title = title
-        self.quantity = quantity
         self.threshold = threshold
         self.status = Status()
         self.probability = math.nan
@@ -129,13 +127,13 @@ class LivePanel:
         """
         self.status = Status(state, cause, note, tone)
 
-    def show_gamma(
+    def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
-        """Shows Γ and the belief.
+        """Shows the probability and the belief.
 
         Args:
-            probability: Γ, in [0, 1], or NaN.
+            probability: In [0, 1], or NaN.
             belief: (safe, unsafe, don't know), (3,), of sum one; one that is not finite is shown
                 as "don't know".
             time_s: Time of a point of the curve, later than the previous one [s]; None for none.
@@ -150,13 +148,13 @@ class LivePanel:
             self._history.popleft()
 
     def clear_history(self) -> None:
-        """Clears the curve of Γ."""
+        """Clears the curve."""
         self._history.clear()
 
     def curve(self) -> list[tuple[float, float]]:
-        """Points (time before the last one [s], at most 0; Γ in [0, 1]), oldest first."""
+        """Points (time before the last one [s], at most 0; probability in [0, 1]), oldest first."""
         points = list(self._history)
-        return [(round(time_s - points[-1][0], 2), round(gamma, 3)) for time_s, gamma in points]
+        return [(round(time_s - points[-1][0], 2), round(value, 3)) for time_s, value in points]
 
     def stop(self) -> None:
         """Shows that the session has ended."""

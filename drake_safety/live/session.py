@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.causes import describe_margin, likely_cause
-from drake_safety.learning.prediction import gamma_of_port, is_unknown
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.live.following_camera import WORLD, FollowingCamera
 from drake_safety.live.panel import COLOURS, LivePanel
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
@@ -37,7 +37,7 @@ BREAK_S = 0.02
 """Real time between ticks while nothing is simulated [s]."""
 STOP = "Stop"
 
-_PORTS = ("belief", "cause_probability", "predicted_margins")
+_PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _LYING_S = 1.5  # From a fall to the reset.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
@@ -75,7 +75,7 @@ class LiveSession(ABC):
     Args:
         loop: A closed loop built with this Meshcat and with an assessment.
         meshcat: The Meshcat server.
-        threshold: Threshold of Γ.
+        threshold: Threshold of the probability.
         seed: Seed of starts and noise.
 
     Raises:
@@ -83,16 +83,14 @@ class LiveSession(ABC):
 
     Attributes:
         pace: Simulated and real time so far.
-        probability: Γ as shown.
+        probability: The probability as shown.
         panel: What a page shows, and its controls.
     """
-
-    probability_port = "normalized_safety_probability"
 
     def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         if loop.assessment is None:
             raise ValueError("live session: the loop was built without an assessment")
-        require_ports(loop, (self.probability_port, *_PORTS), "live session: ")
+        require_ports(loop, _PORTS, "live session: ")
         self.loop = loop
         self.assessment = loop.assessment
         self.meshcat = meshcat
@@ -109,7 +107,6 @@ class LiveSession(ABC):
             self._fall_column = loop.constraint_names.index(loop.fall_name)
         self.panel = LivePanel(
             title=loop.scenario.name,
-            quantity=gamma_of_port(self.probability_port),
             threshold=threshold,
         )
         self.panel.add_button(STOP, "Escape")
@@ -169,24 +166,24 @@ class LiveSession(ABC):
 
     def _advance(self) -> None:
         self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
-        self._show_gamma(
-            self._eval(self.probability_port)[0], self._eval("belief"), self.context.get_time()
+        self._show_belief(
+            self._eval("safety_probability")[0], self._eval("belief"), self.context.get_time()
         )
         if self._camera is not None:
             self._camera.follow(self.context)
 
-    def _show_gamma(
+    def _show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
         self.probability = float(probability)
-        self.panel.show_gamma(self.probability, belief, time_s)
+        self.panel.show_belief(self.probability, belief, time_s)
 
-    def _show_by_gamma(self, note: str, doing: str = "") -> None:
-        """Shows whether Γ has at least its threshold, or "don't know", and what the robot does."""
+    def _show_by_probability(self, note: str, doing: str = "") -> None:
+        """Shows "safe", "unsafe" or "don't know", and what the robot does."""
         doing = f": {doing}" if doing else ""
         if self.probability >= self.threshold:
             self.panel.show(f"safe{doing}", note=note, tone="safe")
-        elif is_unknown(self._eval("belief")[None], self.assessment.parameters.initial_uncertainty):
+        elif is_unknown(self._eval("belief"), self.assessment.parameters.initial_uncertainty):
             self.panel.show(f"don't know{doing}", note=note)
         else:
             self.panel.show(f"unsafe{doing}", cause=self._cause(), note=note, tone="unsafe")
@@ -223,7 +220,7 @@ class LiveThrows(LiveSession):
     Args:
         loop: A closed loop with a ball, built with this Meshcat and with an assessment.
         meshcat: The Meshcat server.
-        threshold: Threshold of Γ that triggers recovery.
+        threshold: Threshold of the probability that triggers recovery.
         seed: Seed of starts and noise.
     """
 
@@ -232,7 +229,6 @@ class LiveThrows(LiveSession):
 
     def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
         self._thrown = require(loop, HasBall)
-        self.probability_port = self._thrown.trigger_port
         super().__init__(loop, meshcat, threshold=threshold, seed=seed)
         self._has_recovery = loop.HasOutputPort("recovery_active")
 
@@ -280,7 +276,7 @@ class LiveThrows(LiveSession):
         elif self._has_recovery and self._eval("recovery_active")[0] > 0:
             self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
         else:
-            self._show_by_gamma(note, "balancing")
+            self._show_by_probability(note, "balancing")
 
 
 class LiveGoals(LiveSession):
@@ -296,7 +292,6 @@ class LiveGoals(LiveSession):
 
     ASK, GO, FORCE, STAND = "Ask", "Go", "Go all the same", "Stand"
     AXES = ("x [m]", "y [m]", "z [m]")
-    probability_port = "calibrated_safety_probability"
     _TARGET, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
     def __init__(
@@ -369,7 +364,7 @@ class LiveGoals(LiveSession):
                 rng=np.random.default_rng(self._seed),
                 num_candidates=_NUM_CANDIDATES,
             )
-        self._show_gamma(verdict.calibrated, verdict.belief)
+        self._show_belief(verdict.probability, verdict.belief)
         self._show_verdict(verdict, is_thorough=is_thorough)
         return verdict
 
@@ -388,12 +383,12 @@ class LiveGoals(LiveSession):
     def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
         if verdict.is_accepted:
             self.panel.show(
-                f"accepted: Γ {verdict.calibrated:.2f}",
+                f"accepted: probability {verdict.probability:.2f}",
                 note="Space goes there",
                 tone="safe",
             )
             return
-        first = f"refused: Γ {verdict.calibrated:.2f}"
+        first = f"refused: probability {verdict.probability:.2f}"
         if verdict.reason:
             first = "refused: don't know"
         cause = describe_margin(verdict.cause, verdict.cause_margin, angular_constraints(self.loop))

@@ -12,7 +12,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
-from drake_safety.learning.prediction import CALIBRATED, is_unknown
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -24,10 +24,10 @@ class GoalVerdict:
     Attributes:
         goal: The goal in the world, (3,) [m].
         verdict: "safe", "unsafe" or "don't know".
-        belief: (safe, unsafe, don't know), (3,); its first entry is literal Γ.
-        calibrated: Calibrated Γ; NaN where it was not evaluated, because the goal is
-            outside the region sampled in training.
-        threshold: Lowest calibrated Γ of a safe goal.
+        belief: (safe, unsafe, don't know), (3,); its first entry is the paper's Γ.
+        probability: The probability of staying safe; NaN where it was not evaluated, because the
+            goal is outside the region sampled in training.
+        threshold: Lowest probability of a safe goal.
         constraint_names: The n_c constraints, the possible causes.
         cause_probability: b_unsafe split by the violated constraint, (n_c,).
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
@@ -39,7 +39,7 @@ class GoalVerdict:
     goal: np.ndarray
     verdict: str
     belief: np.ndarray
-    calibrated: float
+    probability: float
     threshold: float
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
@@ -77,8 +77,7 @@ class GoalVerdict:
             "verdict": self.verdict,
             "reason": self.reason,
             "belief": dict(zip(("safe", "unsafe", "unknown"), self.belief.tolist(), strict=True)),
-            "quantity": CALIBRATED,
-            "calibrated": _finite(self.calibrated),
+            "probability": _finite(self.probability),
             "threshold": self.threshold,
             "cause": self.cause or None,
             "cause_probability": dict(by_name),
@@ -104,8 +103,8 @@ def assess_goal(
         assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
             region sampled in training, is "don't know".
-        threshold: Lowest calibrated Γ of a safe goal.
-        unsafe_below: Calibrated Γ below this is unsafe, between this and the threshold "don't
+        threshold: Lowest probability of a safe goal.
+        unsafe_below: A probability below this is unsafe, between this and the threshold "don't
             know"; the threshold by default.
 
     Raises:
@@ -125,7 +124,7 @@ def assess_goal(
         goal=goal,
         verdict=UNKNOWN,
         belief=np.array(EMPTY, dtype=float),
-        calibrated=math.nan,
+        probability=math.nan,
         threshold=threshold,
         constraint_names=names,
         cause_probability=np.zeros(len(names)),
@@ -144,7 +143,7 @@ def assess_goals(
 ) -> list[GoalVerdict]:
     """Assesses goals inside the region sampled in training.
 
-    The verdict is "don't know" where the input is novel, or more than half of the belief comes from
+    The verdict is "don't know" where the input is novel, or half of the belief or more comes from
     cells without training data.
 
     Args:
@@ -163,13 +162,13 @@ def assess_goals(
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
-        probability = float(prediction.calibrated[i])
+        probability = float(prediction.probability[i])
         reason = ""
         verdict = SAFE if probability >= threshold else UNSAFE
         if unsafe_below <= probability < threshold:
             verdict = UNKNOWN
             reason = (
-                f"calibrated Γ {probability:.3f} lies between {unsafe_below:.3f} and "
+                f"the probability {probability:.3f} lies between {unsafe_below:.3f} and "
                 f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
             )
         if prediction.novelty[i] > 1.0:
@@ -187,7 +186,7 @@ def assess_goals(
                 goal=np.array(goal, dtype=float),
                 verdict=verdict,
                 belief=prediction.belief[i],
-                calibrated=probability,
+                probability=probability,
                 threshold=threshold,
                 constraint_names=tuple(loop.constraint_names),
                 cause_probability=prediction.cause_probability[i],

@@ -57,7 +57,7 @@ def nearest_accepted_goal(
 ) -> GoalVerdict | None:
     """Finds an accepted goal near a given one, with a reserve.
 
-    With reserve: calibrated Γ ≥ threshold + reserve (1 - threshold). The goal found lies at the
+    With reserve: probability ≥ threshold + reserve (1 - threshold). The goal found lies at the
     limit of the search, and of the goals at the threshold itself many are unsafe.
 
     Descent along the gradient of the safety head's logit finds an accepted goal with few
@@ -71,7 +71,7 @@ def nearest_accepted_goal(
         loop: A closed loop whose plans have a goal.
         assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
-        threshold: Lowest calibrated Γ of a safe goal.
+        threshold: Lowest probability of a safe goal.
         rng: Source of the candidates.
         reserve: Share of the interval from the threshold to 1, in [0, 1].
         num_candidates: Candidates of the search per batch; half as many if the descent has found

@@ -18,22 +18,22 @@ _INPUTS = ("state", "desired_preview", "features")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlanChoice:
-    """The chosen plan, and Γ of all candidates.
+    """The chosen plan, and the probability of all candidates.
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        calibrated: Calibrated Γ of each candidate, (M,).
-        threshold: Lowest calibrated Γ of an accepted plan.
+        probability: Probability of each candidate, (M,).
+        threshold: Lowest probability of an accepted plan.
     """
 
     index: int
-    calibrated: np.ndarray
+    probability: np.ndarray
     threshold: float
 
     @property
     def is_accepted(self) -> bool:
-        """Whether calibrated Γ of the chosen plan reaches the threshold."""
-        return bool(self.calibrated[self.index] >= self.threshold)
+        """Whether the probability of the chosen plan reaches the threshold."""
+        return bool(self.probability[self.index] >= self.threshold)
 
 
 def plan_inputs(
@@ -71,13 +71,13 @@ def choose_plan(
     rng: np.random.Generator,
     num_plans: int = 16,
 ) -> PlanChoice:
-    """Sets the plan with the highest calibrated Γ; the present plan is one of the candidates.
+    """Sets the plan with the highest probability; the present plan is one of the candidates.
 
     Args:
         loop: A closed loop whose plans can be chosen.
         assessment: The assessment learned from its episodes.
         context: Its Context, in the state to plan from; the chosen plan is set in it.
-        threshold: Lowest calibrated Γ of an accepted plan. If no candidate reaches it, the best
+        threshold: Lowest probability of an accepted plan. If no candidate reaches it, the best
             one is set, and ``is_accepted`` is False.
         rng: Source of the candidates.
         num_plans: Largest number of candidates.
@@ -88,7 +88,9 @@ def choose_plan(
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)
     state, preview, features = plan_inputs(loop, context, plans)
-    prediction = assessment.predict(state, preview, features if assessment.uses_features else None)
-    best = int(np.argmax(prediction.calibrated))  # The first of equals: the present plan, if any.
+    probability = assessment.predict(
+        state, preview, features if assessment.uses_features else None
+    ).probability
+    best = int(np.argmax(probability))  # The first of equals: the present plan, if any.
     offering.set_plan(context, plans[best])
-    return PlanChoice(index=best, calibrated=prediction.calibrated, threshold=threshold)
+    return PlanChoice(index=best, probability=probability, threshold=threshold)

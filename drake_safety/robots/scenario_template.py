@@ -97,7 +97,7 @@ robot: robot.yaml
     - {_ball(0.6, 2.0 * heavy, 3.5 * sideways, 1.5708)}
     - {_ball(1.68, 3.0 * heavy, 9.0 * sideways, -1.2)}
   recovery:
-    threshold: 0.4  # of normalised Γ, not tuned to this robot
+    threshold: 0.4  # of the probability, not tuned to this robot
     step:
       step_duration_s: {0.09 * slow:.3g}  # [s]
       lift_m: {0.06 * tall:.3g}

@@ -154,10 +154,6 @@ class HasVisuals(Protocol):
 class HasBall(Protocol):
     """A ball can be thrown at the robot, and recovery can be triggered."""
 
-    @property
-    def trigger_port(self) -> str:
-        """Name of the output port that triggers recovery."""
-
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples an undisturbed motion, during which a ball is thrown."""
 

@@ -22,7 +22,7 @@ RECORDED_PORTS = RECORDED
 """Output ports recorded in episodes."""
 REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
 """Output ports of every task."""
-ASSESSMENT_PORTS = ("safety_probability", "normalized_safety_probability", "belief")
+ASSESSMENT_PORTS = ("safety_probability", "belief")
 """Further output ports of a task with an assessment."""
 
 _MOST_NAMES = 8  # Of a list that an error quotes whole.
@@ -87,7 +87,7 @@ class ClosedLoop(FloatSystem, Diagram):
     ``features``           n_f     the safe set's features of state and preview
     ``margins``            n_c     signed margins of the safe set, negative = violated
     ``safe``               1       1 while the state is inside the safe set
-    ``safety_probability`` 1       literal Γ, with an assessment (also ``normalized_…``)
+    ``safety_probability`` 1       probability of staying safe, with an assessment
     ``belief``             3       (safe, unsafe, unknown), with an assessment
     ``alarm``              1       1 since the monitor's alarm (also ``alarm_cause``, ``levels``)
     ``recovery_active``    1       1 during recovery, with recovery

@@ -37,27 +37,24 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
         - alarm (with ``heeds_alarm``)
         output_ports:
         - safety_probability
-        - normalized_safety_probability
         - belief
         - cause_probability
         - embedding
         - predicted_margins
-        - calibrated_safety_probability
         - novelty
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
-    ``safety_probability`` is literal Γ, b_safe as in the paper, at most 1 - μ;
-    ``normalized_safety_probability`` is normalised Γ, b_safe / (1 - μ), 0 where μ = 1;
-    ``calibrated_safety_probability`` is calibrated Γ, the probability by the maps' heads with the
-    correction from feedback, 0 where the belief is "don't know"; ``novelty`` is the distance of the
-    inputs from those of training, novel above 1. The belief of inputs that are
-    novel or not finite is (0, 0, 1), and so is the belief before the first evaluation. So is every
-    belief while ``alarm`` is above 0.5, as that of a
-    :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. While one of ``margins``, those
-    of the measured state, is negative, no belief is safe: its mass for "safe" counts as unsafe by
-    the most violated constraint. The beliefs of the grid, the correction and the novelty
-    are parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
-    between simulations and during them. The embedding is immutable.
+    ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
+    ``safety_probability`` is the probability of staying safe, by the maps' heads with the
+    correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
+    is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
+    training, novel above 1. The belief of inputs that are novel or not finite is (0, 0, 1), and so
+    is the belief before the first evaluation, and every belief while ``alarm`` is above 0.5, as
+    that of a :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. While one of
+    ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
+    counts as unsafe by the most violated constraint. The beliefs of the grid, the correction and
+    the novelty are parameters of the Context: :meth:`adopt` replaces them by those of an adapted
+    assessment, between simulations and during them. The embedding is immutable.
 
     Args:
         assessment: A fitted assessment.
@@ -102,12 +99,10 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
             self._alarm_port = self.DeclareVectorInputPort("alarm", 1)
         sizes = {
             "safety_probability": 1,
-            "normalized_safety_probability": 1,
             "belief": 3,
             "cause_probability": n_c,
             "embedding": 2,
             "predicted_margins": n_c,
-            "calibrated_safety_probability": 1,
             "novelty": 1,
         }
         first = np.concatenate(
@@ -209,12 +204,12 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
         discrete_state.set_value(
             np.concatenate(
                 [
-                    (prediction.literal, prediction.normalized),
+                    (prediction.probability,),
                     prediction.belief,
                     prediction.cause_probability,
                     prediction.embedding,
                     prediction.predicted_margins,
-                    (prediction.calibrated, min(prediction.novelty, _LARGEST_NOVELTY)),
+                    (min(prediction.novelty, _LARGEST_NOVELTY),),
                 ]
             )
         )

@@ -9,7 +9,6 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.control.policy import CommandLimits
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import is_unknown
 from drake_safety.systems.float_system import FloatSystem
 
 _SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
@@ -32,21 +31,20 @@ class CommandGuard(FloatSystem, LeafSystem):
         - is_changed
         - safety_probability
 
-    Every ``period_s`` Γ is evaluated for the asked command, held from now on. If it is accepted,
+    Every ``period_s`` the asked command, held from now on, is assessed. If it is accepted,
     ``desired_output`` is the asked command. Otherwise it is the accepted one nearest to it,
     measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
-    none is accepted, the one with the largest Γ. A command is accepted if its calibrated Γ reaches
-    the threshold and the inputs are not novel. ``safety_probability`` is calibrated Γ of the asked
-    command; the port of that name of :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`
-    is literal Γ. All outputs are discrete states, and preview and outlook hold the command. Whether
-    the guard acts is a parameter of the Context; one that does not passes on everything.
+    none is accepted, the one with the largest probability. A command is accepted if its probability
+    reaches the threshold. ``safety_probability`` is that of the asked command. All outputs are
+    discrete states, and preview and outlook hold the command. Whether the guard acts is a parameter
+    of the Context; one that does not passes on everything.
 
     Args:
         assessment: A fitted assessment.
         with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
             commands, such as `WalkingSafeSet.with_commands`.
         limits: The policy's ranges.
-        threshold: Lowest calibrated Γ of an accepted command.
+        threshold: Lowest probability of an accepted command.
         period_s: Time between two decisions [s].
         offset_s: Time of the first [s].
         num_outlook: M, samples of the outlook.
@@ -114,22 +112,18 @@ class CommandGuard(FloatSystem, LeafSystem):
     def probabilities(
         self, state: np.ndarray, features: np.ndarray, commands: np.ndarray
     ) -> np.ndarray:
-        """Calibrated Γ of constant commands from now on, (C,); 0 where nothing is known.
+        """Probability of constant commands from now on, (C,); 0 where it is "don't know".
 
         Args:
             state: (n_s,), the assessor's.
             features: (n_f,), of any command.
             commands: (C, 3) [m/s, rad/s].
         """
-        prediction = self._assessment.predict(
+        return self._assessment.predict(
             np.tile(state, (len(commands), 1)),
             np.tile(commands, self._horizon),
             self._with_commands(features, commands) if self._assessment.uses_features else None,
-        )
-        unknown = is_unknown(
-            prediction.belief, self._assessment.parameters.initial_uncertainty
-        ) | ~(prediction.novelty <= 1.0)
-        return np.where(unknown, 0.0, prediction.calibrated)
+        ).probability
 
     def candidates(self, asked: np.ndarray) -> np.ndarray:
         """Commands that may replace an asked one, nearest first, (C, 3) [m/s, rad/s]."""
@@ -147,7 +141,7 @@ class CommandGuard(FloatSystem, LeafSystem):
         *,
         is_acting: bool = True,
     ) -> tuple[np.ndarray, float]:
-        """Returns the command to pass on, (3,), and calibrated Γ of the asked one.
+        """Returns the command to pass on, (3,), and the probability of the asked one.
 
         Args:
             asked: (3,) [m/s, rad/s].

@@ -13,7 +13,7 @@ from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 
 class RecoverySwitch(FloatSystem, Diagram):
-    """Passes the nominal set point until Γ falls below its threshold, then recovery steps.
+    """Passes the nominal set point until the probability is below a threshold, then recovery steps.
 
     .. pydrake_system::
 
@@ -41,13 +41,13 @@ class RecoverySwitch(FloatSystem, Diagram):
     Args:
         kinematics: The controller's model of the robot.
         parameters: Parameters of the recovery steps.
-        threshold: Γ_thre, of what ``safety_probability`` is connected to; see
-            :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
-        persistence_s: Time for which Γ must have been below it while nothing is known [s].
+        threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
+        persistence_s: See there.
+        initial_uncertainty: See there.
         period_s: Period of trigger and step planner [s].
-        offset_s: Delay of the trigger after Γ, and of the step planner after the trigger [s]:
-            discrete updates of one time see the state before all of them, so each would be a period
-            late.
+        offset_s: Delay of the trigger after the assessor, and of the step planner after the
+            trigger [s]. Discrete updates of one time see the state before all of them, so each
+            would be a period late.
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """
@@ -59,6 +59,7 @@ class RecoverySwitch(FloatSystem, Diagram):
         *,
         threshold: float,
         persistence_s: float = 0.0,
+        initial_uncertainty: float = 0.3,
         period_s: float,
         offset_s: float,
         horizon: int,
@@ -71,6 +72,7 @@ class RecoverySwitch(FloatSystem, Diagram):
             RecoveryTrigger(
                 threshold=threshold,
                 persistence_s=persistence_s,
+                initial_uncertainty=initial_uncertainty,
                 period_s=period_s,
                 offset_s=offset_s,
             ),

@@ -1,4 +1,4 @@
-"""RecoveryTrigger: a latch that is set when Γ falls below its threshold."""
+"""RecoveryTrigger: a latch that is set when the probability falls below its threshold."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import math
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
 
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.systems.float_system import FloatSystem
 
 
 class RecoveryTrigger(FloatSystem, LeafSystem):
-    """Switches to recovery when Γ < Γ_thre, and back when the recovery is done.
+    """Switches to recovery when the probability falls below Γ_thre, and back when that is done.
 
     .. pydrake_system::
 
@@ -24,19 +25,18 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         - port_selector
         - recovery_active
 
-    Γ is what ``safety_probability`` is connected to: literal Γ in the paper, normalised Γ in
-    balancing, calibrated Γ in walking.
-
-    The trigger latches: once active it stays active until ``recovery_done`` is 1. A Γ that is NaN
-    activates it. ``belief`` (3,) tells a Γ that is low from one of which nothing is known: while it
-    is (0, 0, 1), Γ must have been below Γ_thre for ``persistence_s``. An impact makes a single
-    input unlike those of training. ``port_selector`` drives a PortSwitch whose ports were declared
-    ``nominal`` first, ``recovery`` second.
+    The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
+    that is NaN activates it. ``belief`` (3,) tells a low probability from one that is 0 because the
+    belief is "don't know": meanwhile it must have been below Γ_thre for ``persistence_s``. An
+    impact makes a single input unlike those of training. ``port_selector`` drives a PortSwitch
+    whose ports were declared ``nominal`` first, ``recovery`` second.
 
     Args:
-        threshold: Γ_thre in [0, 1], of that quantity; the paper's value is 0.6, of literal Γ.
-        persistence_s: Time for which Γ must have been below Γ_thre while nothing is known [s]; none
-            by default, as in the paper.
+        threshold: Γ_thre in [0, 1]; the paper's value is 0.6, of the belief's first entry.
+        persistence_s: Time for which the probability must have been below Γ_thre while the belief
+            is "don't know" [s]; none by default, as in the paper.
+        initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
+            :func:`~drake_safety.learning.prediction.is_unknown`.
         period_s: Update period [s].
         offset_s: Time of the first update [s].
 
@@ -49,6 +49,7 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
         *,
         threshold: float = 0.6,
         persistence_s: float = 0.0,
+        initial_uncertainty: float = 0.3,
         period_s: float,
         offset_s: float = 0.0,
     ):
@@ -60,12 +61,13 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
                 f"recovery trigger: persistence_s must not be negative; got {persistence_s}"
             )
         self.threshold = threshold
+        self._initial_uncertainty = initial_uncertainty
         self._num_waited = math.ceil(persistence_s / period_s - 1e-6)
         self._probability_port = self.DeclareVectorInputPort("safety_probability", 1)
         self._belief_port = self.DeclareVectorInputPort("belief", 3)
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
-        self._num_below = self.DeclareDiscreteState(1)  # Updates with Γ below Γ_thre, up to now.
+        self._num_below = self.DeclareDiscreteState(1)  # Updates below Γ_thre, up to now.
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self.DeclareAbstractOutputPort(
             "port_selector",
@@ -87,10 +89,11 @@ class RecoveryTrigger(FloatSystem, LeafSystem):
             is_below = not self._probability_port.Eval(context)[0] >= self.threshold
             num_below = context.get_discrete_state(self._num_below).GetAtIndex(0)
             num_below = num_below + 1.0 if is_below else 0.0
-            is_known = not (
-                self._belief_port.HasValue(context) and self._belief_port.Eval(context)[2] >= 1.0
+            belief = self._belief_port
+            unknown = belief.HasValue(context) and is_unknown(
+                belief.Eval(context), self._initial_uncertainty
             )
-            active = is_below and (is_known or num_below > self._num_waited)
+            active = is_below and (not unknown or num_below > self._num_waited)
         discrete_state.set_value(self._active, [float(active)])
         discrete_state.set_value(self._num_below, [num_below])
 

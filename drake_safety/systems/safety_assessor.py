@@ -27,12 +27,10 @@ class SafetyAssessor(FloatSystem, Diagram):
         - hold (optional)
         output_ports:
         - safety_probability
-        - normalized_safety_probability
         - belief
         - cause_probability
         - embedding
         - predicted_margins
-        - calibrated_safety_probability
         - novelty
         - alarm
         - levels

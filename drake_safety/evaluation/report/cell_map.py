@@ -153,8 +153,8 @@ def map_views(
 
     return {
         "safe": {
-            "title": "normalised Γ",
-            "meaning": "Normalised Γ, b_safe / (1 − μ). Hatched cells are "
+            "title": "safe share",
+            "meaning": "Safe share of the belief, b_safe / (1 − μ). Hatched cells are "
             "empty: the answer there is “don't know”.",
             "fills": fills([safe_share(c) for c in cells], SAFETY_STOPS),
             "stops": SAFETY_STOPS,
@@ -204,15 +204,15 @@ def map_figure(assessment: SafetyAssessment, cells: list[dict[str, Any]]) -> Fig
             np.array([safe_share(cell) for cell in cells]),
             np.array([_is_empty(cell) for cell in cells]),
             np.array([cell["count"] for cell in cells]),
-            label="normalised Γ, b_safe / (1 − μ)",
+            label="safe share, b_safe / (1 − μ)",
         )
         axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
-        axes.set_title(f"Normalised Γ of each cell, mode {assessment.parameters.mode}")
+        axes.set_title(f"Safe share of each cell, mode {assessment.parameters.mode}")
     return fig
 
 
 def safe_share(cell: dict[str, Any]) -> float:
-    """Normalised Γ of a cell, b_safe / (1 - μ); 0 for an empty cell."""
+    """Safe share of a cell's belief, b_safe / (1 - μ); 0 for an empty cell."""
     safe, unsafe = cell["belief"][SAFE], cell["belief"][UNSAFE]
     return float(safe / (safe + unsafe)) if safe + unsafe else 0.0
 

@@ -24,14 +24,14 @@ from drake_safety.evaluation.report.cell_map import (
     safe_share,
 )
 from drake_safety.evaluation.report.run_folder import REPORT_FOLDER, Missing, Run
-from drake_safety.evaluation.report.tables import Column, Table
-from drake_safety.evaluation.report.verdicts import other_tables, verdict_tables
+from drake_safety.evaluation.tables import Column
+from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_SVG_BYTES = 1_500_000  # Larger figures are embedded as PNG.
 _KNOWN_PREFIXES = ("segments", "episodes", "throws", "plans", "monitoring")
-_SHARE = Column(key="", title="", meaning="", unit="%", digits=1)
+_SHARE = Column("", "", "%", digits=1)
 
 
 def write_report(
@@ -53,19 +53,11 @@ def write_report(
         shutil.rmtree(folder / name, ignore_errors=True)
         (folder / name).mkdir(parents=True)
     tables = verdict_tables(run.results)
-    prefixes = dict.fromkeys(key.partition(".")[0] for key in run.results.estimates)
-    others = {
-        prefix: other_tables(run.results, prefix)
-        for prefix in prefixes
-        if prefix not in _KNOWN_PREFIXES
-    }
     maps = {
         mode: _map(run, assessment, folder, angular_constraints)
         for mode, assessment in run.assessments.items()
     }
     pictures = _pictures(run, folder)
-    for table in [*tables, *(table for group in others.values() for table in group)]:
-        _save_table(table, folder / "tables")
     page = (
         _environment()
         .get_template("page.html.j2")
@@ -78,18 +70,12 @@ def write_report(
             counts=_counts(run),
             tiles=_tiles(run),
             paper=_beside_the_paper(run, pictures),
-            tables=[table for table in tables if table.key != "calibrations"],
-            calibration=[
-                *(table for table in tables if table.key == "calibrations"),
-                *others.pop("calibration", []),
-            ],
-            others=others,
+            tables=tables,
             pictures=pictures,
             motions=_motions(run, pictures),
             maps=maps,
             all_estimates=[
-                (key, Column(key="", title="", meaning="", digits=4), estimate)
-                for key, estimate in run.results.estimates.items()
+                (key, Column("", "", digits=4), estimate) for key, estimate in run.results.items()
             ],
             entries=run.results.entries,
             versions=versions,
@@ -126,12 +112,6 @@ def _words(name: str) -> Any:
     return yaml.safe_load(_text(name))
 
 
-def _save_table(table: Table, folder: Path) -> None:
-    (folder / f"{table.key}.csv").write_text(table.to_csv(), encoding="utf-8")
-    text = json.dumps(table.to_json(), indent=2, ensure_ascii=False)
-    (folder / f"{table.key}.json").write_text(text + "\n", encoding="utf-8")
-
-
 def _counts(run: Run) -> list[dict[str, Any]]:
     """Numbers and shares of the ends of training episodes, safe ones first."""
     causes = run.causes
@@ -152,7 +132,7 @@ def _counts(run: Run) -> list[dict[str, Any]]:
 
 def _tiles(run: Run) -> list[dict[str, str]]:
     """The most important estimates."""
-    estimates = run.results.estimates
+    estimates = run.results
     tiles = []
 
     def add(key: str, title: str, remark: str, column: Column) -> None:
@@ -167,7 +147,7 @@ def _tiles(run: Run) -> list[dict[str, str]]:
                 }
             )
 
-    recall = Column(key="", title="", meaning="")
+    recall = Column("", "")
     add("throws.falls_without_recovery", "falls without recovery", "of fresh throws", _SHARE)
     add("throws.sharpened.falls_with_recovery", "falls with recovery", "of these throws", _SHARE)
     add("throws.sharpened.false_triggers", "false triggers", "of harmless throws", _SHARE)
@@ -198,12 +178,12 @@ def _beside_the_paper(run: Run, pictures: dict[str, dict[str, Any]]) -> dict[str
             {
                 "name": name,
                 "paper": printed,
-                "ours": column.value_text(run.results.estimates[key]),
-                "interval": column.interval_text(run.results.estimates[key]),
+                "ours": column.value_text(run.results[key]),
+                "interval": column.interval_text(run.results[key]),
             }
             for name, printed, key, unit in one.get("values", [])
-            if key in run.results.estimates
-            for column in [Column(key="", title="", meaning="", unit=unit, digits=_digits(unit))]
+            if key in run.results
+            for column in [Column("", "", unit, digits=_digits(unit))]
         ]
         found = [p for name, p in pictures.items() if Path(name).name == one["picture"]]
         comparisons.append({**one, "values": values, "found": found[0] if found else None})

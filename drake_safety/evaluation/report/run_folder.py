@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from drake_safety.evaluation.report.results import Results, read_evaluation
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes, EpisodesInfo
 from drake_safety.simulation.dataset import load_episodes, read_info
@@ -71,7 +71,7 @@ class Run:
     extra: dict[str, Any] = field(default_factory=dict)
     episodes: Episodes | None = None
     assessments: dict[str, SafetyAssessment] = field(default_factory=dict)
-    results: Results = field(default_factory=Results)
+    results: Results = field(default_factory=lambda: Results({}))
     motions: list[Motion] = field(default_factory=list)
     pictures: dict[str, dict[str, Path]] = field(default_factory=dict)
     missing: list[Missing] = field(default_factory=list)
@@ -193,7 +193,7 @@ def _read_results(run: Run, path: Path) -> None:
         )
         return
     try:
-        run.results = read_evaluation(path)
+        run.results = Results.read(path)
     except (ValueError, OSError) as error:
         run.missing.append(Missing(what="The evaluation", why=_sentence(error), command=command))
         return

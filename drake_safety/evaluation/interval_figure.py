@@ -1,0 +1,66 @@
+"""Values with their intervals by method, for any rows of the table of results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    SERIES_COLOURS,
+    drawing_style,
+    label_of,
+    new_figure,
+    spoken,
+)
+from drake_safety.evaluation.results import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MARKS = "osD^vP"
+
+
+def interval_figure(rows: Sequence[Result]) -> Figure:
+    """Plots a panel for each metric: methods below each other, sets side by side in colours.
+
+    Args:
+        rows: Rows of the table of results, at least one.
+    """
+    metrics, methods, sets = (
+        list(dict.fromkeys(getattr(row, name) for row in rows))
+        for name in ("metric", "method", "set")
+    )
+    with drawing_style():
+        height = 1.1 + 0.18 * len(methods) * (1 + len(sets))
+        fig = new_figure(2.2 + 2.6 * len(metrics), height)
+        panels = np.atleast_1d(fig.subplots(1, len(metrics), sharey=True))
+        for axes, metric in zip(panels, metrics, strict=True):
+            for i, name in enumerate(sets):
+                shown = [row for row in rows if row.metric == metric and row.set == name]
+                # NaN ends, such as those of a value without interval, draw no bar.
+                value, low, high = (
+                    np.array([[r.value, r.low, r.high] for r in shown]).reshape(-1, 3).T
+                )
+                places = [methods.index(row.method) for row in shown]
+                axes.errorbar(
+                    value,
+                    np.array(places) + 0.7 * ((i + 0.5) / len(sets) - 0.5),
+                    xerr=np.maximum([value - low, high - value], 0.0),
+                    fmt=_MARKS[i % len(_MARKS)],
+                    color=SERIES_COLOURS[i % len(SERIES_COLOURS)],
+                    markersize=5.0,
+                    capsize=2.5,
+                    label=spoken(name).replace(".", ", "),
+                )
+            axes.set_title(label_of(metric))
+            axes.grid(axis="x", color=FAINT_INK, alpha=0.25)
+        panels[0].set_yticks(range(len(methods)), [label_of(method) for method in methods])
+        panels[0].set_ylim(len(methods) - 0.5, -0.5)
+        if len(sets) > 1:
+            fig.legend(
+                *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(sets)
+            )
+    return fig

@@ -1,0 +1,151 @@
+"""Results of evaluations and studies: one tidy table, a row a figure."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.learning.assessment_file import replacing
+
+SCHEMA = "drake_safety.results"
+SCHEMA_VERSION = 1
+_NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
+_DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
+_KEY = re.compile(r"[\w -]+(\.[\w -]+)*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result(Estimate):
+    """A row of the table: a figure with its interval.
+
+    Attributes:
+        set: What was judged, such as "episodes" or "plans.fair".
+        method: What judged it, such as "sharpened"; "" for a figure of the set itself.
+        metric: What was measured, such as "auc".
+    """
+
+    set: str
+    method: str
+    metric: str
+
+    @classmethod
+    def of(cls, key: str, estimate: Estimate) -> Result:
+        """The row with a key "set.method.metric", "set.metric" or "metric"; a set may have dots.
+
+        Raises:
+            ValueError: The key has other characters than letters, digits, spaces, "_", "-", ".".
+        """
+        if not _KEY.fullmatch(key):
+            raise ValueError(
+                f"a result has the key '{key[:80]}', expected letters, digits, spaces, '_' and "
+                "'-' between dots"
+            )
+        *rest, metric = _DOT.split(key)
+        method = rest.pop() if len(rest) > 1 else ""
+        return cls(
+            value=estimate.value,
+            low=estimate.low,
+            high=estimate.high,
+            n=estimate.n,
+            set=".".join(rest),
+            method=method,
+            metric=metric,
+        )
+
+
+class Results(Mapping[str, Result]):
+    """Rows by key "set.method.metric", in their order, and what made them.
+
+    Args:
+        estimates: By key.
+        entries: Command, scenario, seeds, versions and the like, as JSON types.
+    """
+
+    def __init__(self, estimates: Mapping[str, Estimate], entries: Mapping[str, Any] | None = None):
+        self._rows = {key: Result.of(key, estimate) for key, estimate in estimates.items()}
+        self.entries: dict[str, Any] = dict(entries or {})
+
+    def __getitem__(self, key: str) -> Result:
+        return self._rows[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def has(self, prefix: str) -> bool:
+        """Whether the key of any row begins so."""
+        return any(key.startswith(prefix) for key in self)
+
+    def select(
+        self, *, set: str | None = None, method: str | None = None, metric: str | None = None
+    ) -> list[Result]:
+        """The rows of a set, a method and a metric; None takes all."""
+        wanted = {"set": set, "method": method, "metric": metric}.items()
+        return [
+            row
+            for row in self.values()
+            if all(value is None or getattr(row, name) == value for name, value in wanted)
+        ]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Results:
+        """Reads a file that `write` wrote.
+
+        Raises:
+            ValueError: The file holds no results.
+        """
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            found = (content["schema"], content["schema_version"])
+            if found != (SCHEMA, SCHEMA_VERSION):
+                raise ValueError(f"schema and version are {found}")
+            figures = {
+                key: Estimate(*(math.nan if end is None else float(end) for end in ends), int(n))
+                for key, (*ends, n) in content["figures"].items()
+            }
+            return cls(figures, content["entries"])
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+        ) as error:
+            raise ValueError(
+                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: {error!r}"
+            ) from error
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Writes a JSON file, a row a line: key, then value, ends of the interval and n.
+
+        Numbers have six significant digits; what is not finite becomes null.
+        """
+        figures = ",\n".join(
+            f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (r.value, r.low, r.high)), r.n])}"
+            for key, r in self.items()
+        )
+        entries = json.dumps(self.entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
+        text = (
+            "{\n"
+            f'  "schema": {json.dumps(SCHEMA)},\n'
+            f'  "schema_version": {SCHEMA_VERSION},\n'
+            f'  "entries": {entries},\n'
+            f'  "figures": {{\n{figures}\n  }}\n'
+            "}\n"
+        )
+        with replacing(Path(path)) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _rounded(number: float) -> float | None:
+    return float(f"{number:.{_NUM_DIGITS}g}") if math.isfinite(number) else None

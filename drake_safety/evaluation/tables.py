@@ -1,0 +1,196 @@
+"""Tables of results: a row a method or set, a column a metric, for terminals, Markdown and HTML."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+
+import rich.table
+
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
+
+OURS = "sharpened"
+"""The method that baselines are compared with."""
+_MODES = re.compile(r"^(sharpened|paper)\b")
+_SCALES = {"%": 100.0, "=%": 100.0, "ms": 1000.0}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: a metric and how it is written.
+
+    Attributes:
+        key: The metric.
+        title: Its heading.
+        unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
+            rate, or "=" and "=%" for values without interval.
+        better: 1 if larger is better, -1 if smaller is, 0 otherwise.
+        digits: Digits after the decimal point.
+    """
+
+    key: str
+    title: str
+    unit: str = ""
+    better: int = 0
+    digits: int = 3
+
+    def value_text(self, estimate: Estimate | None) -> str:
+        """The value of an estimate; a dash if it has none."""
+        if estimate is None or (math.isnan(estimate.value) and self.unit != "of"):
+            return "–"
+        if self.unit == "of":
+            count = round(estimate.value * estimate.n) if estimate.n else 0
+            return f"{count} of {estimate.n}"
+        if math.isinf(estimate.value):
+            return "never"
+        if self.unit == "n":
+            return f"{estimate.value:.0f}"
+        unit = self.unit.removeprefix("=")
+        space = "" if unit in ("", "/h") else f" {unit}"
+        return f"{_SCALES.get(self.unit, 1.0) * estimate.value:.{self.digits}f}{space}"
+
+    def interval_text(self, estimate: Estimate | None) -> str:
+        """The interval of an estimate in brackets, if any."""
+        if estimate is None or self.unit not in ("", "%", "/h"):
+            return ""
+        if not all(map(math.isfinite, (estimate.value, estimate.low, estimate.high))):
+            return ""
+        scale = _SCALES.get(self.unit, 1.0)
+        low, high = (f"{scale * end:.{self.digits}f}" for end in (estimate.low, estimate.high))
+        return f"({low}–{high})"
+
+    def text(self, estimate: Estimate | None) -> str:
+        """The value and interval of an estimate."""
+        return f"{self.value_text(estimate)} {self.interval_text(estimate)}".strip()
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table.
+
+    Attributes:
+        key: Its method, or its part of the keys of its results.
+        label: Its label.
+        estimates: One a column; None if missing.
+    """
+
+    key: str
+    label: str
+    estimates: Sequence[Estimate | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of estimates.
+
+    Attributes:
+        corner: Heading of the row labels.
+        columns: The columns.
+        rows: The rows.
+        title: Its heading.
+        meaning: Its explanation.
+    """
+
+    corner: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    title: str = ""
+    meaning: str = ""
+
+    def narrow(self, keys: Sequence[str]) -> Table:
+        """The table with some of its columns, in its order."""
+        shown = [i for i, column in enumerate(self.columns) if column.key in keys]
+        rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in self.rows]
+        return replace(self, columns=[self.columns[i] for i in shown], rows=rows)
+
+    def best(self, column: int) -> set[int]:
+        """Indices of the best rows of a column; empty if there is nothing to compare."""
+        sign = self.columns[column].better
+        values = {
+            i: sign * estimate.value
+            for i, row in enumerate(self.rows)
+            if (estimate := row.estimates[column]) is not None and math.isfinite(estimate.value)
+        }
+        if not sign or len(set(values.values())) < 2:
+            return set()
+        return {i for i, value in values.items() if value == max(values.values())}
+
+    def better_baselines(self) -> list[str]:
+        """Describes each column in which another row is better than `OURS`."""
+        ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
+        found: list[str] = []
+        if ours is None:
+            return found
+        for number, column in enumerate(self.columns):
+            best, mine = self.best(number), self.rows[ours].estimates[number]
+            if not best or ours in best or mine is None:
+                continue
+            first = self.rows[min(best)]
+            other = first.estimates[number]
+            assert other is not None
+            is_clear = (other.low > mine.high) if column.better > 0 else (other.high < mine.low)
+            certainty = "beyond both intervals" if is_clear else "the intervals overlap"
+            found.append(
+                f"{column.title}: {first.label}, {column.value_text(other)} against "
+                f"{column.value_text(mine)} ({certainty})"
+            )
+        return found
+
+    def to_rich(self) -> rich.table.Table:
+        """The table for a terminal, with its explanation; cells fold if they do not fit."""
+        ahead = self.better_baselines()
+        caption = (
+            f"{self.meaning}\nBetter than {OURS}: {'; '.join(ahead)}" if ahead else self.meaning
+        )
+        headings = (
+            rich.table.Column(title, overflow="fold")
+            for title in (self.corner, *(column.title for column in self.columns))
+        )
+        table = rich.table.Table(*headings, title=self.title or None, caption=caption or None)
+        for row in self.rows:
+            table.add_row(row.label, *map(Column.text, self.columns, row.estimates))
+        return table
+
+    def to_markdown(self) -> str:
+        """The table as Markdown, estimates with their intervals; a missing one is empty."""
+        lines = [[self.corner, *(column.title for column in self.columns)]]
+        for row in self.rows:
+            cells = zip(self.columns, row.estimates, strict=True)
+            texts = ("" if one is None else column.text(one) for column, one in cells)
+            lines.append([_MODES.sub(r"`\1`", row.label), *texts])
+        head, *rows = ("| " + " | ".join(line) + " |" for line in lines)
+        ruler = "|" + "---|" * (1 + len(self.columns))
+        return "\n".join([head, ruler, *rows]).replace("|  |", "| |").replace("|  |", "| |")
+
+    def to_html(self) -> str:
+        """The table as an HTML element; the best of a column has the class ``best``."""
+        head = "".join(f'<th scope="col">{escape(column.title)}</th>' for column in self.columns)
+        lines = [f'<table><thead><tr><th scope="col">{escape(self.corner)}</th>{head}</tr></thead>']
+        best = [self.best(number) for number in range(len(self.columns))]
+        for i, row in enumerate(self.rows):
+            cells = "".join(
+                f"<td{' class=best' * (i in best[j])}>{escape(column.value_text(one))} "
+                f"<small>{escape(column.interval_text(one))}</small></td>"
+                for j, (column, one) in enumerate(zip(self.columns, row.estimates, strict=True))
+            )
+            lines.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+        return "\n".join([*lines, "</table>"])
+
+
+def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Column]) -> list[Row]:
+    """Rows of the results with given beginnings of their keys; empty rows are left out.
+
+    Args:
+        results: The results.
+        labels: Label of the row by beginning, such as "plans.sharpened".
+        columns: The columns.
+    """
+    rows = [
+        Row(prefix, label, [results.get(f"{prefix}.{column.key}") for column in columns])
+        for prefix, label in labels.items()
+    ]
+    return [row for row in rows if any(row.estimates)]
