@@ -131,10 +131,7 @@ class LeggedLoop(PlannedLoop):
         return physics
 
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
-        """Adds observers of the controller, the assessor and the true state.
-
-        Takes options of `StateObserver`; returns the controller's measured state.
-        """
+        """Adds observers, with options of `StateObserver`; returns the controller's state."""
         noise = self.variation.observation_noise
         self._observers = Observers(
             builder,
@@ -167,20 +164,7 @@ class LeggedLoop(PlannedLoop):
         controller_features: tuple[OutputPort, list[str]] | None = None,
         has_stance: bool = True,
     ) -> None:
-        """Adds monitor and features; see :meth:`_add_safe_set`.
-
-        Features after those of the safe set are gravity in the plane of the feet, with position
-        servos the servos' load, and what the controller tells of itself.
-
-        Args:
-            builder: The diagram's builder.
-            safe_set: The safe set.
-            outlook: Port of the outlook.
-            servo_command: Port of the joints' commanded positions and rates, (2 n_j,); None without
-                servos.
-            controller_features: Port of further features, and their names.
-            has_stance: Whether the feet stand, so that they define a plane.
-        """
+        """Adds monitor and features: the safe set's, gravity, servo loads, the controller's."""
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self._rate_features = safe_set.rate_features
@@ -324,11 +308,7 @@ class LeggedLoop(PlannedLoop):
         return start.stance_pose(self.kinematics)
 
     def start_control(self, context: Context) -> None:
-        """Sets the command for a start in the present state; a controller may hold none.
-
-        Args:
-            context: The root Context.
-        """
+        """Sets the command for a start in the present state; a controller may hold none."""
 
     def advance_control(self, context: Context, time_s: float) -> None:
         """Moves a Context to a later time, with the command that the controller holds then.

@@ -109,16 +109,7 @@ class PlannedLoop(ClosedLoop):
         seen_state: OutputPort | None = None,
         outlook: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features, and sets the names of their outputs.
-
-        Args:
-            builder: The diagram's builder.
-            safe_set: The safe set.
-            sizes: n_q and n_v.
-            plant_state: Port of the true state ``[q; v]``, for the monitor.
-            seen_state: Port of the measured state, for the features; ``plant_state`` by default.
-            outlook: Port of the outlook, for the features; the planner's by default.
-        """
+        """Adds monitor and features; the latter see the state and outlook that are given."""
         self.plant_state_sizes = sizes
         self._plant_state = plant_state
         self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
@@ -147,18 +138,7 @@ class PlannedLoop(ClosedLoop):
         hold: OutputPort | None = None,
         **ports: OutputPort,
     ) -> SafetyAssessor | None:
-        """Adds the assessor, if there is an assessment, and exports the ports of the contract.
-
-        Args:
-            builder: The diagram's builder.
-            period_s: Time between two evaluations of Γ [s].
-            hold: Port that is 1 while the assessor's monitor waits.
-            **ports: ``state``, ``output``, and what differs from the planner's ``desired_output``
-                and ``desired_preview``; ``true_state`` is ``state`` by default.
-
-        Returns:
-            The assessor; None without an assessment.
-        """
+        """Adds the assessor, if any, and exports the contract's ports, by default the planner's."""
         ports = {
             "true_state": ports["state"],
             "desired_output": self._planner.GetOutputPort("desired_output"),

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import fields
-
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import (
@@ -16,11 +13,11 @@ from pydrake.systems.framework import (
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction
 from drake_safety.systems.float_system import FloatSystem
 
 _LARGEST_NOVELTY = 1e6
-_CORRECTION = tuple(field.name for field in fields(Correction))
 
 
 class BeliefEvaluator(FloatSystem, LeafSystem):
@@ -81,12 +78,7 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
         self._belief_index = self.DeclareNumericParameter(
             BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        correction = assessment.correction_
-        self._correction_shapes = [getattr(correction, name).shape for name in _CORRECTION]
-        self._correction_index = self.DeclareNumericParameter(BasicVector(_packed(correction)))
-        self._novelty_index = self.DeclareAbstractParameter(Value(assessment.novelty_))
-        # Without heads there is no logit to correct.
-        self._has_heads = assessment.base_logit_ is not None
+        self._learned = self.DeclareAbstractParameter(Value(_learned(assessment)))
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._preview_port = self.DeclareVectorInputPort(
             "desired_preview", info.horizon * len(info.output_names)
@@ -138,32 +130,12 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
         Raises:
             ValueError: The beliefs have another shape.
         """
-        _check_shape("beliefs", beliefs, self._shape)
-        _replace(context, self._belief_index, beliefs)
-
-    def get_correction(self, context: Context) -> Correction:
-        """Returns the correction in a Context."""
-        values = context.get_numeric_parameter(self._correction_index).get_value()
-        parts, start = [], 0
-        for shape in self._correction_shapes:
-            stop = start + math.prod(shape)
-            parts.append(values[start:stop].reshape(shape))
-            start = stop
-        return Correction(*parts)
-
-    def set_correction(self, context: Context, correction: Correction) -> None:
-        """Replaces the correction of the maps' logit.
-
-        Args:
-            context: This system's Context.
-            correction: Its arrays are shaped as those of the assessment.
-
-        Raises:
-            ValueError: An array has another shape; nothing is replaced.
-        """
-        for name, shape in zip(_CORRECTION, self._correction_shapes, strict=True):
-            _check_shape(f"the correction's {name}", getattr(correction, name), shape)
-        _replace(context, self._correction_index, _packed(correction))
+        beliefs = np.asarray(beliefs, dtype=float)
+        if beliefs.shape != self._shape:
+            raise ValueError(
+                f"belief evaluator: beliefs must have shape {self._shape}; got {beliefs.shape}"
+            )
+        context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned.
@@ -182,17 +154,17 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
                 "belief evaluator: the assessment to adopt has other maps; build the diagram anew"
             )
         self.set_beliefs(context, adapted.beliefs_)
-        self.set_correction(context, adapted.correction_)
-        context.get_mutable_abstract_parameter(self._novelty_index).set_value(adapted.novelty_)
+        context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        correction, novelty = context.get_abstract_parameter(self._learned).get_value()
         prediction = self._assessment.predict_one(
             self._state_port.Eval(context),
             self._preview_port.Eval(context),
             self._features_port.Eval(context) if self.reads_features else None,
             beliefs=self.get_beliefs(context),
-            correction=self.get_correction(context) if self._has_heads else None,
-            novelty=context.get_abstract_parameter(self._novelty_index).get_value(),
+            correction=correction,
+            novelty=novelty,
         )
         if self._alarm_port is not None and self._alarm_port.Eval(context)[0] > 0.5:
             prediction = prediction.unknown()
@@ -215,17 +187,5 @@ class BeliefEvaluator(FloatSystem, LeafSystem):
         )
 
 
-def _packed(correction: Correction) -> np.ndarray:
-    return np.concatenate([np.ravel(getattr(correction, name)) for name in _CORRECTION])
-
-
-def _check_shape(what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
-    if np.shape(values) != shape:
-        raise ValueError(
-            f"belief evaluator: {what} must have shape {shape}; got {np.shape(values)}"
-        )
-
-
-def _replace(context: Context, index: int, values: np.ndarray) -> None:
-    values = np.asarray(values, dtype=float)
-    context.get_mutable_numeric_parameter(index).SetFromVector(values.ravel())
+def _learned(assessment: SafetyAssessment) -> tuple[Correction, Novelty]:
+    return assessment.correction_, assessment.novelty_

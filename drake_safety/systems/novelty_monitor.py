@@ -37,11 +37,10 @@ class NoveltyMonitor(FloatSystem, LeafSystem):
     Every step of training it predicts the state from the last inputs, and updates the charts of
     :class:`~drake_safety.learning.innovation.Innovation`. ``levels`` has five numbers in units of
     their limits: repeated inputs, the sums of the distance of x and of the innovation's norm, the
-    fast and the slow chart. When
-    one exceeds 1, ``alarm`` becomes 1 and stays so until the Context is reset, and ``alarm_cause``
-    says what was seen. While ``hold`` is above 0.5, as during a recovery step that training does
-    not have, the charts wait. Innovation and novelty are a parameter of the Context, see
-    :meth:`adopt`.
+    fast and the slow chart. When one exceeds 1, ``alarm`` becomes 1 and stays so until the Context
+    is reset, and ``alarm_cause`` says what was seen. While ``hold`` is above 0.5, as during a
+    recovery step that training does not have, the charts wait. Innovation and novelty are a
+    parameter of the Context, see :meth:`adopt`.
 
     Args:
         assessment: A fitted assessment.
