@@ -18,7 +18,6 @@ from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
-from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.sampling import calm_start
@@ -162,7 +161,7 @@ class Balancing(LeggedLoop):
         return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
     @classmethod
-    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Removes the ball from both diagrams if the variation's engine does not support it."""
         if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
             return {}

@@ -28,7 +28,6 @@ from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import GoalWords
-from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.contract import Finding, failed, passed
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -196,7 +195,7 @@ class Walking(LeggedLoop):
         self.finish(builder)
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
         policy = read_policy_file(policy_file(scenario))
         return [*super().model_files(scenario), *policy.files, policy.network]
@@ -360,7 +359,7 @@ class Walking(LeggedLoop):
         return np.zeros(3)  # Commands are in the heading frame, wherever the feet are.
 
 
-def policy_file(scenario: LoopScenario, name: str | None = None) -> Path:
+def policy_file(scenario: Scenario, name: str | None = None) -> Path:
     """A policy file, relative to the folder of a scenario's robot.
 
     Args:

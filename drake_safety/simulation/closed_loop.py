@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.segments import RECORDED
 from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
 if TYPE_CHECKING:
-    from drake_safety.robots.robot import PlantVariation
+    from drake_safety.simulation.scenario import Scenario
 
 RECORDED_PORTS = RECORDED
 """Output ports recorded in episodes."""
@@ -34,38 +33,6 @@ _SIZED_BY = {
     "features": "feature_names",
     "margins": "constraint_names",
 }
-
-
-class LoopScenario(Protocol):
-    """The part of a :class:`~drake_safety.simulation.scenario.Scenario` that a loop reads."""
-
-    name: str
-    task: str
-    robot: str
-    episode_duration_s: float
-    step_s: float
-    time_step_s: float
-    control_period_s: float
-    on_alarm: str
-    assessment: AssessmentParameters
-    parameters: Any
-
-    @property
-    def num_steps(self) -> int:
-        """Rows after the first one of a whole episode."""
-
-    @property
-    def preview_step_s(self) -> float:
-        """Time between two samples of the preview [s]."""
-
-    def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name."""
-
-    def simulation_hash(self, variation: str = "nominal") -> str:
-        """A digest of all parameters that determine a rollout."""
-
-    def code_digest(self) -> str:
-        """A digest of the code that simulates."""
 
 
 class ClosedLoop(FloatSystem, Diagram):
@@ -119,7 +86,7 @@ class ClosedLoop(FloatSystem, Diagram):
     feature_names: list[str]
     constraint_names: list[str]
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
         self.scenario = scenario
         self.variation_name = variation
@@ -127,7 +94,7 @@ class ClosedLoop(FloatSystem, Diagram):
         self.assessment = assessment
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -20,7 +20,6 @@ from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import InputShift
-from drake_safety.simulation.closed_loop import LoopScenario
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
@@ -28,6 +27,9 @@ from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
+
+if TYPE_CHECKING:
+    from drake_safety.simulation.scenario import Scenario
 
 UPDATE_TICK = 0.25
 """Time between two systems that update one after the other, as a share of the plant's step.
@@ -99,7 +101,7 @@ class LeggedLoop(PlannedLoop):
 
     view: View = View()
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: "Scenario", variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
@@ -107,7 +109,7 @@ class LeggedLoop(PlannedLoop):
         self._push_source: PushSource | None = None
 
     @classmethod
-    def model_files(cls, scenario: LoopScenario) -> list[Path]:
+    def model_files(cls, scenario: "Scenario") -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
 

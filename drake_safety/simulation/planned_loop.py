@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
@@ -14,12 +14,15 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.inputs import is_rate
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop, LoopScenario
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
+
+if TYPE_CHECKING:
+    from drake_safety.simulation.scenario import Scenario
 
 
 class PlannedLoop(ClosedLoop):
@@ -43,12 +46,12 @@ class PlannedLoop(ClosedLoop):
     judging_options: Mapping[str, Any] = MappingProxyType({})
     paper_options: Mapping[str, Any] = MappingProxyType({})
 
-    def __init__(self, scenario: LoopScenario, variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
         self.monitor_period_s = scenario.control_period_s
 
     @classmethod
-    def pairing_options(cls, scenario: LoopScenario, variation: str) -> dict[str, Any]:
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Options with which an actual variation and its nominal twin can start alike."""
         del scenario, variation
         return {}
