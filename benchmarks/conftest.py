@@ -70,8 +70,7 @@ def episodes_folder(pytestconfig: pytest.Config, scenario: Scenario, num_episode
             )
         name = f"{SCENARIO}-{scenario.simulation_hash()[:16]}"
         folder = pytestconfig.cache.mkdir("episodes") / name
-        # Costs hardly depend on which code has simulated the episodes.
-        run_episodes(scenario, num_episodes, path=folder, accept_code_change=True)
+        run_episodes(scenario, num_episodes, path=folder)
     return folder
 
 

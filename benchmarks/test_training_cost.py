@@ -54,7 +54,7 @@ def fit_cost(mode: str, folder: Path, num_episodes: int) -> dict[str, Any]:
     stages: dict[str, float] = {}
     started = last = time.process_time()
 
-    def progress(stage: str, fraction: float) -> None:
+    def progress(stage: str, done: int, wanted: int) -> None:
         nonlocal last
         now = time.process_time()
         stages[stage] = stages.get(stage, 0.0) + now - last

@@ -2,8 +2,7 @@
 
 import math
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -49,7 +48,7 @@ class Balancing(LeggedLoop):
 
     Parameters = BalancingParameters
     # "We also add a random offset to the initial state to simulate the disturbances": no ball.
-    paper_options = MappingProxyType({"ball": False})
+    paper_options: ClassVar[dict[str, Any]] = {"ball": False}
     online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
@@ -127,9 +126,8 @@ class Balancing(LeggedLoop):
         if recovery:
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
-        physics.connect_servos(
-            builder, kinematics.joint_names, controller.GetOutputPort("desired_joint_state")
-        )
+        command = self._delayed(builder, controller.GetOutputPort("desired_joint_state"))
+        physics.connect_servos(builder, kinematics.joint_names, command)
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
         self._watch(

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -54,7 +54,7 @@ class Reaching(LeggedLoop):
     """
 
     Parameters = ReachingParameters
-    judging_options = MappingProxyType({"exploring": False})
+    judging_options: ClassVar[dict[str, Any]] = {"exploring": False}
     # "We do not sample an offset and do not add it to the initial state since we do not consider
     # disturbances here."
     paper_options = judging_options
@@ -124,7 +124,8 @@ class Reaching(LeggedLoop):
         )
         self._controller = controller
         self._connect_controller(builder, controller, measured)
-        physics.connect_torques(builder, controller.GetOutputPort("actuation"))
+        torques = self._delayed(builder, controller.GetOutputPort("actuation"))
+        physics.connect_torques(builder, torques)
         self._add_push_source(builder)
 
         clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)

@@ -1,10 +1,9 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -65,7 +64,7 @@ class Walking(LeggedLoop):
     Parameters = WalkingParameters
     angular_constraints = WalkingSafeSet.angular_names
     # Commands are judged before the robot walks, and pushes are those of a run.
-    judging_options: Mapping[str, Any] = MappingProxyType({"disturbed": False})
+    judging_options: ClassVar[dict[str, Any]] = {"disturbed": False}
     online_parameters = (
         "guard",
         "recovery",
@@ -144,9 +143,8 @@ class Walking(LeggedLoop):
             command = branches.command(command)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
-            PolicyController(
-                self.kinematics, self.policy, offset_s=2 * self.tick_s
-            ),  # After guard or trigger.
+            # After guard or trigger.
+            PolicyController(self.kinematics, self.policy, offset_s=2 * self.tick_s),
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
@@ -160,6 +158,7 @@ class Walking(LeggedLoop):
                 measured=measured,
                 command=desired["desired_output"],
             )
+        joint_state = self._delayed(builder, joint_state)
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
         self._watch(

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.assessment_parameters import AssessmentParameters
     from drake_safety.learning.segments import Episode, Episodes
+    from drake_safety.robots.shift import Fault
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.contract import check_contract
     from drake_safety.simulation.episode_start import EpisodeStart
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from drake_safety.systems.novelty_monitor import NoveltyMonitor
     from drake_safety.systems.recovery_switch import RecoverySwitch
     from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
+    from drake_safety.systems.sensor_faults import SensorFaults
 
 __all__ = [
     "AddSafetyAssessor",
@@ -29,11 +31,13 @@ __all__ = [
     "Episode",
     "EpisodeStart",
     "Episodes",
+    "Fault",
     "NoveltyMonitor",
     "RecoverySwitch",
     "SafetyAssessment",
     "SafetyAssessor",
     "Scenario",
+    "SensorFaults",
     "__version__",
     "check_contract",
     "inputs_at",
@@ -78,11 +82,13 @@ _HOMES = {
     "Episode": "drake_safety.learning.segments",
     "EpisodeStart": "drake_safety.simulation.episode_start",
     "Episodes": "drake_safety.learning.segments",
+    "Fault": "drake_safety.robots.shift",
     "NoveltyMonitor": "drake_safety.systems.novelty_monitor",
     "RecoverySwitch": "drake_safety.systems.recovery_switch",
     "SafetyAssessment": "drake_safety.learning.assessment",
     "SafetyAssessor": "drake_safety.systems.safety_assessor",
     "Scenario": "drake_safety.simulation.scenario",
+    "SensorFaults": "drake_safety.systems.sensor_faults",
     "check_contract": "drake_safety.simulation.contract",
     "inputs_at": "drake_safety.simulation.rollouts",
     "load_assessment": "drake_safety.assessments",

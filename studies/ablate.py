@@ -13,7 +13,6 @@ from rich.table import Table
 
 from drake_safety.cli.console import (
     ScenarioArgument,
-    Stages,
     TrainingOption,
     WorkersOption,
     console,
@@ -30,6 +29,7 @@ from drake_safety.cli.training_folder import (
     fresh_episodes_folder,
     load_assessment,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from studies import command_line
 
@@ -81,7 +81,6 @@ def ablate(
     to compare the definitions of n_f.
     """
     from drake_safety.evaluation.figure_style import save
-    from drake_safety.simulation.capabilities import rate_names
     from drake_safety.simulation.dataset import load_episodes
     from drake_safety.simulation.scenario import load_scenario
     from studies.ablation import list_variants
@@ -108,7 +107,7 @@ def ablate(
         base,
         num_training,
         state_names=training.info.state_names,
-        rate_names=rate_names(loop),
+        rate_names=loop.rate_names,
         quick=quick,
     )
     name = "ablation_quick" if quick else "ablation"
@@ -177,14 +176,13 @@ def _sets(
     num_calibration: int,
     seeds: dict[str, int],
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
 ) -> AblationSets:
     """The training episodes and fresh ones, which are simulated and kept as needed."""
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
     from studies.ablation import AblationSets, EpisodeSet
 
-    judging = judging_options(scenario.task_class())
+    judging = scenario.task_class().judging_options
 
     def fresh(what: str, count: int, own_seed: int) -> EpisodeSet:
         path = fresh_episodes_folder(folder, scenario.simulation_hash(), own_seed, judging)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
-from drake_safety.evaluation.scorers import StageProgress
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Assessments, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import FeedbackSet

@@ -10,7 +10,6 @@ from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.segments import Episodes, split
-from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, batches, parallel_map
@@ -94,7 +93,7 @@ def simulate_truth(
         ValueError: The task has no such plane.
     """
     loop = scenario.make_loop()
-    planes = require(loop, HasStatePlanes).state_planes
+    planes = loop.state_planes
     if plane not in planes:
         raise ValueError(
             f"task '{type(loop).__name__}' has no state plane '{plane}'; it has {list(planes)}"
@@ -127,7 +126,7 @@ def _outcomes(
     scenario: Scenario, plane: str, indices: list[int], points: np.ndarray
 ) -> dict[int, tuple]:
     loop = worker_loop(scenario, "nominal", {})
-    start = require(loop, HasStatePlanes).state_planes[plane].start
+    start = loop.state_planes[plane].start
     found = {}
     for index, point in zip(indices, points, strict=True):
         episode = run_episode(loop, index, start=start(point))

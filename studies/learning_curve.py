@@ -36,9 +36,10 @@ from drake_safety.evaluation.plan_study import (
     verdict_estimates,
 )
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Table, rows_of
 from drake_safety.evaluation.verdict_tables import TARGETS
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import score_threshold

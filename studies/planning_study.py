@@ -15,7 +15,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
-from drake_safety.simulation.capabilities import OffersPlans, judging_options, require
+from drake_safety.simulation.capabilities import OffersPlans, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import episode_rng, episodes_info, run_episode, worker_loop
@@ -102,7 +102,7 @@ def run_trials(
         ValueError: The task offers no plans or only one, too few starts are undisturbed, or the
             folder holds other motions.
     """
-    options = judging_options(scenario.task_class())
+    options = scenario.task_class().judging_options
     loop = scenario.make_loop(**options)
     context = loop.CreateDefaultContext()
     indices: list[int] = []
@@ -205,7 +205,7 @@ def _motion_batch(
     scenario: Scenario, seed: int, num_plans: int, index: int, candidates: list[int]
 ) -> tuple[int, list[tuple[int, Episode]]]:
     """Executes candidates of a start that exist; returns also the number requested."""
-    loop = worker_loop(scenario, "nominal", judging_options(scenario.task_class()))
+    loop = worker_loop(scenario, "nominal", scenario.task_class().judging_options)
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     there = [i for i in candidates if i < len(plans)]
     return len(candidates), [(i, run_episode(loop, index, seed=seed, plan=plans[i])) for i in there]

@@ -28,7 +28,6 @@ from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.capabilities import judging_options, paper_options
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -132,7 +131,7 @@ def readings_of(scenario: Scenario) -> list[Reading]:
     if any(getattr(start, "tracking_offset_m", ())):
         offset = {"tracking_offset_m": [0.0, 0.0, 0.0]}
         singles.append(Reading(name="no offset between plan and state", start=offset))
-    if paper_options(scenario.task_class()):
+    if scenario.task_class().paper_options:
         singles.append(Reading(name="disturbed episodes", is_exploring=True))
     singles = [
         one
@@ -236,7 +235,7 @@ class _EpisodeSets:
 
     def training(self, count: int) -> Episodes:
         """The first training episodes."""
-        options = paper_options(self._scenario.task_class())
+        options = self._scenario.task_class().paper_options
         if not self._is_own:
             mode = "sharpened" if self._reading.is_exploring else "paper"
             episodes = load_episodes(episodes_folder(self._folder, mode))
@@ -254,7 +253,7 @@ class _EpisodeSets:
         """Fresh episodes, as `evaluate` draws them."""
         seed = self._seeds[purpose]
         if self._is_own:
-            options = judging_options(self._scenario.task_class())
+            options = self._scenario.task_class().judging_options
             return self._run(purpose, count, seed, options)
         progress = partial(self._stages, f"episodes, {purpose}")
         episodes = run_fresh_episodes(

@@ -184,7 +184,7 @@ def learned_row(
     cpu_s = dict.fromkeys(STAGES, 0.0)
     last = time.process_time()
 
-    def progress(stage: str, fraction: float) -> None:
+    def progress(stage: str, done: int, wanted: int) -> None:
         nonlocal last
         now = time.process_time()
         cpu_s[stage if stage in cpu_s else STAGES[-1]] += now - last

@@ -20,7 +20,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN
 from drake_safety.learning.segments import split
-from drake_safety.simulation.capabilities import judging_options
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 from studies.cards import write_card
@@ -182,7 +181,7 @@ def first_verdicts(
         seed=seed,
         num_workers=num_workers,
         progress=progress,
-        **judging_options(scenario.task_class()),
+        **scenario.task_class().judging_options,
     )
     entries: list[dict[str, Any]] = [
         {"episode": episode.index, "cause": episode.cause} for episode in episodes

@@ -29,7 +29,6 @@ from drake_safety.cli.training_folder import (
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.learning.seeds import EVALUATION
-from drake_safety.simulation.capabilities import HasStatePlanes, require
 from drake_safety.simulation.scenario import load_scenario
 from studies import command_line
 from studies.known_truth import agreement, random_plan_estimates, simulate_truth
@@ -56,7 +55,9 @@ def truth(
     """
     loaded = load_scenario(scenario)
     loop = loaded.make_loop()
-    planes = require(loop, HasStatePlanes, "truth").state_planes
+    planes = loop.state_planes
+    if not planes:
+        raise ValueError(f"truth: task '{type(loop).__name__}' has no state planes")
     assessments = {mode: load_assessment(assessment, mode) for mode in MODES}
     for gamma in assessments.values():
         check_fresh(gamma, loaded, (seed,))

@@ -23,7 +23,8 @@ from drake_safety.cli.training_folder import MODES, episodes_folder, load_assess
 from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.scorers import StageProgress, classifier_scorers
+from drake_safety.evaluation.scorers import classifier_scorers
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes

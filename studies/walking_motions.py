@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.walking_parameters import profile
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import replacing
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
@@ -215,12 +216,8 @@ def run_motions(
     if progress is not None:
         progress(done, len(indices))
     for motion in run_batches(
-        _batch,
+        partial(_batch, scenario, variation, assessment, options or {}, kind, seed, duration_s),
         wanted,
-        lambda batch: (
-            *(scenario, variation, assessment, options or {}),
-            *(kind, seed, duration_s, batch),
-        ),
         progress=progress,
         num_done=done,
     ):

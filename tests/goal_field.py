@@ -41,7 +41,7 @@ class GoalTask:
 class FieldAssessment:
     """Γ of a goal is a given function of it: `gamma(goals (N, 3)) -> (N,)`."""
 
-    parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=0.02)
+    parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=0.02, is_sharpened=True)
 
     def __init__(self, gamma, unknown=0.3):
         self._gamma = gamma

@@ -276,16 +276,14 @@ def test_the_feedback_belief_is_the_average_with_an_uncertainty_that_decays():
     grid = Grid(resolution=2, cell_length=1.0)
     certain = from_scores(np.array([0.0, 1.0, 1.0]), 0.0, np.array([-1, 0, 0]), 1)
     cells = np.array([0, 0, 3])
-    pair = np.array([0, 0, 1])
-    beliefs = adaptation.feedback_beliefs(certain, cells, grid, AdaptationParameters(), pair)
+    beliefs = adaptation.feedback_beliefs(certain, cells, grid, AdaptationParameters())
     mu = 0.3 * np.exp(-0.4)
     np.testing.assert_allclose(beliefs[0], [0.5 * (1 - mu), 0.5 * (1 - mu), mu, 0.5 * (1 - mu)])
     np.testing.assert_allclose(beliefs[3], [0.0, 0.7, 0.3, 0.7])
     np.testing.assert_array_equal(beliefs[1], [*EMPTY, 0.0])
-    for count, number in (("segments", 3), ("pairs", 2)):
-        literal = AdaptationParameters(count=count)
-        beliefs = adaptation.feedback_beliefs(certain, cells, grid, literal, pair)
-        np.testing.assert_allclose(beliefs[[0, 3], 2], 0.3 * np.exp(-0.4 * (number - 1)))
+    literal = AdaptationParameters(count="segments")
+    beliefs = adaptation.feedback_beliefs(certain, cells, grid, literal)
+    np.testing.assert_allclose(beliefs[[0, 3], 2], 0.3 * np.exp(-0.4 * 2))
 
 
 def test_prior_and_feedback_are_fused_by_hand_worked_weights():

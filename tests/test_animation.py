@@ -50,7 +50,7 @@ def test_a_gif_shows_every_instant_in_real_time(loop, tmp_path):
 
 def test_logs_that_do_not_fit_are_refused(loop, tmp_path):
     time_s, positions, gamma = log_of(loop)
-    with pytest.raises(ValueError, match="11 instants, 11 positions and 10 values of Γ"):
+    with pytest.raises(ValueError, match="11 instants, 11 positions and 10 probabilities"):
         save_animation(loop, time_s, positions, gamma[:-1], 0.5, tmp_path / "run.gif")
     with pytest.raises(ValueError, match="frames_per_second must be positive; got 0"):
         save_animation(

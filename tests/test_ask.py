@@ -137,7 +137,7 @@ def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(call, fol
     assert words in told
     assert "x 0.45…1, y -0.3…1.3, z 0.5…1.6 m" in told
     # The number that may follow is of another target, which may be suggested.
-    assert "Γ" not in told.partition("nearest accepted")[0]
+    assert "probability" not in told.partition("nearest accepted")[0]
     assert "belief" not in told
 
 

@@ -1,13 +1,10 @@
 """Files of assessments: what is saved is loaded to the bit, and what is damaged is refused."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
-from safetensors import safe_open
 
-from drake_safety.learning import assessment_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.calibration import calibrate
@@ -111,78 +108,6 @@ def test_every_flipped_bit_is_noticed(assessment, tmp_path):
         path.write_bytes(damaged.tobytes())
         with pytest.raises(ValueError, match=r"assessment\.safetensors"):
             SafetyAssessment.load(path)
-
-
-def forged(path, change):
-    """Writes the file again after `change(entries, tensors)`, with the digest that fits."""
-    from safetensors.numpy import load_file, save_file
-
-    with safe_open(path, framework="numpy") as file:
-        entries = json.loads(file.metadata()[SCHEMA])
-    tensors = load_file(path)
-    del entries["sha256"]
-    change(entries, tensors)
-    entries["sha256"] = assessment_file._digest(entries, tensors)
-    save_file(tensors, path, {SCHEMA: json.dumps(entries)})
-
-
-def set_entry(name, value):
-    *keys, last = name.split(".")
-
-    def change(entries, tensors):
-        for key in keys:
-            entries = entries[int(key) if key.isdigit() else key]
-        entries[last] = value
-
-    return change
-
-
-def scale_beliefs(factor):
-    def change(entries, tensors):
-        tensors["beliefs"] = tensors["beliefs"] * factor
-
-    return change
-
-
-def rename_tensor(name, new):
-    def change(entries, tensors):
-        tensors[new] = tensors.pop(name)
-
-    return change
-
-
-@pytest.mark.parametrize("assessment", ["sharpened"], indirect=True)
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (scale_beliefs(5.0), "its beliefs are not masses that sum to 1"),
-        (scale_beliefs(np.nan), "its beliefs has entries that are not finite numbers"),
-        (
-            rename_tensor("embedding.trunk.1.bias", "embedding.Mrunk.1.bias"),
-            r"unexpected \['Mrunk.1",
-        ),
-        (rename_tensor("embedding.safety.0.bias", "spare"), "safety.0.bias"),
-        (rename_tensor("training_nearest", "spare"), r"the unknown tensors \['spare'\]"),
-        (set_entry("numbers.base_logit.offset", "a"), r"its base_logit.offset is 'a', expected"),
-        (set_entry("numbers.base_logit.offset", np.nan), "its base_logit.offset is nan"),
-        (set_entry("numbers.novelty_limits", [1.0, 1.0, -1.0]), "expected 3 positive numbers"),
-        (set_entry("parameters.resolution", "3"), "its parameters.resolution is '3'"),
-        (set_entry("parameters.paper.stride", 1.5), "its paper.stride is 1.5"),
-        (set_entry("info.state_names", [1, 2]), r"its info.state_names is \[1, 2\]"),
-        (set_entry("info.surplus", 1), "its info has no field 'surplus'"),
-        (set_entry("parameters", 3), "damaged"),
-        (set_entry("numbers", None), "damaged"),
-    ],
-)
-def test_a_forged_file_is_refused(assessment, tmp_path, change, message):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
-    forged(path, lambda entries, tensors: None)
-    SafetyAssessment.load(path)
-    forged(path, change)
-    with pytest.raises(ValueError, match=message) as caught:
-        SafetyAssessment.load(path)
-    assert f"'{path}' is a damaged safety assessment" in str(caught.value)
 
 
 def test_the_same_assessment_gives_the_same_bytes(assessment, tmp_path):

@@ -12,13 +12,7 @@ from drake_safety.simulation.capabilities import (
     FollowsCommands,
     HasBall,
     HasGoals,
-    HasMirrorImage,
-    HasStatePlanes,
     OffersPlans,
-    angular_constraints,
-    judging_options,
-    pairing_options,
-    rate_names,
     require,
 )
 from drake_safety.simulation.rollouts import run_episode
@@ -33,8 +27,6 @@ ASKED = (
     FollowsCommands,
     OffersPlans,
     CanStartAnywhere,
-    HasStatePlanes,
-    HasMirrorImage,
 )
 HAS = {
     "laikago_balancing": {HasBall, CanFall, OffersPlans, CanStartAnywhere},
@@ -44,10 +36,9 @@ HAS = {
         CanBePushed,
         OffersPlans,
         CanStartAnywhere,
-        HasMirrorImage,
     },
     "go2_walking": {HasGoals, CanFall, CanBePushed, FollowsCommands, CanStartAnywhere},
-    "pendulum": {CanStartAnywhere, HasStatePlanes},
+    "pendulum": {CanStartAnywhere},
 }
 
 
@@ -59,7 +50,7 @@ def test_a_task_of_the_package_has_what_it_says_and_no_more(name):
 
 def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
     loop = Shuttling(shuttling())
-    for capability in (HasGoals, CanBePushed, OffersPlans, CanFall, HasMirrorImage):
+    for capability in (HasGoals, CanBePushed, OffersPlans, CanFall):
         assert require(loop, capability) is loop
 
 
@@ -68,7 +59,6 @@ def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
     [
         (HasBall, "ball to throw"),
         (CanStartAnywhere, "episodes from a given start"),
-        (HasStatePlanes, "state planes"),
     ],
 )
 def test_what_a_task_lacks_is_told_with_what_was_asked_and_what_it_has(capability, lacked):
@@ -80,27 +70,34 @@ def test_what_a_task_lacks_is_told_with_what_was_asked_and_what_it_has(capabilit
         require(Gliding(gliding()), capability)
 
 
+def test_asking_for_what_a_task_has_evaluates_none_of_its_properties():
+    class Counting(Shuttling):
+        @property
+        def target_box(self):
+            raise AssertionError("evaluated")
+
+    assert isinstance(Counting(shuttling()), HasGoals)
+
+
 def test_every_required_capability_has_a_description():
     assert set(ASKED) == set(capabilities._DESCRIPTIONS)
 
 
 def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
     loop = Gliding(gliding())
-    assert angular_constraints(loop) == ()
-    assert rate_names(loop) == []
-    assert judging_options(Gliding) == {}
-    assert pairing_options(gliding(), "actual") == {}
+    assert loop.angular_constraints == ()
+    assert loop.rate_names == []
+    assert Gliding.judging_options == {}
+    assert gliding().task_class().pairing_options(gliding(), "actual") == {}
+    assert loop.mirror_options == loop.state_planes == {}
+    assert list(loop.check_files(loop.scenario, None)) == []
     assert run_episode(loop).num_controller_failures == 0
 
 
 def test_without_a_word_of_its_own_all_of_a_tasks_targets_are_fair():
-    class Plain(Shuttling):
-        fair_box = is_fair = None
-
-    loop = Plain(shuttling())
-    assert not isinstance(loop, capabilities.HasFairGoals)
+    loop = load_scenario("go2_walking").make_loop()
     np.testing.assert_array_equal(capabilities.fair_box(loop), loop.target_box)
-    assert all(capabilities.is_fair(loop, run_episode(loop, index)) for index in range(3))
+    assert capabilities.is_fair(loop, None)
 
 
 def test_a_goal_outside_the_fair_box_is_not_fair():

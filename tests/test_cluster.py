@@ -1,10 +1,8 @@
 """Simulation on a cluster: a scheduler and workers in processes of their own."""
 
 import contextlib
-import dataclasses
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,10 +15,8 @@ import pytest
 from cart_episodes import ARRAYS
 from command_line import call
 from drake_safety import load_scenario, run_episodes
-from drake_safety.models import robot_files
-from drake_safety.simulation import cluster
-from drake_safety.simulation.cluster import RemoteCall, connected, local_versions, packed
-from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation import cluster, worker_processes
+from drake_safety.simulation.cluster import connected
 from gliding_task import gliding
 
 NUM_EPISODES, PATIENCE_S = 120, 60.0
@@ -31,9 +27,15 @@ pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 def start(folder, *arguments):
     command = [sys.executable, "-m", "dask", *arguments, "--scheduler-file", "scheduler.json"]
     log = (folder / f"{arguments[0]}-{time.monotonic_ns()}.log").open("w")
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     with log:
         return subprocess.Popen(
-            [*command, "--no-dashboard"], cwd=folder, stdout=log, stderr=subprocess.STDOUT
+            [*command, "--no-dashboard"],
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
         )
 
 
@@ -54,7 +56,7 @@ def running_scheduler(folder):
 
 @pytest.fixture
 def two_workers(tmp_path):
-    """A scheduler's address and two workers, which cannot import what stands beside the tests."""
+    """A scheduler's address and two workers, which can import what stands beside the tests."""
     with running_scheduler(tmp_path) as address:
         one = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
         workers = [start(tmp_path, *one) for _ in range(2)]
@@ -113,44 +115,9 @@ def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path
         pass
 
 
-@pytest.fixture
-def own_robot(tmp_path):
-    """A scenario whose robot lies in a folder of the user's."""
-    shutil.copytree(Path(robot_files("laikago")[0]).parent, tmp_path / "dog")
-    package = Path(cluster.__file__).parents[2] / "diagrams" / "laikago_balancing.yaml"
-    text = package.read_text().replace("robot: laikago", "robot: dog/robot.yaml")
-    (tmp_path / "dog_balancing.yaml").write_text(text)
-    return load_scenario(tmp_path / "dog_balancing.yaml")
-
-
-def test_a_robot_of_the_users_travels_as_its_files(own_robot, tmp_path):
-    found = []
-
-    def keep(scenario):
-        found.append(scenario)
-
-    parcel = packed(own_robot)
-    assert str(tmp_path) not in parcel.text
-    RemoteCall(function=keep, versions=local_versions())(parcel)
-    (there,) = found
-    assert isinstance(there, Scenario)
-    assert not Path(there.robot).is_relative_to(tmp_path)
-    for variation in own_robot.variations:
-        assert there.simulation_hash(variation) == own_robot.simulation_hash(variation)
-    changed = dataclasses.replace(parcel, text=parcel.text + "# changed\n")
-    assert changed.digest != parcel.digest
-
-
-def test_a_folder_that_is_too_large_is_refused(own_robot, monkeypatch):
-    monkeypatch.setattr(cluster, "_LARGEST_PARCEL", 1000)
-    with pytest.raises(ValueError, match="its robot's folder and its task have"):
-        packed(own_robot)
-
-
 def test_a_worker_with_other_versions_is_refused_by_name():
-    call = RemoteCall(function=print, versions=local_versions() | {"drake": "0.1"})
     with pytest.raises(ValueError, match=r"has drake 1\S+, expected 0.1, as here"):
-        call()
+        worker_processes._called({"drake": "0.1"}, print)
 
 
 @pytest.mark.train

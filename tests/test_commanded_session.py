@@ -5,7 +5,7 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
-from drake_safety.live.commanded_session import LiveCommands
+from drake_safety.live.task_sessions import LiveCommands
 from live_scenarios import quick
 
 pytestmark = pytest.mark.train
@@ -28,7 +28,7 @@ def ticks(session, *names, num=1):
 
 
 def test_keys_change_the_command_within_the_range_of_training(session):
-    ticks(session, session.STAND)
+    ticks(session, session.START)
     np.testing.assert_array_equal(session.command, np.zeros(3))
     ticks(session, "Faster", "Turn left")
     high = session.loop.target_box[1]
@@ -43,7 +43,7 @@ def test_keys_change_the_command_within_the_range_of_training(session):
 
 
 def test_without_the_guard_what_is_asked_is_passed_on(session):
-    ticks(session, session.STAND, session.GUARD)
+    ticks(session, session.START, session.GUARD)
     assert not session.is_guarded
     ticks(session, *["Faster"], num=4)
     asked = session.loop.GetOutputPort("desired_output").Eval(session.context)
@@ -54,12 +54,12 @@ def test_without_the_guard_what_is_asked_is_passed_on(session):
 
 
 def test_a_push_moves_the_robot_and_a_fall_is_followed_by_standing(session):
-    ticks(session, session.STAND, num=3)
+    ticks(session, session.START, num=3)
     before = session.loop.GetOutputPort("output").Eval(session.context).copy()
     ticks(session, session.PUSH, num=5)
     after = session.loop.GetOutputPort("output").Eval(session.context)
     assert np.linalg.norm((after - before)[:2]) > 0.5
     assert "pushed with" in session.panel.status.note
-    session._lies_until_s = session.context.get_time()
+    session._end_s = session.context.get_time()
     ticks(session)
     assert session.context.get_time() < 0.1

@@ -139,7 +139,7 @@ def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
         segments, has_target = segments_for(episodes, parameters)
         x = segments.state
         grid = Grid(resolution=14, cell_length=10.0)
-        learned[backend], _, _ = learned_maps(segments, has_target, x, grid, parameters, None)
+        learned[backend], _ = learned_maps(segments, has_target, x, grid, parameters, None)
         assert bool(asked) == (backend == "tslearn")
     assert learned["tslearn"].is_same(learned["dtaidistance"])
     with pytest.raises(ValueError, match=r"distance_backend is fast, expected one of .*tslearn"):

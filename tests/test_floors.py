@@ -32,8 +32,9 @@ ALLOWED["planning"] = {*ALLOWED["simulation"], "simulation"}
 ALLOWED["diagrams"] = ALLOWED["logs"] = ALLOWED["planning"]
 ALLOWED["evaluation"] = ALLOWED["live"] = {*ALLOWED["planning"], "planning"}
 ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessments"}
-# Every room may name the extra that it needs.
-ALLOWED["extras"] = set()
+# Every room may name the extra that it needs, and write files.
+EVERYWHERE = ("extras", "files")
+ALLOWED |= {"extras": set(), "files": set()}
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "pyarrow", "matplotlib"}
@@ -58,12 +59,13 @@ EXTRAS = {
     "walking": ("drake_safety/control/policy_network.py",),
 }
 ONLY_IN = {
+    "cloudpickle": ("drake_safety/simulation/worker_processes.py",),
     "torch": ("drake_safety/learning/embedding.py", "drake_safety/control/policy_network.py"),
     "tslearn": ("drake_safety/learning/distance.py",),
     "dtaidistance": ("drake_safety/learning/distance.py",),
     "mujoco": ("drake_safety/plants/mujoco_model.py",),
 }
-PICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal"}
+PICKLING = {"pickle", "cPickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}
 PORT_WORDS = re.compile(r"LeafSystem|VectorSystem|Declare\w*Port|Export(In|Out)put")
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "manager", "managers", "data"}
@@ -150,7 +152,7 @@ def upward_imports(source, name):
         if target is not None and target not in ALLOWED:
             if target != "__version__":
                 offences.append(f"{name}:{line} imports {dotted}: import it from its own room")
-        elif target not in {None, room, "extras"} | ALLOWED.get(room, set()):
+        elif target not in {None, room, *EVERYWHERE} | ALLOWED.get(room, set()):
             offences.append(f"{name}:{line} in {room} imports {dotted}")
     return offences
 

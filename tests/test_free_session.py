@@ -12,8 +12,8 @@ from cart_pole_task import SCENARIO, CartPole
 from command_line import call
 from drake_safety import AddSafetyAssessor, SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli.training_folder import assessment_file
-from drake_safety.live.free_session import LiveEpisodes
-from drake_safety.live.session import BREAK_S, STOP, TICK_S, LiveGoals
+from drake_safety.live.session import BREAK_S, STOP, TICK_S
+from drake_safety.live.task_sessions import LiveEpisodes, LiveGoals
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.free_motion import run_free
 from drake_safety.simulation.scenario import parse_scenario
@@ -111,13 +111,13 @@ def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, mes
         session = LiveEpisodes(cart_loop, meshcat, threshold=0.5, seed=3)
         starts.append(state.Eval(session.context).copy())
         ticks(session, 0.4)
-        session.panel.click(session.NEW)
+        session.panel.click(session.START)
         session.tick()
         assert session.context.get_time() == pytest.approx(TICK_S)
         starts.append(state.Eval(session.context).copy())
     np.testing.assert_array_equal(starts[:2], starts[2:])
     assert np.abs(starts[0] - starts[1]).max() > 0.1
-    assert session.panel.buttons == {STOP: "Escape", session.NEW: "KeyR"}
+    assert session.panel.buttons == {STOP: "Escape", session.START: "KeyR"}
 
 
 def test_an_episode_whose_duration_has_passed_is_followed_by_the_next(session):
@@ -157,7 +157,7 @@ def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, 
     session = LiveEpisodes(loop, meshcat, threshold=0.5)
     assert session.panel.status.note == "no start"
     loop.mass.parameters.fails_at_start = False
-    session.panel.click(session.NEW)
+    session.panel.click(session.START)
     assert session.tick()
 
 
@@ -182,11 +182,11 @@ def test_goals_need_no_legs(shuttle_loop, meshcat):
 def test_ports_that_are_not_exported_are_named(meshcat):
     scenario = quick(gliding())
     loop = FewPorts(scenario, assessment=learned(scenario))
-    message = r"'FewPorts' exports no port \['safety_probability'"
+    message = r"'FewPorts' exports no port \['cause_probability'"
     with pytest.raises(ValueError, match=message):
         LiveEpisodes(loop, meshcat, threshold=0.5)
     with pytest.raises(ValueError, match=message):
-        run_free(loop, seed=0, duration_s=0.4, ports=("safety_probability",))
+        run_free(loop, seed=0, duration_s=0.4, ports=("cause_probability",))
 
 
 @pytest.fixture(scope="module")

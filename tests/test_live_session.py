@@ -11,13 +11,8 @@ from pydrake.geometry import Meshcat
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli import main
 from drake_safety.cli.console import LOOPBACK, open_viewer
-from drake_safety.live.session import (
-    STOP,
-    TICK_S,
-    LiveGoals,
-    LiveThrows,
-    Pace,
-)
+from drake_safety.live.session import STOP, TICK_S, Pace
+from drake_safety.live.task_sessions import LiveGoals, LiveThrows
 from live_scenarios import quick
 from reaching_targets import NEAR, made_up_episodes
 
@@ -173,7 +168,7 @@ def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
     wanted = np.array(target, dtype=float)
     after = goals.loop.GetOutputPort("output").Eval(goals.context)
     assert np.linalg.norm(after - wanted) < np.linalg.norm(before - wanted) - 0.02
-    goals.panel.click(goals.STAND)
+    goals.panel.click(goals.START)
     assert not goals.tick()
     assert goals.context.get_time() == 0.0
 

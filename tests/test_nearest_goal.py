@@ -1,5 +1,7 @@
 """The gradient leads to the nearest accepted goal, with far fewer goals judged than by search."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -115,6 +117,14 @@ def test_what_is_found_lies_in_the_region_and_a_flat_field_leads_nowhere():
     weights = {k: v * (k != "trunk.0.weight") for k, v in flat.embedding_.weights.items()}
     flat.embedding_ = Embedding(weights, num_margins=0)
     assert descend(GoalTask(), flat) is None
+
+
+def test_the_reserve_of_the_papers_mode_ends_at_its_largest_probability():
+    paper = PlaneAssessment()
+    shape = paper._gamma
+    paper._gamma = lambda goals: 0.7 * shape(goals)
+    paper.parameters = SimpleNamespace(**vars(paper.parameters) | {"is_sharpened": False})
+    assert 0.66 <= search(GoalTask(), paper).probability <= 0.7
 
 
 def test_a_suggestion_is_as_near_as_that_of_the_search_with_fewer_goals_judged():

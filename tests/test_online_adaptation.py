@@ -83,8 +83,7 @@ def run(duration_s, capacity=400, monitor=None, **settings):
     ("settings", "numbers"),
     [
         ({"update_interval": 2}, [2, 4]),
-        ({"update_interval": 8, "update_unit": "segments"}, [2, 4]),
-        ({"update_interval": 12, "update_unit": "segments"}, [3]),
+        ({"update_interval": 3}, [3]),
         ({"update_interval": 6}, []),
     ],
 )

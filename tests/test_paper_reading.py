@@ -15,7 +15,7 @@ from drake_safety.learning.embedding import MapData, stack_members, train_map
 from drake_safety.learning.inputs import inputs, is_rate, num_inputs
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.training import segments_for
-from lip_assessments import QUICK, worse
+from lip_assessments import QUICK
 from lip_episodes import make_episodes
 
 
@@ -147,22 +147,6 @@ def test_standardised_inputs_make_the_map_independent_of_units():
         assert np.allclose(one, other, atol=1e-3) == standardized
 
 
-@pytest.mark.train
-def test_the_discrepancy_is_predicted_where_t_sne_has_put_the_segments(episodes, tmp_path):
-    settings = AdaptationParameters(discrepancy_at="tsne")
-    prior = SafetyAssessment(paper(adaptation=settings, paper=PaperReading(epochs=2)))
-    prior.fit(episodes)
-    assert prior.training_.target.shape == (len(prior.training_.score), 2)
-    prior.save(tmp_path / "paper.safetensors")
-    loaded = SafetyAssessment.load(tmp_path / "paper.safetensors")
-    np.testing.assert_array_equal(loaded.training_.target, prior.training_.target)
-    assert loaded.parameters == prior.parameters
-    feedback = worse()
-    adapted = loaded.adapt(feedback)
-    prior.training_ = replace(prior.training_, target=None)
-    assert not np.array_equal(adapted.beliefs_, prior.adapt(feedback).beliefs_)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -174,8 +158,6 @@ def test_the_discrepancy_is_predicted_where_t_sne_has_put_the_segments(episodes,
         (lambda: paper(exaggeration=0.5), "exaggeration is 0.5, expected >= 1"),
         (lambda: paper(initialization="pca"), "initialization is pca, expected one of"),
         (lambda: AdaptationParameters(count="all"), "count is all, expected one of"),
-        (lambda: AdaptationParameters(update_unit="cell"), "update_unit is cell, expected one of"),
-        (lambda: AdaptationParameters(discrepancy_at="y"), "discrepancy_at is y, expected one of"),
     ],
 )
 def test_a_reading_that_does_not_exist_is_refused_with_those_that_do(make, message):

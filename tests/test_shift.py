@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import load_scenario
 from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.robots.shift import InputShift, JointShift, Shift
+from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.rollouts import run_episode
 
 SCENARIO = "laikago_balancing"
@@ -129,21 +129,36 @@ def test_a_late_command_is_late():
 @pytest.mark.parametrize(
     ("fault", "seen"),
     [
-        (InputShift(velocity_scale=0.0), lambda s, t: np.allclose(_rates(s), 0.0)),
         (
-            InputShift(joint_bias_rad=0.05),
+            Fault(kind="zero", entries=[".*_w", "trunk_[wv]."]),
+            lambda s, t: np.allclose(_rates(s), 0.0),
+        ),
+        (
+            Fault(kind="bias", entries=[".*_joint_q"], value=0.05),
             lambda s, t: np.allclose(s[:, 12:24] - t[:, 12:24], 0.05, atol=0.03),
         ),
-        (InputShift(frozen_at_s=0.4), lambda s, t: len(np.unique(s[11:], axis=0)) == 1),
-        (InputShift(delay_s=0.2), lambda s, t: np.allclose(s[8:, 12], t[3:-5, 12], atol=0.02)),
+        (Fault(kind="freeze", start_s=0.4), lambda s, t: len(np.unique(s[11:], axis=0)) == 1),
+        (
+            Fault(kind="delay", value=0.2),
+            lambda s, t: np.allclose(s[8:, 12], t[3:-5, 12], atol=0.02),
+        ),
     ],
 )
 def test_a_faulty_input_does_not_change_the_motion(fault, seen):
     plain = run_episode(loop_with(None), 0, seed=5)
-    episode = run_episode(loop_with(Shift(inputs=fault)), 0, seed=5)
+    episode = run_episode(loop_with(Shift(sensor_faults=[fault])), 0, seed=5)
     np.testing.assert_array_equal(episode.true_state, plain.true_state)
     assert seen(episode.state, episode.true_state)
     assert not seen(plain.state, plain.true_state)
+
+
+def test_noise_of_a_fault_follows_from_the_episode():
+    loop = loop_with(Shift(sensor_faults=[Fault(kind="noise", entries=["FR_.*_w"], value=3.0)]))
+    first, again, other = (run_episode(loop, index, seed=5) for index in (0, 0, 1))
+    np.testing.assert_array_equal(first.state, again.state)
+    errors = [(one.state - one.true_state)[:20, 24:27] for one in (first, other)]
+    assert np.std(errors[0]) == pytest.approx(3.0, rel=0.3)
+    assert not np.allclose(*errors, atol=0.5)
 
 
 def _rates(state):
@@ -163,13 +178,13 @@ def test_a_scenario_file_can_state_a_shift(tmp_path):
     path.write_text(
         "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\nvariations:\n"
         "  nominal: {}\n  icy: {shift: {slope_rad: 0.1, joints: {.*_calf_joint: {effort_scale: "
-        "0.5}}, inputs: {delay_s: 0.1}}}\n",
+        "0.5}}, sensor_faults: [{kind: delay, value: 0.1}]}}\n",
         encoding="utf-8",
     )
     shift = load_scenario(path).variation("icy").shift
     assert shift.slope_rad == 0.1
     assert shift.joints[".*_calf_joint"].effort_scale == 0.5
-    assert shift.inputs.delay_s == 0.1
+    assert shift.sensor_faults == [Fault(kind="delay", value=0.1)]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +195,6 @@ def test_a_scenario_file_can_state_a_shift(tmp_path):
         (lambda: Shift(command_delay_s=-1.0), "command_delay_s must not be negative"),
         (lambda: Shift(holes_m={"FR": 0.0}), "holes_m of foot 'FR' must be positive"),
         (lambda: JointShift(effort_scale=0.0), "effort_scale must be positive"),
-        (lambda: InputShift(delay_s=-0.1), "delay_s must not be negative"),
     ],
 )
 def test_a_shift_that_is_none_is_refused(make, message):
@@ -193,6 +207,11 @@ def test_a_shift_that_is_none_is_refused(make, message):
     [
         (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),
         (Shift(holes_m={"tail": 0.1}), "no foot 'tail' for a hole; it has"),
+        (
+            Shift(sensor_faults=[Fault(kind="zero", entries=["elbow_q"])]),
+            "no entry 'elbow_q'",
+        ),
+        (Shift(command_delay_s=0.004), "a delay must be a multiple of the period 0.0025 s"),
     ],
 )
 def test_a_shift_of_a_part_that_does_not_exist_is_refused(shift, message):

@@ -17,7 +17,7 @@ def run():
     margins = np.column_stack([0.1 - 0.1 * time_s, np.full(len(time_s), 0.05)])
     return {
         "time_s": time_s,
-        "gamma": gamma,
+        "probability": gamma,
         "threshold": 0.6,
         "throws": [SimpleNamespace(time_s=0.98, mass_kg=3.0, speed_m_s=8.0)],
         "trigger_times_s": [1.0],
@@ -118,10 +118,10 @@ def test_margins_that_are_angles_are_drawn_in_degrees_and_say_so(run):
     np.testing.assert_allclose(drawn["support polygon"][0], 10.0)
 
 
-def test_the_timeline_needs_no_more_than_gamma(run):
-    fig = timeline_figure(run["time_s"], run["gamma"], 0.6)
+def test_the_timeline_needs_no_more_than_the_probability(run):
+    fig = timeline_figure(run["time_s"], run["probability"], 0.6)
     assert len(fig.axes) == 1
-    gaps = np.where(run["time_s"] < 0.3, np.nan, run["gamma"])
+    gaps = np.where(run["time_s"] < 0.3, np.nan, run["probability"])
     timeline_figure(run["time_s"], gaps, 0.6, stills=run["stills"]).draw_without_rendering()
 
 

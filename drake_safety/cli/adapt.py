@@ -14,7 +14,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ClusterOption,
     ScenarioArgument,
-    Stages,
     WorkersOption,
     command_line,
     console,
@@ -35,6 +34,7 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import ADAPTATION
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.learning.assessment_file import replacing
+    from drake_safety.files.atomic import replacing
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -177,7 +177,7 @@ def paired_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
 ) -> EpisodePairs:
     """Simulates pairs of actual episodes and nominal twins, and keeps them in the folder.
 
@@ -211,7 +211,7 @@ def fresh_actual_episodes(
     seed: int,
     folder: Path,
     workers: int | None,
-    stages: Stages,
+    stages: StageProgress,
     what: str = "fresh actual episodes",
 ) -> Episodes:
     """Simulates other episodes of the actual plant, and keeps them in the folder.
@@ -226,7 +226,6 @@ def fresh_actual_episodes(
         stages: Progress bars.
         what: Name of the stage.
     """
-    from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.rollouts import run_episodes
 
     return run_episodes(
@@ -238,7 +237,7 @@ def fresh_actual_episodes(
         path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
         progress=partial(stages, what),
         extra={"command": command_line()},
-        **pairing_options(scenario, variation),
+        **scenario.task_class().pairing_options(scenario, variation),
     )
 
 

@@ -79,7 +79,6 @@ def calibrate(
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
     from drake_safety.learning.segments import split
-    from drake_safety.simulation.capabilities import pairing_options
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -106,7 +105,7 @@ def calibrate(
             progress,
             workers,
             plant,
-            **pairing_options(loaded, plant),
+            **loaded.task_class().pairing_options(loaded, plant),
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}

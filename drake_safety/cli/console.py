@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shlex
 import sys
-from collections.abc import Iterator
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from drake_safety.learning import progress
-from drake_safety.learning.progress import Stages
+from drake_safety.files import progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,13 +130,12 @@ def cause_words(
         margins: Predicted margins, (n_c,) [m, rad].
     """
     from drake_safety.learning.causes import describe_margin, likely_cause
-    from drake_safety.simulation.capabilities import angular_constraints
 
     names = loop.constraint_names
     cause = likely_cause(names, masses, margins, assessment.parameters.margin_unit)
     if not cause:
         return "unknown"
-    return describe_margin(cause, margins[names.index(cause)], angular_constraints(loop))
+    return describe_margin(cause, margins[names.index(cause)], loop.angular_constraints)
 
 
 def print_path(what: str, path: Path) -> None:
@@ -178,8 +175,5 @@ def versions() -> dict[str, str]:
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")
 
 
-@contextlib.contextmanager
-def open_stages() -> Iterator[Stages]:
-    """Shows progress while the block runs: bars on a terminal, a line every 10 s elsewhere."""
-    with progress.open_stages(console) as stages:
-        yield stages
+open_stages = partial(progress.open_stages, console)
+"""Shows progress while a block runs: bars on a terminal, a line every 10 s elsewhere."""

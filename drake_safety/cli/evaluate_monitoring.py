@@ -40,11 +40,10 @@ def evaluate_pushes(
     from drake_safety.evaluation.metrics import proportion
     from drake_safety.evaluation.monitoring_study import begun
     from drake_safety.evaluation.scorers import assessment_scorer
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.pushed_motions import run_pushed_motions
 
     scenario = judged.scenario
-    options = {**judging_options(scenario.task_class()), "pushed": _PLANT}
+    options = {**scenario.task_class().judging_options, "pushed": _PLANT}
 
     def run(what: str, count: int, own_seed: int) -> list[WatchedMotion]:
         return run_pushed_motions(

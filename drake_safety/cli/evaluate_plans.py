@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -56,16 +56,10 @@ def check_options(loop: ClosedLoop, options: PlanOptions) -> None:
                 "evaluate: leave out --other-hand, --plane-x and --plane-step",
             )
         return
-    if options.other_hand and not _mirror_options(loop):
+    if options.other_hand and not loop.mirror_options:
         raise ValueError(f"evaluate: {loop.scenario.task} has no other hand: pass --other-hand 0")
     if options.plane_step and goal_words(loop).is_point:
         plane_of(loop, options.plane_x, options.plane_step)
-
-
-def _mirror_options(loop: ClosedLoop) -> dict[str, Any]:
-    from drake_safety.simulation.capabilities import HasMirrorImage
-
-    return loop.mirror_options if isinstance(loop, HasMirrorImage) else {}
 
 
 def evaluate_plans(
@@ -86,14 +80,13 @@ def evaluate_plans(
     from drake_safety.simulation.capabilities import (
         HasGoals,
         goal_words,
-        judging_options,
         require,
     )
 
     scenario, sharpened = judged.scenario, judged.sharpened
     loop = scenario.make_loop()
     words = goal_words(require(loop, HasGoals))
-    mirror = _mirror_options(loop)
+    mirror = loop.mirror_options
     test = plans_of(loop, judged.test_set)
     calibration = plans_of(loop, judged.calibration_set)
     sets = {"plans": test}
@@ -104,7 +97,7 @@ def evaluate_plans(
         # The same random draws, mirrored.
         episodes = run_set("fresh targets, other hand", num_other, **mirror)
         sets["plans.other_hand"] = plans_of(
-            scenario.make_loop(**judging_options(type(loop)), **mirror), episodes
+            scenario.make_loop(**type(loop).judging_options, **mirror), episodes
         )
     rules = _rules(judged, loop, [plans.hand for plans in sets.values()])
     twins = [key for key in sets if key != "plans"]

@@ -26,7 +26,7 @@ from drake_safety.cli.training_folder import (
 from drake_safety.learning.seeds import SHIFTS
 
 if TYPE_CHECKING:
-    from drake_safety.cli.console import Stages
+    from drake_safety.cli.console import StageProgress
     from drake_safety.evaluation.shift_study import ShiftResult
     from drake_safety.evaluation.shifted_motions import ShiftedSet
     from drake_safety.simulation.closed_loop import ClosedLoop
@@ -125,7 +125,7 @@ def _shifted_sets(
     num_motions: int,
     num_nominal: int,
     seed: int,
-    stages: Stages,
+    stages: StageProgress,
     workers: int | None,
 ) -> dict[str, ShiftedSet]:
     from drake_safety.evaluation.shifted_motions import (
@@ -135,7 +135,6 @@ def _shifted_sets(
         shifted_scenario,
     )
     from drake_safety.evaluation.shifts import plant_shifts
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
 
     nominal = run_fresh_episodes(
@@ -144,7 +143,7 @@ def _shifted_sets(
     sets = {"nominal": of_episodes("nominal", nominal)}
     loop: ClosedLoop = scenario.make_loop()
     shifts = plant_shifts(scenario, loop)
-    options = judging_options(scenario.task_class())
+    options = scenario.task_class().judging_options
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)

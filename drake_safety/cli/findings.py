@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drake_safety.cli.console import Stages
     from drake_safety.evaluation.metrics import Estimate
     from drake_safety.evaluation.scorers import Scorer
+    from drake_safety.files.progress import StageProgress
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.segments import Episodes
     from drake_safety.simulation.scenario import Scenario
@@ -42,7 +42,7 @@ class Judged:
     test_set: Episodes
     folder: Path
     workers: int | None
-    stages: Stages
+    stages: StageProgress
 
 
 @dataclass(kw_only=True)

@@ -35,7 +35,6 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
         ValueError: The task exports a port of the assessor under another name, or not at all.
     """
     from drake_safety.evaluation.timeline_figure import timeline_figure
-    from drake_safety.simulation.capabilities import angular_constraints
     from drake_safety.simulation.free_motion import run_free
 
     if settings.is_animated:
@@ -66,7 +65,7 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
         belief=motion.extra["belief"],
         margins=motion.margins,
         constraint_names=loop.constraint_names,
-        angular_constraints=angular_constraints(loop),
+        angular_constraints=loop.angular_constraints,
     )
     recording.save(
         {"timeline": timeline},

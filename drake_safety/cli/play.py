@@ -53,10 +53,8 @@ def play(
     push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
     verdict are shown.
     """
-    from drake_safety.live.commanded_session import LiveCommands
-    from drake_safety.live.free_session import LiveEpisodes
     from drake_safety.live.page import serve_page
-    from drake_safety.live.session import LiveGoals, LiveThrows
+    from drake_safety.live.task_sessions import LiveCommands, LiveEpisodes, LiveGoals, LiveThrows
     from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
     from drake_safety.simulation.scenario import load_scenario
 

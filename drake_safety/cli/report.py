@@ -39,7 +39,6 @@ def _angular_constraints(run: Run) -> tuple[str, ...]:
     """Constraints whose margins are angles; empty if the task cannot be loaded."""
     import yaml
 
-    from drake_safety.simulation.capabilities import angular_constraints
     from drake_safety.simulation.scenario import parse_scenario
 
     if not run.scenario:
@@ -48,6 +47,6 @@ def _angular_constraints(run: Run) -> tuple[str, ...]:
         scenario = parse_scenario(
             yaml.safe_dump(run.scenario), name=run.scenario_name, folder=run.folder
         )
-        return angular_constraints(scenario.make_loop())
+        return scenario.make_loop().angular_constraints
     except (ValueError, OSError, RuntimeError):
         return ()

@@ -159,7 +159,6 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     """
     from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
     from drake_safety.evaluation.timeline_figure import timeline_figure
-    from drake_safety.simulation.capabilities import angular_constraints
 
     positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
     events = [motion.leave_time_s] if motion.has_left else []
@@ -182,7 +181,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
         belief=motion.extra["belief"],
         margins=motion.margins,
         constraint_names=loop.constraint_names,
-        angular_constraints=angular_constraints(loop),
+        angular_constraints=loop.angular_constraints,
     )
 
 

@@ -154,12 +154,11 @@ def _refusal(
     loop: ClosedLoop, words: GoalWords, verdict: GoalVerdict, nearest: GoalVerdict | None
 ) -> dict[str, str]:
     from drake_safety.learning.causes import describe_margin
-    from drake_safety.simulation.capabilities import angular_constraints
 
     lines = {}
     if np.isfinite(verdict.cause_margin):
         lines["likely cause"] = describe_margin(
-            verdict.cause, verdict.cause_margin, angular_constraints(loop)
+            verdict.cause, verdict.cause_margin, loop.angular_constraints
         )
     elif verdict.cause:
         share = verdict.cause_probability.max() / verdict.cause_probability.sum()

@@ -16,7 +16,6 @@ import typer
 from drake_safety.cli.console import (
     ClusterOption,
     ScenarioArgument,
-    Stages,
     WorkersOption,
     command_line,
     console,
@@ -31,6 +30,7 @@ from drake_safety.cli.training_folder import (
     episodes_folder,
     training_options,
 )
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import TRAINING
 
 if TYPE_CHECKING:
@@ -47,13 +47,6 @@ def train(
     ] = "both",
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue with the episodes in OUT.")
-    ] = False,
-    accept_code_change: Annotated[
-        bool,
-        typer.Option(
-            "--accept-code-change",
-            help="Resume although the source code has changed since.",
-        ),
     ] = False,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
@@ -92,7 +85,6 @@ def train(
                 path=folder,
                 progress=partial(stages, f"nominal {folder.name.replace('_', ', ')}"),
                 extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
-                accept_code_change=accept_code_change,
                 **options,
             )
         # The modes are independent: the first is trained here, the others in worker processes.
@@ -141,7 +133,7 @@ def _learn(
     scenario: Scenario,
     mode: str,
     out: Path,
-    stages: Stages | None = None,
+    stages: StageProgress | None = None,
 ) -> tuple[int, str, float]:
     """Trains and saves one mode.
 
@@ -158,9 +150,9 @@ def _learn(
     from drake_safety.learning.training import segments_for
     from drake_safety.simulation.dataset import load_episodes
 
-    def report(stage: str, share: float) -> None:
+    def report(stage: str, done: int, wanted: int) -> None:
         if stages is not None:
-            stages(f"{mode}: {stage}", round(100 * share), 100)
+            stages(f"{mode}: {stage}", done, wanted)
 
     started = time.process_time()
     scenario.assessment.mode = mode

@@ -64,9 +64,7 @@ def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
 
 def training_options(scenario: Scenario, mode: str) -> dict[str, Any]:
     """Options of the diagram for a mode's training episodes, besides the defaults."""
-    from drake_safety.simulation.capabilities import paper_options
-
-    return {} if mode == MODES[0] else paper_options(scenario.task_class())
+    return {} if mode == MODES[0] else scenario.task_class().paper_options
 
 
 def fresh_episodes_folder(
@@ -106,10 +104,9 @@ def run_fresh_episodes(
         variation: The plant.
         **loop_options: Options of the diagram, besides those of evaluations.
     """
-    from drake_safety.simulation.capabilities import judging_options
     from drake_safety.simulation.rollouts import run_episodes
 
-    options = {**judging_options(scenario.task_class()), **loop_options}
+    options = {**scenario.task_class().judging_options, **loop_options}
     return run_episodes(
         scenario,
         num_episodes,

@@ -23,9 +23,12 @@ from drake_safety.learning.blas_threads import one_blas_thread
 
 SOLVED = 0
 """Status of a solved program; other values are daqp's negative exit flags."""
+ITERATION_LIMIT = -4
+"""Status of a program that was given up, as those of a robot that has fallen."""
 
 # Before 0.10 daqp has no elimination of equations to switch off.
 _OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTION_OFF") else {}
+_ITERATIONS_PER_ROW = 1.5  # Random episodes and pushes take up to 0.8 until the robot has fallen.
 _BOUNDLESS = 1e12  # Squared norms from this size on count as not finite.
 _TINY = 1e-300
 _ORIGIN = np.zeros(3)
@@ -276,7 +279,11 @@ def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _Task
 
 @one_blas_thread
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
-    """Solves the program by daqp's dual active-set method, deterministically without warm start."""
+    """Solves the program by daqp's dual active-set method, deterministically without warm start.
+
+    The number of iterations is limited by that of constraints. Programs without a solution, as
+    those of a robot that has fallen, would take several times as many until that is certain.
+    """
     n_v = len(qp.bias)
     n = qp.A.shape[1]
     # With H = UᵀU and v̇ = U⁻¹z the quadratic cost is ½|[z; y]|². LAPACK's factorisation takes a
@@ -285,7 +292,10 @@ def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     A, g = qp.A.copy(), np.zeros(n)
     A[: qp.num_vdot_rows, :n_v] = dtrtrs(U, qp.A[: qp.num_vdot_rows, :n_v].T, trans=1)[0].T
     g[:n_v] = dtrtrs(U, qp.g, trans=1)[0]
-    x, _, flag, _ = daqp.solve(np.eye(n), g, A, qp.upper, qp.lower, qp.sense, **_OPTIONS)
+    limit = int(_ITERATIONS_PER_ROW * len(A))
+    x, _, flag, _ = daqp.solve(
+        np.eye(n), g, A, qp.upper, qp.lower, qp.sense, iter_limit=limit, **_OPTIONS
+    )
     x[:n_v] = dtrtrs(U, x[:n_v])[0]
     is_solved = flag == 1 and x.dot(x) < math.inf
     return WholeBodySolution(

@@ -13,15 +13,15 @@ from typing import Any
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
+from drake_safety.files.atomic import replacing
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import replacing
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.models import load_robot
-from drake_safety.simulation.capabilities import HasBall, judging_options
+from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario
 
@@ -98,7 +98,7 @@ def compare_scenario(
     run = partial(run_episodes, scenario, num_workers=num_workers)
     seed, robot = effort.seed, scenario.robot
     seeds = EVALUATION.seeds(EVALUATION.first + seed)
-    judging = judging_options(scenario.task_class())
+    judging = scenario.task_class().judging_options
     with shown(progress, lambda stages: stages) as given:
         report = given or (lambda stage, done, total: None)
         training = run(
@@ -122,7 +122,7 @@ def compare_scenario(
         )
         assessment = SafetyAssessment(scenario.assessment).fit(
             training,
-            lambda stage, share: report(f"{scenario.name}: {stage}", round(100 * share), 100),
+            lambda stage, done, total: report(f"{scenario.name}: {stage}", done, total),
         )
         assessment.save(folder / "sharpened.safetensors")
         scorer = assessment_scorer("sharpened", assessment)

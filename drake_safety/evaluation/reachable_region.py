@@ -11,9 +11,9 @@ from pydrake.systems.framework import Context
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.plan_study import SAFE
 from drake_safety.evaluation.reachability import BASELINES, Reachability
-from drake_safety.evaluation.scorers import StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import assessment_scorer
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.progress import shown
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, fair_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop

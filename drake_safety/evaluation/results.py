@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.learning.assessment_file import replacing
+from drake_safety.files.atomic import replacing
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1

@@ -8,14 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.baselines import KINDS, DirectClassifier
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments
-
-StageProgress = Callable[[str, int, int], None]
-"""Called with the name of a stage, the number done and the number wanted."""
 
 
 @dataclass(frozen=True, kw_only=True)

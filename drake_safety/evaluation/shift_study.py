@@ -13,15 +13,15 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.monitoring_study import rate_per_hour
-from drake_safety.evaluation.scorers import Scorer, StageProgress
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shifted_motions import Motion, ShiftedSet
 from drake_safety.extras import require_extra
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.progress import shown
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.watched_motion import SEEN
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -93,12 +94,10 @@ def run_changed_starts(
     found = {}
     names = [*STARTS, *POSTURES, "falling"]
     for name in names:
-
-        def arguments(batch: list[int], name: str = name) -> tuple:
-            return scenario, name, seed, batch
-
         results = run_batches(
-            _changed_batch, list(range(num_motions)), arguments, num_workers=num_workers
+            partial(_changed_batch, scenario, name, seed),
+            list(range(num_motions)),
+            num_workers=num_workers,
         )
         motions = [motion for motion in results if len(motion.state)]
         kind = "plan" if name in STARTS else "posture"

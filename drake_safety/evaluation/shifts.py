@@ -12,11 +12,10 @@ import numpy as np
 from pydrake.math import RotationMatrix
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
-from drake_safety.robots.shift import InputShift, JointShift, Shift
-from drake_safety.simulation.capabilities import pairing_options
+from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -66,7 +65,9 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     """
     own = {
         f"variation {name}": PlantShift(
-            kind="plant", variation=variation, options=pairing_options(scenario, name)
+            kind="plant",
+            variation=variation,
+            options=scenario.task_class().pairing_options(scenario, name),
         )
         for name, variation in scenario.variations.items()
         if name != "nominal"
@@ -93,12 +94,15 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     }
     if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
         lasting["soft_joint"] = Shift(joints={joint: JointShift(stiffness_scale=0.5)})
+    names = kinematics.plant.GetStateNames(add_model_instance_prefix=False)
+    n_q, period_s = kinematics.num_positions, scenario.control_period_s
+    positions, velocities = names[NUM_BASE_POSITIONS:n_q], names[n_q:]
     faults = {
-        "joint_bias": InputShift(joint_bias_rad=_JOINT_BIAS_RAD),
-        "dead_velocities": InputShift(velocity_scale=0.0),
-        "stale": InputShift(delay_s=_STALE_S),
-        "frozen": InputShift(frozen_at_s=0.0),
-        "frozen_later": InputShift(frozen_at_s=_FROZEN_AT_S),
+        "joint_bias": Fault(kind="bias", entries=positions, value=_JOINT_BIAS_RAD),
+        "dead_velocities": Fault(kind="zero", entries=velocities),
+        "stale": Fault(kind="delay", value=round(_STALE_S / period_s) * period_s),
+        "frozen": Fault(kind="freeze"),
+        "frozen_later": Fault(kind="freeze", start_s=_FROZEN_AT_S),
     }
     noise = nominal.input_noise
     noisy = ObservationNoise(position=noise.position, velocity=_NOISE_FACTOR * noise.velocity)
@@ -110,7 +114,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     }
     sensors = {
         **{
-            name: dataclasses.replace(nominal, shift=Shift(inputs=fault))
+            name: dataclasses.replace(nominal, shift=Shift(sensor_faults=[fault]))
             for name, fault in faults.items()
         },
         "noisy_velocities": dataclasses.replace(nominal, input_noise=noisy),

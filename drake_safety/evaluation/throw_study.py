@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, median, proportion
-from drake_safety.evaluation.scorers import Scorer, StageProgress, assessment_scorer
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.progress import shown
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
 

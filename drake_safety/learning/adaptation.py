@@ -45,7 +45,6 @@ class TrainingScores:
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
         heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
         nearest: Column of the constraint with the smallest predicted margin, (N,).
-        target: Points in t-SNE, (N, 2); None if not used.
         multiplicity: Number of segments that each stands for, (N,); None for one each.
         count: Number of all training segments in every map's cells, (K, R*R); None if none of them
             was left out.
@@ -56,7 +55,6 @@ class TrainingScores:
     cause: np.ndarray
     heads: np.ndarray | None = None
     nearest: np.ndarray | None = None
-    target: np.ndarray | None = None
     multiplicity: np.ndarray | None = None
     count: np.ndarray | None = None
 
@@ -66,7 +64,6 @@ class TrainingScores:
         segments: Segments,
         output: EmbeddingOutput,
         base_logit: BaseLogit | None,
-        target: np.ndarray | None = None,
     ) -> TrainingScores:
         """Those of training segments, in the precision in which files store them.
 
@@ -74,7 +71,6 @@ class TrainingScores:
             segments: The training segments.
             output: What the maps give for them.
             base_logit: The base logit; None for maps without heads.
-            target: Their points in t-SNE, (N, 2); None if they are not used.
         """
         heads = nearest = None
         if base_logit is not None:
@@ -91,7 +87,6 @@ class TrainingScores:
             cause=segments.cause,
             heads=heads,
             nearest=nearest,
-            target=None if target is None else target.astype(np.float32),
         )
 
     @property
@@ -136,7 +131,6 @@ class TrainingScores:
             cause=self.cause[kept],
             heads=rows(self.heads),
             nearest=rows(self.nearest),
-            target=rows(self.target),
             multiplicity=_single(1.0 / probability[kept]),
             count=count,
         )
@@ -226,8 +220,7 @@ def paper_beliefs(
     uncertainty = []
     for member_points, training_points in zip(points, training.points, strict=True):
         discrepancy = DiscrepancyFunction().fit(member_points, difference)
-        places = training_points if training.target is None else training.target
-        mean, deviation = discrepancy.predict(places)
+        mean, deviation = discrepancy.predict(training_points)
         uncertainty.append(
             updated_uncertainty(
                 mean,
@@ -243,9 +236,7 @@ def paper_beliefs(
         [
             combined(
                 member_prior,
-                feedback_beliefs(
-                    certain, grid.locate(member_points), grid, settings, feedback.set_index
-                ),
+                feedback_beliefs(certain, grid.locate(member_points), grid, settings),
             )
             for member_prior, member_points in zip(prior, points, strict=True)
         ]
@@ -257,7 +248,6 @@ def feedback_beliefs(
     cells: np.ndarray,
     grid: Grid,
     settings: AdaptationParameters,
-    set_index: np.ndarray,
 ) -> np.ndarray:
     """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 
@@ -269,13 +259,10 @@ def feedback_beliefs(
         cells: Cell of each, -1 for outside, (M,).
         grid: The grid.
         settings: beta, alpha and the definition of n_f.
-        set_index: Pair of each, (M,).
     """
     num_feedback = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
     if settings.count == "segments":
         num_feedback = np.full(grid.num_cells, len(certain))
-    elif settings.count == "pairs":
-        num_feedback = np.full(grid.num_cells, len(np.unique(set_index)))
     # mu_v = beta exp(-alpha (n_f - 1))
     uncertainty = settings.first_uncertainty * np.exp(-settings.decay_rate * (num_feedback - 1.0))
     return belief_masses.average_cells(certain, cells, np.minimum(uncertainty, 1.0))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
@@ -31,7 +32,6 @@ from drake_safety.learning.innovation import Innovation
 from drake_safety.learning.inputs import input_names, inputs, plan_columns, used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
 from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for
@@ -99,14 +99,14 @@ class SafetyAssessment:
         return len(self.info_.constraint_names)
 
     def fit(
-        self, episodes: Episodes, progress: Callable[[str, float], None] | bool | None = None
+        self, episodes: Episodes, progress: StageProgress | bool | None = None
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
             episodes: Nominal episodes with the parameters' horizon.
             progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
-                "beliefs") and the fraction done; True shows it.
+                "beliefs"), the percentage done and 100; True shows it.
 
         Returns:
             Itself.
@@ -123,12 +123,12 @@ class SafetyAssessment:
         # The order of sums depends on the number of threads, and the last bits with it.
         with (
             threadpool_limits(1, user_api="blas"),
-            shown(progress, lambda stages: stages.report_share) as report,
+            shown(progress, lambda stages: stages) as report,
         ):
             self._learn(episodes, report)
         return self
 
-    def _learn(self, episodes: Episodes, progress: Callable[[str, float], None] | None) -> None:
+    def _learn(self, episodes: Episodes, progress: StageProgress | None) -> None:
         parameters = self.parameters
         info = episodes.info
         check_preview(info, parameters)
@@ -140,7 +140,7 @@ class SafetyAssessment:
             segments.desired_preview,
             segments.features if parameters.is_sharpened else None,
         )
-        self.embedding_, base_logit, target = learned_maps(
+        self.embedding_, base_logit = learned_maps(
             segments, has_target, x, self.grid_, parameters, progress
         )
         if parameters.is_sharpened:
@@ -162,13 +162,12 @@ class SafetyAssessment:
             novelty=self.novelty_,
         )
         if progress is not None:
-            progress("innovation", 1.0)
+            progress("innovation", 100, 100)
         output = self.embedding_.evaluate(x)
         self.base_logit_: BaseLogit | None = base_logit
-        is_placed = not parameters.is_sharpened and parameters.adaptation.discrepancy_at == "tsne"
-        self.training_ = TrainingScores.of(
-            segments, output, base_logit, target if is_placed else None
-        ).thinned(self.grid_, parameters.seed)
+        self.training_ = TrainingScores.of(segments, output, base_logit).thinned(
+            self.grid_, parameters.seed
+        )
         self.adaptation_: Adaptation | None = None
         self.calibrations_: dict[str, Calibration] = {}
         self.used_ = [UsedEpisodes.of("training", info, len(episodes))]
@@ -177,7 +176,7 @@ class SafetyAssessment:
             self.training_, self.grid_, parameters, self.num_causes
         )
         if progress is not None:
-            progress("beliefs", 1.0)
+            progress("beliefs", 100, 100)
 
     def prior_beliefs(self) -> np.ndarray:
         """Computes the beliefs of every map's cells before any feedback, (K, R*R, 3 + n_c)."""

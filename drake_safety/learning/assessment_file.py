@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import math
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
 from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
@@ -24,8 +21,8 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.innovation import Innovation
-from drake_safety.learning.inputs import num_inputs, plan_columns, used_states
-from drake_safety.learning.novelty import NUM_DISTANCES, Moments, Novelty
+from drake_safety.learning.inputs import plan_columns, used_states
+from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
@@ -44,15 +41,11 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "cause": (np.int16, np.int64),
     "heads": (np.float32, float),
     "nearest": (np.int16, np.int64),
-    "target": (np.float32, np.float32),
     "multiplicity": (np.float32, float),
     "count": (np.int32, np.int64),
 }
 """Arrays of `TrainingScores`: the type on disk and in memory."""
-_OPTIONAL = ("heads", "nearest", "target", "multiplicity", "count")
-_INFINITE = ("innovation.chart_limits", "innovation.sums")
-"""Arrays with limits, which are infinite if training had too little motion."""
-_MASS_TOLERANCE = 1e-6
+_OPTIONAL = ("heads", "nearest", "multiplicity", "count")
 _T = TypeVar("_T")
 
 
@@ -112,37 +105,6 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         temporary.write_bytes(content)
 
 
-@contextlib.contextmanager
-def replacing(final: Path) -> Iterator[Path]:
-    """A temporary file beside a final one, renamed to it on success and removed on any exception.
-
-    What a killed process left of the same file is removed.
-
-    Args:
-        final: Path of the complete file.
-
-    Raises:
-        OSError: It cannot be written; the message names the file.
-    """
-    # Readers of folders (pyarrow, pandas) skip names that start with a dot.
-    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
-    try:
-        for left in final.parent.glob(f".{final.name}.*.tmp"):
-            left.unlink(missing_ok=True)
-        yield temporary
-        # The bytes reach the disk before the name does.
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(final)
-    except OSError as error:
-        why = str(error) if error.errno is None else os.strerror(error.errno)
-        raise OSError(
-            f"{final} cannot be written: {why}; what had been written before is kept"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
     """Reads a file written by `write`.
 
@@ -183,15 +145,11 @@ def _checked(
     stored = entries.pop("sha256")
     if stored != _digest(entries, tensors):
         raise ValueError("its contents do not have the SHA-256 that it was written with")
-    for name, tensor in tensors.items():
-        is_number = np.isnan if name in _INFINITE else lambda values: ~np.isfinite(values)
-        if is_number(tensor).any():
-            raise ValueError(f"its {name} has entries that are not finite numbers")
     nested = {"paper": PaperReading, "adaptation": AdaptationParameters}
     # Files from before this parameter are of exact neighbours.
     own = {"candidates_per_neighbour": 0} | entries["parameters"]
-    own |= {name: _typed(made, own[name], name) for name, made in nested.items()}
-    parameters = _typed(AssessmentParameters, own, "parameters")
+    own |= {name: _made(made, own[name]) for name, made in nested.items()}
+    parameters = _made(AssessmentParameters, own)
     return parameters, _learned(parameters, entries, tensors)
 
 
@@ -209,53 +167,30 @@ def _digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> st
     return digest.hexdigest()
 
 
-def _typed(made: type[_T], entries: Mapping[str, Any], where: str) -> _T:
-    """Makes a dataclass of JSON values of its fields' types."""
+def _made(made: type[_T], entries: Mapping[str, Any]) -> _T:
+    """Makes a dataclass of JSON values, without those of fields that it does not have any more."""
     hints = get_type_hints(made)
-    for name, value in entries.items():
-        if name not in hints:
-            raise ValueError(f"its {where} has no field '{name}'")
-        if not _is_of(value, hints[name]):
-            raise ValueError(f"its {where}.{name} is {value!r}, expected {hints[name]}")
-    return made(**entries)
-
-
-def _is_of(value: Any, hint: Any) -> bool:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is UnionType:
-        return any(_is_of(value, one) for one in arguments)
-    if origin in (list, tuple):
-        return isinstance(value, (list, tuple)) and all(_is_of(v, arguments[0]) for v in value)
-    if origin is dict:
-        return isinstance(value, dict) and all(_is_of(v, arguments[1]) for v in value.values())
-    if hint is float:
-        return type(value) in (int, float) and math.isfinite(value)
-    return type(value) is hint
+    return made(**{name: value for name, value in entries.items() if name in hints})
 
 
 def _learned(
     parameters: AssessmentParameters, entries: dict[str, Any], tensors: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    info, numbers = _typed(EpisodesInfo, entries["info"], "info"), entries["numbers"]
+    info, numbers = _made(EpisodesInfo, entries["info"]), entries["numbers"]
     grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
     weights = {k.removeprefix(_MAPS): v for k, v in tensors.items() if k.startswith(_MAPS)}
     # Files from before the range was stored have none: their maps extrapolate.
     embedding = Embedding(
         weights, num_margins=numbers["num_margins"], input_range=tensors.get(_INPUT_RANGE)
     )
-    expected_inputs = num_inputs(info, parameters)
-    if embedding.num_inputs != expected_inputs:
-        raise ValueError(
-            f"its maps have {embedding.num_inputs} inputs, expected {expected_inputs} by its names"
-        )
     base_logit = numbers["base_logit"]
     if base_logit is not None:
         low, high = base_logit["margin_range"]
         base_logit = base_logit | {"margin_range": (low, high)}
-        base_logit = _typed(BaseLogit, base_logit, "base_logit")
+        base_logit = _made(BaseLogit, base_logit)
     correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
     correction["guard"] = correction["guard"].astype(float)
-    calibrations = [_typed(Calibration, one, "calibration") for one in numbers["calibrations"]]
+    calibrations = [_made(Calibration, one) for one in numbers["calibrations"]]
     adaptation = entries["adaptation"]
     learned: dict[str, Any] = {
         "info_": info,
@@ -264,92 +199,45 @@ def _learned(
         "base_logit_": base_logit,
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
-        "novelty_": _novelty(numbers, tensors, expected_inputs, plan_columns(info, parameters)),
+        "novelty_": _novelty(numbers, tensors, plan_columns(info, parameters)),
         "innovation_": Innovation.from_arrays(
             {
                 k.removeprefix(_INNOVATION): v.astype(float)
                 for k, v in tensors.items()
                 if k.startswith(_INNOVATION)
             },
-            num_inputs=expected_inputs,
+            num_inputs=embedding.num_inputs,
             num_states=int(used_states(info, parameters).sum()),
         ),
         "calibrations_": {one.kind: one for one in calibrations},
-        "used_": [_typed(UsedEpisodes, one, "used") for one in numbers["used"]],
-        "adaptation_": None if adaptation is None else _typed(Adaptation, adaptation, "adaptation"),
+        "used_": [_made(UsedEpisodes, one) for one in numbers["used"]],
+        "adaptation_": None if adaptation is None else _made(Adaptation, adaptation),
     }
     stored: dict[str, Any] = {
         name: tensors[f"training_{name}"].astype(used)
         for name, (_, used) in _TRAINING.items()
         if name not in _OPTIONAL or f"training_{name}" in tensors
     }
-    if base_logit is not None and "heads" not in stored:
-        raise KeyError("training_heads")
     learned["training_"] = TrainingScores(**stored)
-    cells = (embedding.num_members, grid.num_cells)
-    expected = {
-        "beliefs": (*cells, 3 + len(info.constraint_names)),
-        "correction.change": (3,),
-        "correction.hidden": (embedding.num_members, embedding.num_activations + 1),
-        "correction.hidden_range": (2,),
-        "correction.guard": cells,
-    }
-    for name, shape in expected.items():
-        if tensors[name].shape != shape:
-            raise ValueError(f"the shape of its {name} is {tensors[name].shape}, expected {shape}")
-    beliefs = tensors["beliefs"]
-    masses = np.stack([beliefs[..., :3].sum(axis=-1), beliefs[..., 1]], axis=-1)
-    known = np.stack([np.ones(cells), beliefs[..., 3:].sum(axis=-1)], axis=-1)
-    if (beliefs < 0.0).any() or np.abs(masses - known).max() > _MASS_TOLERANCE:
-        raise ValueError("its beliefs are not masses that sum to 1, with causes of the unsafe one")
-    _check_names(tensors, learned)
     return learned
 
 
-def _check_names(tensors: Mapping[str, np.ndarray], learned: Mapping[str, Any]) -> None:
-    """Checks that all tensors belong to what was learned."""
-    known = {"beliefs", _INPUT_RANGE, *(f"training_{name}" for name in _TRAINING)}
-    known |= {f"{_MAPS}{name}" for name in learned["embedding_"].weights}
-    known |= {f"{_CORRECTION}{field.name}" for field in fields(Correction)}
-    known |= {f"{_INNOVATION}{name}" for name in learned["innovation_"].arrays()}
-    moments = {
-        _NOVELTY: learned["novelty_"].training,
-        _FEEDBACK_NOVELTY: learned["novelty_"].feedback,
-    }
-    for prefix, one in moments.items():
-        known |= set() if one is None else {f"{prefix}mean", f"{prefix}covariance"}
-    if not tensors.keys() <= known:
-        raise ValueError(f"it has the unknown tensors {sorted(tensors.keys() - known)}")
-
-
-def _novelty(
-    numbers: dict[str, Any], tensors: dict[str, np.ndarray], num_columns: int, plan: slice
-) -> Novelty:
-    found: list[Moments | None] = []
-    for prefix, count in zip((_NOVELTY, _FEEDBACK_NOVELTY), numbers["novelty_counts"], strict=True):
-        if not count and prefix == _FEEDBACK_NOVELTY:
-            found.append(None)
-            continue
-        for name, shape in {"mean": (num_columns,), "covariance": (num_columns,) * 2}.items():
-            tensor = tensors[prefix + name]
-            if tensor.shape != shape or not np.isfinite(tensor).all():
-                raise ValueError(
-                    f"the shape of its {prefix}{name} is {tensor.shape}, expected {shape} of "
-                    "finite numbers"
-                )
-        found.append(
-            Moments(
-                count=int(count),
-                mean=tensors[f"{prefix}mean"],
-                covariance=tensors[f"{prefix}covariance"],
-            )
+def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], plan: slice) -> Novelty:
+    training, feedback = (
+        Moments(
+            count=int(count),
+            mean=tensors[f"{prefix}mean"],
+            covariance=tensors[f"{prefix}covariance"],
         )
-    training, feedback = found
+        if count
+        else None
+        for prefix, count in zip(
+            (_NOVELTY, _FEEDBACK_NOVELTY), numbers["novelty_counts"], strict=True
+        )
+    )
+    if training is None:
+        raise ValueError("it has no moments of the training inputs")
     limits = np.array(numbers["novelty_limits"], dtype=float)
-    if training is None or limits.shape != (NUM_DISTANCES,) or not np.all(limits > 0.0):
-        raise ValueError(
-            f"its limits of novelty are {limits}, expected {NUM_DISTANCES} positive numbers"
-        )
     return Novelty(training=training, feedback=feedback, limits=limits, plan=plan)
 
 

@@ -8,8 +8,7 @@ from drake_safety.learning.distance import BACKENDS, WARPING_COSTS
 MODES = ("paper", "sharpened")
 INITIALIZATIONS = ("spectral", "random")
 LOSSES = ("squared", "norm")
-PLACES = ("map", "tsne")
-COUNTS = ("cell", "segments", "pairs")
+COUNTS = ("cell", "segments")
 
 
 def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
@@ -35,14 +34,10 @@ class AdaptationParameters:
         least_uncertainty: mu_min of nominal beliefs without discrepancy (paper).
         decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
-        update_interval: k_u, feedback between two updates: "The online adaptation process is
-            performed once every 40 feedback data".
-        update_unit: Unit of k_u: "segments", the paper's sets, or "pairs" of episodes.
+        update_interval: k_u, pairs of episodes between two updates: "The online adaptation process
+            is performed once every 40 feedback data".
         count: n_f in a feedback belief's uncertainty (paper): segments in its "cell", or all
-            feedback ("a collection of feedback data with n_f sets") in "segments" or in "pairs".
-        discrepancy_at: Where the discrepancy of a training segment is predicted (paper): "map" at
-            Psi(x), or "tsne" at its point in t-SNE: "the predicted mean and standard deviation of
-            y^i". The function is learned at Psi(x) of the feedback.
+            "segments" of the feedback ("a collection of feedback data with n_f sets").
         offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
         slope_std: The same for each of its slopes (sharpened).
         hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
@@ -54,9 +49,7 @@ class AdaptationParameters:
     decay_rate: float = 0.4
     first_uncertainty: float = 0.3
     update_interval: int = 40
-    update_unit: str = "pairs"
     count: str = "cell"
-    discrepancy_at: str = "map"
     offset_std: float = 2.0
     slope_std: float = 0.5
     hidden_std: float = 1.0
@@ -76,10 +69,7 @@ class AdaptationParameters:
             _expect(self, name, getattr(self, name) > 0.0, "> 0")
         for name in ("gate", "decay_rate"):
             _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
-        units = COUNTS[1:]
-        _expect(self, "update_unit", self.update_unit in units, f"one of {list(units)}")
         _expect(self, "count", self.count in COUNTS, f"one of {list(COUNTS)}")
-        _expect(self, "discrepancy_at", self.discrepancy_at in PLACES, f"one of {list(PLACES)}")
         _expect(self, "update_interval", self.update_interval >= 1, ">= 1")
 
 

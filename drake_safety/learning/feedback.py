@@ -204,7 +204,6 @@ class FeedbackSegments:
     """Segments of several feedback sets.
 
     Attributes:
-        set_index: Position of the segment's set, (N,).
         state: State in x, (N, n_s).
         desired_preview: Desired outputs over the horizon, (N, H*n_z).
         features: Features, (N, n_f).
@@ -215,7 +214,6 @@ class FeedbackSegments:
         cause: Column of the constraint that ended the actual episode, -1 when safe, (N,).
     """
 
-    set_index: np.ndarray
     state: np.ndarray
     desired_preview: np.ndarray
     features: np.ndarray
@@ -248,7 +246,7 @@ def segments_of(
         ValueError: No set has a segment of that length.
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in FeedbackSegments.__annotations__}
-    for position, one in enumerate(feedback):
+    for one in feedback:
         sample = one.info.preview_stride
         is_taken = one.steps_since_start % stride == 0
         left = one.remaining_steps
@@ -261,7 +259,6 @@ def segments_of(
         nominal_is_unsafe = np.full(rows.size, one.nominal_is_unsafe)
         state = one.true_state if plain and one.info.variation == "nominal" else one.state
         piece = {
-            "set_index": np.full(rows.size, position),
             "state": state[rows],
             "desired_preview": one.desired_preview[rows],
             "features": one.features[rows],

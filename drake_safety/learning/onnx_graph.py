@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.atomic import replacing
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.assessment_file import replacing
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import used_states

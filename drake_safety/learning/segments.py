@@ -69,7 +69,6 @@ class EpisodesInfo:
         versions: Package versions at the time of the simulation.
         num_steps: T, rows after the first one of a complete episode; 0 if unknown.
         preview_stride: Rows between two of the H samples of a preview or a segment.
-        code: SHA-256 of the simulating source code; "" if unknown.
     """
 
     scenario: str
@@ -84,7 +83,6 @@ class EpisodesInfo:
     feature_names: list[str]
     versions: dict[str, str]
     num_steps: int = 0
-    code: str = ""
     preview_stride: int = 1
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.embedding import (
@@ -29,7 +30,6 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _logger = logging.getLogger("drake_safety")
 
-StageProgress = Callable[[str, float], None]
 """Called with a stage and the fraction done."""
 
 
@@ -94,7 +94,7 @@ def learned_maps(
     grid: Grid,
     parameters: AssessmentParameters,
     progress: StageProgress | None,
-) -> tuple[Embedding, BaseLogit | None, np.ndarray]:
+) -> tuple[Embedding, BaseLogit | None]:
     """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
@@ -103,15 +103,14 @@ def learned_maps(
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
         parameters: The assessment's parameters.
-        progress: Called with "distances", "t-SNE", "training" and the fraction done.
+        progress: Called with "distances", "t-SNE", "training", the percentage done and 100.
 
     Returns:
-        The maps, the base logit of their heads, None without heads, and t-SNE's points scaled to
-        the grid, (M, 2).
+        The maps, and the base logit of their heads; None without heads.
     """
 
     def stage(name: str) -> Callable[[float], None] | None:
-        return None if progress is None else lambda fraction: progress(name, fraction)
+        return None if progress is None else lambda done: progress(name, round(100 * done), 100)
 
     targeted = segments.take(has_target)
     num_neighbours = int(3 * parameters.perplexity)
@@ -154,7 +153,7 @@ def learned_maps(
     report = stage("training")
     if not parameters.is_sharpened:
         held_out = data.take(is_held_out) if is_held_out.any() else None
-        return _train(data.take(~is_held_out), parameters, report, held_out), None, data.target
+        return _train(data.take(~is_held_out), parameters, report, held_out), None
     if not 0 < label.sum() < len(label):
         # No held-out episodes of both labels.
         embedding = _train(data, parameters, report)
@@ -165,11 +164,11 @@ def learned_maps(
         tried = _train(data.take(~is_held_out), parameters, _part(report, 0))
         embedding = _train(data, parameters, _part(report, 1))
     if not embedding.has_heads:
-        return embedding, None, data.target
+        return embedding, None
     base_logit = fitted_base_logit(
         tried.evaluate(x[is_held_out]), segments.take(is_held_out), parameters
     )
-    return embedding, base_logit, data.target
+    return embedding, base_logit
 
 
 def known_range(x: np.ndarray) -> np.ndarray:

@@ -24,10 +24,6 @@ _CELL_M, _NUM_CELLS = 0.5, 7  # Of the grid: size, and number from its middle.
 class FollowingCamera:
     """Keeps a robot on legs in the middle of the picture, and the ground below it.
 
-    Args:
-        loop: The robot's closed loop.
-        meshcat: The Meshcat server.
-
     Attributes:
         size_m: Size of the robot: twice the height of its base, or the extent of its feet [m].
     """
@@ -51,20 +47,12 @@ class FollowingCamera:
         meshcat.SetCameraPose(_DISTANCE * self.size_m * away, np.zeros(3))
 
     def begin(self, context: Context) -> None:
-        """Aims at the robot.
-
-        Args:
-            context: Context of the loop.
-        """
+        """Aims at the robot in a Context of the loop."""
         self._target = self._base(context)
         self.follow(context)
 
     def follow(self, context: Context) -> None:
-        """Moves the world so that the robot stays in the picture, from wherever a viewer looks.
-
-        Args:
-            context: Context of the loop.
-        """
+        """Moves the world so that the robot stays in the picture, from wherever a viewer looks."""
         self._target = self._target + _FOLLOWED * (self._base(context) - self._target)
         self.meshcat.SetTransform(WORLD, RigidTransform([*-self._target, -self._height_m]))
         # The ground has no end: its disc and whole cells of its grid stay below the robot.

@@ -65,12 +65,7 @@ def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> It
 
 
 def build_page(panel: LivePanel, scene_port: int) -> None:
-    """Builds the page of a viewer.
-
-    Args:
-        panel: What is shown and controlled.
-        scene_port: Port of Meshcat, at the host that the viewer asked for the page.
-    """
+    """Builds the page of a viewer; Meshcat is at the same host, at its own port."""
     here = files("drake_safety.live")
     tones = " ".join(f"--{name}: {_css(name)};" for name in COLOURS)
     ui.colors(primary=_css("safe"))
@@ -159,15 +154,12 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
 
 def _chart_options(threshold: float) -> dict[str, Any]:
     line = {"yAxis": threshold, "name": f"threshold {threshold:.2f}"}
+    font = {"fontSize": 13, "fontWeight": "normal"}
+    where = f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}"
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
-        "title": {
-            "text": "probability over time [s]",
-            "textStyle": {"fontSize": 13, "fontWeight": "normal"},
-            "left": 0,
-            "padding": 0,
-        },
+        "title": {"text": "probability over time [s]", "textStyle": font, "left": 0, "padding": 0},
         "xAxis": {"type": "value", "min": -HISTORY_S, "max": 0, "splitLine": {"show": False}},
         "yAxis": {"type": "value", "min": 0, "max": 1, "interval": 0.5},
         "series": [
@@ -182,11 +174,7 @@ def _chart_options(threshold: float) -> dict[str, Any]:
                     "symbol": "none",
                     "data": [line],
                     "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
-                    "label": {
-                        "formatter": "{b}",
-                        "position": f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}",
-                        "color": _css("unsafe"),
-                    },
+                    "label": {"formatter": "{b}", "position": where, "color": _css("unsafe")},
                 },
             }
         ],

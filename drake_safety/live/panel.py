@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -25,14 +26,7 @@ _UNKNOWN = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Status:
-    """The text of a page.
-
-    Attributes:
-        state: What the robot does.
-        cause: The expected violation; "" for none.
-        note: A remark, such as the last ball; "" for none.
-        tone: A key of `COLOURS`.
-    """
+    """What the robot does, the expected violation, a remark, and a key of `COLOURS`."""
 
     state: str = ""
     cause: str = ""
@@ -42,13 +36,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Slider:
-    """Range of a slider.
-
-    Attributes:
-        low: Lowest value.
-        high: Highest value.
-        step: Distance of neighbouring values.
-    """
+    """Range of a slider, and the distance of neighbouring values."""
 
     low: float
     high: float
@@ -59,7 +47,7 @@ class LivePanel:
     """What every viewer of a session sees and controls; the session and a page share it.
 
     The session runs in one thread and the page in another. Each of them replaces whole values,
-    which needs no lock.
+    which needs no lock; only a click is taken by the one and made by the other.
 
     Args:
         title: Title of the page.
@@ -85,6 +73,7 @@ class LivePanel:
         self._values: dict[str, float] = {}
         self.is_stopped = False
         self._clicks: set[str] = set()
+        self._clicking = threading.Lock()
         self._history: deque[tuple[float, float]] = deque()
 
     def add_button(self, name: str, key: str = "") -> None:
@@ -98,12 +87,14 @@ class LivePanel:
 
     def click(self, name: str) -> None:
         """Clicks a button; clicks before the next :meth:`take_click` count as one."""
-        self._clicks.add(name)
+        with self._clicking:
+            self._clicks.add(name)
 
     def take_click(self, name: str) -> bool:
         """Whether a button was clicked since the last call."""
-        is_clicked = name in self._clicks
-        self._clicks.discard(name)
+        with self._clicking:
+            is_clicked = name in self._clicks
+            self._clicks.discard(name)
         return is_clicked
 
     def set_value(self, name: str, value: Any) -> None:
@@ -117,14 +108,7 @@ class LivePanel:
         return self._values[name]
 
     def show(self, state: str, *, cause: str = "", note: str = "", tone: str = "plain") -> None:
-        """Shows text.
-
-        Args:
-            state: See :class:`Status`, as the others.
-            cause: See there.
-            note: See there.
-            tone: See there.
-        """
+        """Shows text; see `Status`."""
         self.status = Status(state, cause, note, tone)
 
     def show_belief(

@@ -16,7 +16,6 @@ from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
-from drake_safety.simulation.capabilities import monitor_period_s
 from drake_safety.simulation.closed_loop import RECORDED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -193,7 +192,7 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
 def _episode(log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float) -> Episode:
     scenario = loop.scenario
     length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
-    period_s = monitor_period_s(loop)
+    period_s = loop.monitor_period_s
     ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
     margins = _margins(log, loop, context, begin_s, ticks)
     is_out = (margins < 0).any(axis=1)

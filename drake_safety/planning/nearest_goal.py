@@ -57,8 +57,9 @@ def nearest_accepted_goal(
 ) -> GoalVerdict | None:
     """Finds an accepted goal near a given one, with a reserve.
 
-    With reserve: probability ≥ threshold + reserve (1 - threshold). The goal found lies at the
-    limit of the search, and of the goals at the threshold itself many are unsafe.
+    With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
+    probability: 1, or 1 - mu_ini in the paper's mode. The goal found lies at the limit of the
+    search, and of the goals at the threshold itself many are unsafe.
 
     Descent along the gradient of the safety head's logit finds an accepted goal with few
     evaluations, but often not the nearest one: it stays in one basin, and Γ follows the logit only
@@ -73,7 +74,7 @@ def nearest_accepted_goal(
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
         rng: Source of the candidates.
-        reserve: Share of the interval from the threshold to 1, in [0, 1].
+        reserve: Share of the interval from the threshold to the largest probability, in [0, 1].
         num_candidates: Candidates of the search per batch; half as many if the descent has found
             an accepted goal.
         resolution_m: Spacing of the grid of candidates [m].
@@ -92,7 +93,9 @@ def nearest_accepted_goal(
         raise ValueError(f"nearest accepted goal: method must be one of {METHODS}; got '{method}'")
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
-    stricter = threshold + reserve * max(1.0 - threshold, 0.0)
+    parameters = assessment.parameters
+    highest = 1.0 if parameters.is_sharpened else 1.0 - parameters.initial_uncertainty
+    stricter = threshold + reserve * max(highest - threshold, 0.0)
     goal = checked_goal(goal)
     if not np.isfinite(goal).all():
         return None

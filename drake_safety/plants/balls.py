@@ -51,14 +51,7 @@ def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
 
 
 class Ball:
-    """A ball in a finalised plant.
-
-    Args:
-        plant: The plant.
-        scene_graph: Its scene graph.
-        instance: The ball's model instance.
-        target: Body to throw at.
-    """
+    """A ball in a finalised plant, thrown at a target: the name of a body."""
 
     def __init__(
         self,
@@ -76,11 +69,7 @@ class Ball:
         self._robot_geometries = collision_geometries(plant, [self._target.model_instance()])
 
     def park(self, context: Context) -> None:
-        """Puts the ball at rest on the ground, far away.
-
-        Args:
-            context: The plant's Context.
-        """
+        """Puts the ball at rest on the ground, far away, in the plant's Context."""
         p = _PARKED + [0.0, 0.0, self.radius_m]
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
         self._plant.SetFreeBodySpatialVelocity(context, self._body, SpatialVelocity.Zero())

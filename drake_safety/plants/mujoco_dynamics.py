@@ -34,9 +34,6 @@ class MujocoDynamics:
         variation: Differences from the published robot.
         time_step_s: Step [s].
         servos: Whether the command is a joint state for robot.yaml's servos instead of torques.
-
-    Raises:
-        ValueError: As :func:`~drake_safety.plants.mujoco_model.build_model`.
     """
 
     def __init__(
@@ -75,10 +72,9 @@ class MujocoDynamics:
         return state[:n_q], state[n_q : n_q + n_v], state[n_q + n_v :]
 
     def state_from(self, plant_state: np.ndarray) -> np.ndarray:
-        """Converts a state from Drake's convention to MuJoCo's, without a warm start.
+        """MuJoCo's state, without a warm start, from Drake's ``[q; v]`` (n_q + n_v,).
 
-        Args:
-            plant_state: Drake's ``[q; v]``, (n_q + n_v,); the quaternion need not be normalised.
+        The quaternion need not be normalised.
         """
         q, v = plant_state[: self.num_positions], plant_state[self.num_positions :]
         state = np.zeros(self.num_state)
@@ -93,11 +89,7 @@ class MujocoDynamics:
         return state
 
     def plant_state(self, state: np.ndarray) -> np.ndarray:
-        """Converts a state from MuJoCo's convention to Drake's, ``[q; v]`` (n_q + n_v,).
-
-        Args:
-            state: MuJoCo's state, (num_state,).
-        """
+        """Drake's ``[q; v]``, (n_q + n_v,), from MuJoCo's state (num_state,)."""
         qpos, qvel, _ = self._parts(state)
         plant_state = np.empty(self.num_positions + self.num_velocities)
         q, v = plant_state[: self.num_positions], plant_state[self.num_positions :]
@@ -140,9 +132,7 @@ class MujocoDynamics:
             self._apply(force)
         mujoco.mj_step(model, scratch)
         failed = (
-            mujoco.mjtWarning.mjWARN_BADQPOS,
-            mujoco.mjtWarning.mjWARN_BADQVEL,
-            mujoco.mjtWarning.mjWARN_BADQACC,
+            getattr(mujoco.mjtWarning, f"mjWARN_BAD{part}") for part in ("QPOS", "QVEL", "QACC")
         )
         if any(scratch.warning[int(kind)].number for kind in failed):
             mujoco.mj_resetData(model, scratch)
@@ -157,12 +147,5 @@ class MujocoDynamics:
             raise ValueError(f"robot '{self.robot.name}': MuJoCo has no body '{body}' to push")
         point = scratch.xpos[index] + scratch.xmat[index].reshape(3, 3) @ force.p_BoBq_B
         F_Bq_W = force.F_Bq_W
-        mujoco.mj_applyFT(
-            model,
-            scratch,
-            F_Bq_W.translational(),
-            F_Bq_W.rotational(),
-            point,
-            index,
-            scratch.qfrc_applied,
-        )
+        f, tau = F_Bq_W.translational(), F_Bq_W.rotational()
+        mujoco.mj_applyFT(model, scratch, f, tau, point, index, scratch.qfrc_applied)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +13,12 @@ from pydrake.geometry import (
     Convex,
     Cylinder,
     Ellipsoid,
-    GeometryId,
     HalfSpace,
     SceneGraph,
     Sphere,
 )
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex
 
 from drake_safety.extras import require_extra
 from drake_safety.robots.model_files import required_file
@@ -44,11 +42,7 @@ _SHAPES = {
 
 
 def import_mujoco() -> Any:
-    """Imports the optional package ``mujoco``.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-    """
+    """Imports the optional package ``mujoco``, or says how to install it."""
     require_extra("mujoco", "engine 'mujoco'")
     import mujoco
 
@@ -56,11 +50,7 @@ def import_mujoco() -> Any:
 
 
 def mechanics_of_urdf(text: str) -> str:
-    """Reduces a URDF to links, inertias and joints, without visuals and collision shapes.
-
-    Args:
-        text: The URDF.
-    """
+    """Reduces a URDF to links, inertias and joints, without visuals and collision shapes."""
     root = ElementTree.fromstring(text)
     for element in list(root):
         if element.tag not in _MECHANICS:
@@ -144,15 +134,6 @@ def _add_actuators(
     return commands
 
 
-def _touchable(plant: MultibodyPlant) -> Iterator[tuple[RigidBody, list[GeometryId]]]:
-    """Bodies with collision geometry."""
-    for index in range(plant.num_bodies()):
-        body = plant.get_body(BodyIndex(index))
-        geometries = plant.GetCollisionGeometriesForBody(body)
-        if geometries:
-            yield body, geometries
-
-
 def _add_geometries(
     spec: mujoco.MjSpec, plant: MultibodyPlant, scene_graph: SceneGraph, robot: RobotModel
 ) -> None:
@@ -161,7 +142,9 @@ def _add_geometries(
     inspector = scene_graph.model_inspector()
     context = plant.CreateDefaultContext()
     instance = plant.GetModelInstanceByName(robot.name)
-    touchable = list(_touchable(plant))
+    bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
+    of_bodies = [(body, plant.GetCollisionGeometriesForBody(body)) for body in bodies]
+    touchable = [(body, geometries) for body, geometries in of_bodies if geometries]
     names = {}
     for body, geometries in touchable:
         if body.model_instance() == instance:

@@ -52,12 +52,7 @@ class MujocoPlant(LeafSystem):
         self.DeclareVectorOutputPort("positions", BasicVector(n_q), self._calc_positions, ticket)
 
     def set_state(self, context: Context, plant_state: np.ndarray) -> None:
-        """Sets the state.
-
-        Args:
-            context: This system's Context.
-            plant_state: Drake's ``[q; v]`` of the robot, (n_q + n_v,).
-        """
+        """Sets the state in this system's Context to Drake's ``[q; v]``, (n_q + n_v,)."""
         context.SetDiscreteState(self.dynamics.state_from(np.asarray(plant_state, dtype=float)))
 
     def _plant_state(self, context: Context) -> np.ndarray:

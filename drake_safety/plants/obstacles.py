@@ -43,14 +43,7 @@ class Obstacle:
 
 
 def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[ModelInstanceIndex]:
-    """Welds obstacles to the world of a plant that is not finalised.
-
-    Args:
-        plant: The plant.
-        obstacles: The obstacles.
-
-    Returns:
-        Their model instances, in the same order.
+    """Welds obstacles to the world of a plant that is not finalised; returns their models.
 
     Raises:
         ValueError: A model cannot be read, has moving joints, or more or less than one root link.
@@ -127,11 +120,7 @@ def filter_collisions(
 ) -> None:
     """Filters all contacts except those of arms with obstacles and of other bodies with the ground.
 
-    Args:
-        plant: The finalised plant.
-        scene_graph: Its scene graph.
-        robot: The robot.
-        obstacles: Model instances of the obstacles.
+    The plant is finalised, and obstacles are their model instances.
     """
     arms = arm_geometries(plant, robot)
     everything = collision_geometries(plant, [plant.GetModelInstanceByName(robot.name)])
@@ -147,29 +136,15 @@ def filter_collisions(
 
 
 def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Context) -> None:
-    """Removes all geometries but those of collision from a Context.
+    """Removes all geometries but those of collision from a root Context.
 
     Every query moves all geometries, and a robot's meshes are many times its collision shapes.
-
-    Args:
-        plant: The finalised plant, the only source of geometries.
-        scene_graph: Its scene graph.
-        context: The root Context.
     """
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     own_context = scene_graph.GetMyMutableContextFromRoot(context)
     for geometry in inspector.GetAllGeometryIds():
         if inspector.GetProximityProperties(geometry) is None:
             scene_graph.RemoveGeometry(own_context, source, geometry)
-
-
-@dataclass(eq=False)
-class _Contexts:
-    """A scratch Context, and those of its parts: looking them up costs as much as a distance."""
-
-    root: Context
-    plant: Context
-    scene_graph: Context
 
 
 class Clearance:
@@ -208,22 +183,17 @@ class Clearance:
             )
         self.range_m = range_m
 
-    def _contexts_of(self, root: Context) -> _Contexts:
+    def _contexts_of(self, root: Context) -> tuple[Context, Context, Context]:
+        """A scratch Context, and its parts, as looking them up costs as much as a distance."""
         remove_visuals(self._plant, self._scene_graph, root)
-        return _Contexts(
-            root=root,
-            plant=self._plant.GetMyMutableContextFromRoot(root),
-            scene_graph=self._scene_graph.GetMyContextFromRoot(root),
-        )
+        plant = self._plant.GetMyMutableContextFromRoot(root)
+        return root, plant, self._scene_graph.GetMyContextFromRoot(root)
 
     def _query(self) -> QueryObject:
-        return self._query_port.Eval(self._scratch.value.scene_graph)
+        return self._query_port.Eval(self._scratch.value[2])
 
     def of_arms(self, q: np.ndarray) -> float:
-        """Returns the distance of the arms to the nearest obstacle, negative in contact [m].
-
-        Args:
-            q: Positions of the robot (n_q,).
+        """Distance of the arms to the nearest obstacle at q (n_q,), negative in contact [m].
 
         Raises:
             ValueError: The positions are not finite.
@@ -233,16 +203,14 @@ class Clearance:
             raise ValueError(f"clearance: positions must be finite; got {q}")
         if not self._obstacles:
             return self.range_m
-        self._plant.SetPositions(self._scratch.value.plant, q)
+        self._plant.SetPositions(self._scratch.value[1], q)
         pairs = self._query().ComputeSignedDistancePairwiseClosestPoints(self.range_m)
         return min((pair.distance for pair in pairs), default=self.range_m)
 
     def of_points(self, p_WP: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-        """Returns the distance of spheres to the nearest obstacle, (N,) [m].
+        """Distance of spheres to the nearest obstacle, (N,) [m].
 
-        Args:
-            p_WP: Centres in the world, (N, 3) [m].
-            radius_m: Radius of the spheres [m].
+        Their centres p_WP, (N, 3), are in the world.
         """
         query, range_m = self._query(), self.range_m + radius_m
         distances = np.full(len(p_WP), range_m)

@@ -39,7 +39,6 @@ from drake_safety.plants.obstacles import (
     collision_geometries,
     filter_collisions,
 )
-from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot import (
     PlantVariation,
@@ -66,7 +65,7 @@ class Scene:
 
 
 class DrakePhysics:
-    """Physics by a MultibodyPlant; see :func:`add_physics`.
+    """Physics by a MultibodyPlant; :func:`add_physics` makes it.
 
     Attributes:
         plant, scene_graph, instance: The plant, its scene graph and the robot's model instance.
@@ -94,7 +93,7 @@ class DrakePhysics:
         )
         plant, scene_graph = AddMultibodyPlant(config, builder)
         instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
-        self._robot, self._variation, self._time_step_s = robot, variation, time_step_s
+        self._robot, self._variation = robot, variation
         self.plant: MultibodyPlant = plant
         self.scene_graph: SceneGraph = scene_graph
         self.instance = instance
@@ -111,7 +110,6 @@ class DrakePhysics:
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
         """Connects torques in actuator order to a robot without servos."""
-        torques = self._delayed(builder, torques)
         builder.Connect(torques, self.plant.get_actuation_input_port(self.instance))
         if self._variation.joint_friction_nm:
             # Without a desired state Drake deactivates the servos that model dry friction.
@@ -126,7 +124,6 @@ class DrakePhysics:
 
         Actuators that model dry friction get a desired velocity of zero.
         """
-        desired_joint_state = self._delayed(builder, desired_joint_state)
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
@@ -134,35 +131,16 @@ class DrakePhysics:
             servos.get_output_port(), self.plant.get_desired_state_input_port(self.instance)
         )
 
-    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
-        """Adds the variation's delay of the command."""
-        delay_s = 0.0 if self._variation.shift is None else self._variation.shift.command_delay_s
-        if not delay_s:
-            return command
-        delay = builder.AddNamedSystem(
-            "command_delay", SampledDelay(command.size(), delay_s, period_s=self._time_step_s)
-        )
-        builder.Connect(command, delay.get_input_port())
-        return delay.get_output_port()
-
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """Context manager for writing the plant's Context, with the variation's masses set.
-
-        Args:
-            context: The root Context of the diagram.
-        """
+        """Context manager for writing the plant's part of a root Context, masses set."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         apply_masses(self.plant, plant_context, self._robot, self._variation)
         yield plant_context
 
 
 class MujocoPhysics:
-    """Physics by MuJoCo, with the interface of DrakePhysics; see :func:`add_physics`.
-
-    Raises:
-        ValueError: The scene has a ball, or MuJoCo cannot simulate the robot or its scene.
-    """
+    """Physics by MuJoCo, with the interface of DrakePhysics; no balls and no shifts."""
 
     def __init__(
         self,
@@ -220,11 +198,7 @@ class MujocoPhysics:
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """Context manager for writing a Context of the Drake plant, copied to MuJoCo's state.
-
-        Args:
-            context: The root Context of the diagram.
-        """
+        """Context manager for writing a Context of the Drake plant, copied to MuJoCo's state."""
         system_context = self._system.GetMyMutableContextFromRoot(context)
         plant_context = self.plant.CreateDefaultContext()
         state = self.state.Eval(system_context)
@@ -237,10 +211,6 @@ class MujocoPhysics:
 Physics = DrakePhysics | MujocoPhysics
 ENGINES_WITH_BALLS = ("drake",)
 """Engines that can simulate a thrown ball."""
-_ENGINES: dict[str, type[DrakePhysics] | type[MujocoPhysics]] = {
-    "drake": DrakePhysics,
-    "mujoco": MujocoPhysics,
-}
 
 
 def add_physics(
@@ -262,24 +232,16 @@ def add_physics(
         time_step_s: Step of the discrete plant [s].
         servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
 
-    Returns:
-        The plant and its ports.
-
     Raises:
         ValueError: A body, joint or file does not exist, a leg or an arm has no motors, a
             decoration has collision geometry, or the engine cannot simulate the scene.
     """
-    physics = _ENGINES[variation.engine]
-    return physics(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
+    engine = {"drake": DrakePhysics, "mujoco": MujocoPhysics}[variation.engine]
+    return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
 
 
 def add_ground(plant: MultibodyPlant, friction: float) -> None:
-    """Adds level ground at z = 0 to a plant that is not finalised.
-
-    Args:
-        plant: The plant.
-        friction: Friction coefficient, static and dynamic.
-    """
+    """Adds level ground at z = 0, with a friction coefficient, to a plant not yet finalised."""
     # The URDF is the visual; the collision shape is an infinite half space.
     package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ground.urdf")
     plant.RegisterCollisionGeometry(
@@ -289,10 +251,6 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
         "ground",
         CoulombFriction(friction, friction),
     )
-
-
-def _friction(robot: RobotModel, variation: PlantVariation) -> float:
-    return variation.foot_friction or robot.foot_friction
 
 
 def _incline(plant: MultibodyPlant, shift: Shift) -> None:
@@ -313,8 +271,7 @@ def _dig_holes(
     friction: float,
 ) -> None:
     """Lowers the ground under some feet."""
-    if not depths_m:
-        return
+    material = CoulombFriction(friction, friction)
     holes = {}
     for name, depth_m in depths_m.items():
         if name not in robot.feet:
@@ -322,10 +279,8 @@ def _dig_holes(
                 f"robot '{robot.name}' has no foot '{name}' for a hole; it has {list(robot.feet)}"
             )
         X_WH = RigidTransform([0.0, 0.0, -depth_m])
-        material = CoulombFriction(friction, friction)
-        shape = f"hole_{name}"
         holes[name] = plant.RegisterCollisionGeometry(
-            plant.world_body(), X_WH, HalfSpace(), shape, material
+            plant.world_body(), X_WH, HalfSpace(), f"hole_{name}", material
         )
     # After the registrations, which invalidate earlier lists of identifiers.
     everything = plant.GetCollisionGeometriesForBody(plant.world_body())
@@ -358,10 +313,12 @@ def _furnish(
     config.default_proximity_properties.resolution_hint = None
     scene_graph.set_config(config)
     instance = add_robot(plant, robot, variation, scene_graph=scene_graph, servos=servos)
-    add_ground(plant, _friction(robot, variation))
+    friction = variation.foot_friction or robot.foot_friction
+    add_ground(plant, friction)
     ball = add_ball(plant) if scene.has_ball else None
     shift = variation.shift or Shift()
-    _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, _friction(robot, variation))
+    if shift.holes_m:
+        _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
     if shift.slope_rad:
         _incline(plant, shift)
     obstacles = add_obstacles(plant, list(scene.obstacles or ()))

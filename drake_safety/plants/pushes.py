@@ -60,21 +60,11 @@ class RandomPushes:
             raise ValueError(f"random pushes: duration_s must be positive; got {self.duration_s}")
 
     def sample(self, rng: np.random.Generator, body: str) -> Push | None:
-        """Samples the push of an episode, or None with probability 1 - ``share``.
-
-        Args:
-            rng: Random generator.
-            body: The pushed body if :attr:`body` is empty.
-        """
+        """Draws the push of an episode, on this body by default; None in ``1 - share`` of them."""
         return None if rng.random() >= self.share else self.draw(rng, body)
 
     def draw(self, rng: np.random.Generator, body: str) -> Push:
-        """Samples a push.
-
-        Args:
-            rng: Random generator.
-            body: The pushed body if :attr:`body` is empty.
-        """
+        """Draws a push, on this body by default."""
         direction = rng.uniform(-np.pi, np.pi)
         strength = rng.uniform(self.force_n[0], self.force_n[1])
         return Push(

@@ -3,6 +3,21 @@
 import math
 from dataclasses import dataclass, field
 
+from drake_safety.robots.reading import did_you_mean
+
+FAULTS = {
+    "bias": True,
+    "drift": True,
+    "zero": False,
+    "scale": True,
+    "swap": False,
+    "noise": True,
+    "delay": True,
+    "half_rate": False,
+    "freeze": False,
+}
+"""Kinds of faults, and whether they have a value."""
+
 
 @dataclass(kw_only=True)
 class JointShift:
@@ -22,23 +37,45 @@ class JointShift:
 
 
 @dataclass(kw_only=True)
-class InputShift:
-    """A fault of the measurement that the assessor reads; the motion does not depend on it."""
+class Fault:
+    """A fault of some entries of a vector signal; see `SensorFaults`.
 
-    joint_bias_rad: float = 0.0
-    """Added to every measured joint position [rad]."""
-    velocity_scale: float = 1.0
-    """Factor on every measured velocity; 0 for dead ones."""
-    frozen_at_s: float | None = None
-    """Time after which the measurement repeats itself [s]; never by default."""
-    delay_s: float = 0.0
-    """Age of the measurement [s]."""
+    ============= ==============================================================================
+    kind          the entries
+    ============= ==============================================================================
+    ``bias``      have ``value`` added
+    ``drift``     have ``value`` times the elapsed time [s] added
+    ``zero``      are 0
+    ``scale``     are multiplied by ``value``
+    ``swap``      are two, of which each shows the other
+    ``noise``     have normal noise of standard deviation ``value`` added, new in every sample
+    ``delay``     are those of ``value`` [s] ago, a multiple of the sampling period
+    ``half_rate`` are renewed by every second sample
+    ``freeze``    repeat the last sample before the fault
+    ============= ==============================================================================
+    """
+
+    kind: str = "zero"
+    entries: list[str] = field(default_factory=lambda: [".*"])
+    """Names or patterns of the entries; all by default."""
+    value: float | None = None
+    start_s: float = 0.0
+    """Time from which the fault lasts [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("delay_s", "frozen_at_s"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise ValueError(f"input shift: {name} must not be negative; got {value}")
+        if self.kind not in FAULTS:
+            raise ValueError(
+                f"fault: kind must be one of {list(FAULTS)}; got '{self.kind}'"
+                f"{did_you_mean(self.kind, FAULTS)}"
+            )
+        if (self.value is not None) != FAULTS[self.kind]:
+            needs = "needs a value" if FAULTS[self.kind] else "has no value"
+            raise ValueError(f"fault: '{self.kind}' {needs}; got {self.value}")
+        lowest = 0.0 if self.kind in ("noise", "delay") else -math.inf
+        if self.value is not None and not lowest <= self.value < math.inf:
+            raise ValueError(f"fault: value of '{self.kind}' is out of range; got {self.value}")
+        if not 0 <= self.start_s < math.inf:
+            raise ValueError(f"fault: start_s must not be negative; got {self.start_s}")
 
 
 @dataclass(kw_only=True)
@@ -57,8 +94,9 @@ class Shift:
     """Age of the command that the joints get [s]."""
     holes_m: dict[str, float] = field(default_factory=dict)
     """Depth of the ground under a foot [m]."""
-    inputs: InputShift = field(default_factory=InputShift)
-    """What the assessor reads."""
+    sensor_faults: list[Fault] = field(default_factory=list)
+    """Faults of the measured ``[q; v]`` that the assessor reads; the motion does not depend on
+    them. Entries have Drake's names, such as ``FR_calf_joint_q`` and ``FR_calf_joint_w``."""
 
     def __post_init__(self) -> None:
         if not abs(self.slope_rad) < 0.5 * math.pi:

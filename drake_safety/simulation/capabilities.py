@@ -6,36 +6,23 @@ generator, and ``episode`` an episode of the loop.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_safety.learning.inputs import is_rate
-from drake_safety.simulation.planned_loop import PlannedLoop
+# Those of Python 3.11 evaluate properties when a loop is asked for a protocol.
+from typing_extensions import Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from drake_safety.control.kinematics import RobotKinematics
     from drake_safety.learning.segments import Episode
     from drake_safety.plants.balls import Throw
     from drake_safety.plants.pushes import Push
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.contract import Finding
-    from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
-    from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.episode_start import EpisodeStart
 
 _Capability = TypeVar("_Capability")
-
-
-@runtime_checkable
-class HasOwnFiles(Protocol):
-    """A task, the class itself, with files of its own that ``check`` checks before the diagram."""
-
-    @classmethod
-    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
-        """Findings about the task's own files, for a scenario and its robot."""
 
 
 @runtime_checkable
@@ -106,29 +93,6 @@ class GoalWords:
 
 
 @runtime_checkable
-class NamesGoals(Protocol):
-    """Goals are called otherwise than targets.
-
-    Attributes:
-        goal_words: What they are called.
-    """
-
-    goal_words: GoalWords
-
-
-@runtime_checkable
-class HasFairGoals(Protocol):
-    """Some goals are trivially safe or unsafe; without this protocol, none are."""
-
-    @property
-    def fair_box(self) -> np.ndarray:
-        """The part of the target box without trivial goals, (2, 3) [m]."""
-
-    def is_fair(self, episode: Episode) -> bool:
-        """Whether the verdict on an episode's goal is not trivial."""
-
-
-@runtime_checkable
 class CanFall(Protocol):
     """The robot can fall, which ends a motion.
 
@@ -140,14 +104,6 @@ class CanFall(Protocol):
 
     fall_name: str
     watched_features: Mapping[str, str]
-
-
-@runtime_checkable
-class HasVisuals(Protocol):
-    """The diagram has shapes that only pictures need, and that cost time in each query."""
-
-    def remove_visuals(self, context: Context) -> None:
-        """Removes them from the Context of a simulation that is not rendered."""
 
 
 @runtime_checkable
@@ -251,24 +207,6 @@ class CanStartAnywhere(Protocol):
         """State and plan of a Context, as a start for :meth:`reset_to`."""
 
 
-@runtime_checkable
-class HasStatePlanes(Protocol):
-    """The true safe set can be simulated on planes of starts."""
-
-    @property
-    def state_planes(self) -> Mapping[str, StatePlane]:
-        """The planes, by name of the plan."""
-
-
-@runtime_checkable
-class HasMirrorImage(Protocol):
-    """The task has a mirror image."""
-
-    @property
-    def mirror_options(self) -> dict[str, Any]:
-        """Options of the mirrored diagram; empty without a mirror image."""
-
-
 _DESCRIPTIONS: dict[type, str] = {
     HasGoals: "plans with a goal",
     HasBall: "a ball to throw",
@@ -277,8 +215,6 @@ _DESCRIPTIONS: dict[type, str] = {
     FollowsCommands: "commands that change while it moves",
     OffersPlans: "plans to choose from",
     CanStartAnywhere: "episodes from a given start",
-    HasStatePlanes: "state planes",
-    HasMirrorImage: "a mirror image",
 }
 """Descriptions for messages."""
 
@@ -304,72 +240,20 @@ def require(loop: object, capability: type[_Capability], who: str = "") -> _Capa
     )
 
 
-def judging_options(task: type) -> dict[str, Any]:
-    """Options of a task's diagram for evaluation, if they differ from those of training."""
-    return dict(task.judging_options) if issubclass(task, PlannedLoop) else {}
-
-
-def paper_options(task: type) -> dict[str, Any]:
-    """Options of a task's diagram for training episodes of the paper's mode."""
-    return dict(task.paper_options) if issubclass(task, PlannedLoop) else {}
-
-
-def pairing_options(scenario: Any, variation: str) -> dict[str, Any]:
-    """Options with which a variation and its nominal twin can start alike.
-
-    Args:
-        scenario: The scenario.
-        variation: The actual plant.
-    """
-    task = scenario.task_class()
-    return task.pairing_options(scenario, variation) if issubclass(task, PlannedLoop) else {}
-
-
-def remove_visuals(loop: object, context: Context) -> None:
-    """Removes from a Context the shapes that only pictures need, if the loop has any.
-
-    Args:
-        loop: A closed loop.
-        context: The root Context of a simulation that is not rendered.
-    """
-    if isinstance(loop, HasVisuals):
-        loop.remove_visuals(context)
-
-
-def angular_constraints(loop: object) -> tuple[str, ...]:
-    """Constraints of a loop whose margins are angles [rad]; the others are lengths [m]."""
-    return tuple(getattr(loop, "angular_constraints", ()))
-
-
-def monitor_period_s(loop: ClosedLoop) -> float:
-    """Sampling period of a loop's port ``safe`` [s]; the control period by default."""
-    if isinstance(loop, PlannedLoop):
-        return loop.monitor_period_s
-    return loop.scenario.control_period_s
-
-
-def rate_names(loop: ClosedLoop) -> list[str]:
-    """States and features of a loop that depend on velocities."""
-    if isinstance(loop, PlannedLoop):
-        return loop.rate_names
-    return [*filter(is_rate, loop.state_names)]
-
-
 def goal_words(loop: HasGoals) -> GoalWords:
-    """What the goals of a loop are called."""
-    if isinstance(loop, NamesGoals):
-        return loop.goal_words
-    return GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
+    """What the goals of a loop are called: its ``goal_words``, if it has some."""
+    words = GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
+    return getattr(loop, "goal_words", words)
 
 
 def fair_box(loop: HasGoals) -> np.ndarray:
-    """The part of a loop's target box without trivial goals, (2, 3) [m]."""
-    return loop.fair_box if isinstance(loop, HasFairGoals) else loop.target_box
+    """The part of a loop's target box without trivial goals, (2, 3) [m]: its ``fair_box``."""
+    return getattr(loop, "fair_box", loop.target_box)
 
 
 def is_fair(loop: HasGoals, episode: Episode) -> bool:
-    """Whether the verdict on the goal of a loop's episode is not trivial."""
-    return loop.is_fair(episode) if isinstance(loop, HasFairGoals) else True
+    """Whether the verdict on an episode's goal is not trivial: by ``is_fair`` of the loop."""
+    return getattr(loop, "is_fair", lambda _: True)(episode)
 
 
 def is_in_box(goal: np.ndarray, box: np.ndarray) -> bool:

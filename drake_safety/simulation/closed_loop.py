@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.segments import RECORDED
-from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
 if TYPE_CHECKING:
+    from drake_safety.control.kinematics import RobotKinematics
+    from drake_safety.simulation.contract import Finding
+    from drake_safety.simulation.episode_start import StatePlane
     from drake_safety.simulation.scenario import Scenario
 
 RECORDED_PORTS = RECORDED
@@ -35,7 +38,7 @@ _SIZED_BY = {
 }
 
 
-class ClosedLoop(FloatSystem, Diagram):
+class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
     The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
@@ -72,6 +75,7 @@ class ClosedLoop(FloatSystem, Diagram):
         scenario: The scenario.
         variation_name, variation: The plant variation.
         assessment: The assessment, or None.
+        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
@@ -80,6 +84,16 @@ class ClosedLoop(FloatSystem, Diagram):
 
     online_parameters: tuple[str, ...] = ()
     """Parameters on which no episode depends; the scenario's hash leaves them out."""
+
+    angular_constraints: tuple[str, ...] = ()
+    """Constraints whose margins are angles [rad]; the others are lengths [m]."""
+
+    judging_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for evaluation, if they differ from training's."""
+
+    paper_options: ClassVar[dict[str, Any]] = {}
+    """Options of the diagram for training episodes of the paper's mode, which has no disturbances
+    but the offsets of the initial state."""
 
     state_names: list[str]
     output_names: list[str]
@@ -92,12 +106,49 @@ class ClosedLoop(FloatSystem, Diagram):
         self.variation_name = variation
         self.variation = scenario.variation(variation)
         self.assessment = assessment
+        self.monitor_period_s = scenario.control_period_s
+
+    @classmethod
+    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
+        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
+        del robot
+        return stated
+
+    @classmethod
+    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """Options with which an actual variation and its nominal twin can start alike."""
+        del scenario, variation
+        return {}
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
+
+    @classmethod
+    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterable[Finding]:
+        """Findings about the task's own files, which ``check`` checks before the diagram."""
+        del scenario, kinematics
+        return ()
+
+    @property
+    def rate_names(self) -> list[str]:
+        """States and features that depend on velocities."""
+        return [*filter(is_rate, self.state_names)]
+
+    @property
+    def mirror_options(self) -> dict[str, Any]:
+        """Options of the mirrored diagram; empty without a mirror image."""
+        return {}
+
+    @property
+    def state_planes(self) -> Mapping[str, StatePlane]:
+        """Planes of starts on which the true safe set can be simulated, by name of the plan."""
+        return {}
+
+    def remove_visuals(self, context: Context) -> None:
+        """Removes shapes that only pictures need from the Context of a simulation without them."""
 
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
         """Finds this diagram's Context in that of the outermost diagram.

@@ -13,15 +13,15 @@ import dataclasses
 import json
 import logging
 import os
-import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.learning.assessment_file import replacing
+from drake_safety.files.atomic import lock_folder, replacing
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.robots.reading import reading, shortened
 from drake_safety.simulation.episode_shards import (
@@ -32,12 +32,8 @@ from drake_safety.simulation.episode_shards import (
     to_table,
 )
 
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
-
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
-_EARLIER_CODE = "earlier_code"
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -54,8 +50,8 @@ class EpisodeWriter:
         extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
             ...). In a folder that is continued, it replaces entries of the same names.
         flush_episodes: Number of pending episodes that are written as a shard.
-        flush_seconds: Age of the oldest pending episode at which they are written [s].
-        accept_code_change: See :func:`open_folder`.
+        flush_seconds: Time since the last shard after which the next episode is written at once,
+            with those that are pending [s].
 
     Raises:
         MissingExtraError: The extra "train" is not installed.
@@ -70,39 +66,26 @@ class EpisodeWriter:
         *,
         flush_episodes: int = 64,
         flush_seconds: float = 10.0,
-        accept_code_change: bool = False,
     ) -> None:
         require_extra("train", f"episodes in {path}", "pyarrow")
-        if flush_episodes < 1:
-            raise ValueError(f"EpisodeWriter: flush_episodes must be >= 1; got {flush_episodes}")
-        if not flush_seconds > 0:
-            raise ValueError(f"EpisodeWriter: flush_seconds must be > 0; got {flush_seconds}")
         self.path = Path(path)
         self.info = info
         self._flush_episodes = flush_episodes
         self._flush_seconds = flush_seconds
         self._pending: list[Episode] = []
-        self._timer: threading.Timer | None = None
-        self._access = threading.RLock()  # Of the pending episodes.
         self._is_closed = False
-        self._lock = _locked(self.path)
+        self._lock = lock_folder(self.path)
         try:
-            self._open(info, extra, accept_code_change)
+            for left_behind in self.path.glob(".*.tmp"):
+                left_behind.unlink()
+            # Before info.json is written: a folder with shards but no info.json is refused.
+            self._indices = completed(self.path)
+            open_folder(self.path, info, extra)
         except BaseException:
             self._lock.release()
             raise
-
-    def _open(
-        self, info: EpisodesInfo, extra: Mapping[str, Any] | None, accept_code_change: bool
-    ) -> None:
-        for left_behind in self.path.glob(".*.tmp"):
-            left_behind.unlink()
-        # Before info.json is written: a folder with shards but no info.json is refused.
-        self._indices = completed(self.path)
-        open_folder(self.path, info, extra, accept_code_change=accept_code_change)
-        self._next_shard = 1 + max(
-            (shard_number(shard) for shard in shards_in(self.path)), default=-1
-        )
+        self._next_shard = 1 + max(map(shard_number, shards_in(self.path)), default=-1)
+        self._flushed_s = time.monotonic()
 
     def append(self, episode: Episode) -> None:
         """Adds one episode; it is on disk after the next flush.
@@ -110,37 +93,28 @@ class EpisodeWriter:
         Raises:
             ValueError: The writer is closed, the folder has an episode of this index, or the
                 episode does not fit the info.
+            OSError: The pending episodes are due and cannot be written.
         """
         if self._is_closed:
             raise ValueError(f"EpisodeWriter of {self.path} is closed; open it again to append")
         if episode.index in self._indices:
             raise ValueError(f"episode {episode.index} is already in {self.path}; see completed()")
         Episodes(self.info, [episode])  # Checks the shapes.
-        with self._access:
-            self._pending.append(episode)
-            self._indices.add(episode.index)
-            if len(self._pending) >= self._flush_episodes:
-                self.flush()
-            elif self._timer is None:
-                self._timer = threading.Timer(self._flush_seconds, self._flush_by_the_clock)
-                self._timer.daemon = True
-                self._timer.start()
-
-    def _flush_by_the_clock(self) -> None:
-        try:
+        self._pending.append(episode)
+        self._indices.add(episode.index)
+        age_s = time.monotonic() - self._flushed_s
+        if len(self._pending) >= self._flush_episodes or age_s >= self._flush_seconds:
             self.flush()
-        except OSError as error:
-            # They are still pending: the next flush tries again, and raises.
-            _LOGGER.warning("episodes are not written yet: %s", error)
 
     def flush(self) -> None:
-        """Writes the pending episodes as one shard."""
-        with self._access:
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
-            if self._pending:
-                self._write()
+        """Writes the pending episodes as one shard.
+
+        Raises:
+            OSError: They cannot be written, and stay pending.
+        """
+        if self._pending:
+            self._write()
+        self._flushed_s = time.monotonic()
 
     def _write(self) -> None:
         import pyarrow.parquet as pq
@@ -177,29 +151,10 @@ class EpisodeWriter:
         self.close()
 
 
-def _locked(path: Path) -> BaseFileLock:
-    """Makes the folder if it does not exist, and locks it."""
-    from filelock import FileLock, Timeout
-
-    path.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path / ".lock", thread_local=False)
-    try:
-        # The operating system unlocks it when the process ends, however that happens.
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise ValueError(
-            f"{path} is being written by another process or another EpisodeWriter: wait for it, "
-            "stop it, or choose another folder"
-        ) from None
-    return lock
-
-
 def open_folder(
     path: str | os.PathLike[str],
     info: EpisodesInfo,
     extra: Mapping[str, Any] | None = None,
-    *,
-    accept_code_change: bool = False,
 ) -> None:
     """Makes the folder of a set, or checks that an existing folder holds the same set.
 
@@ -207,12 +162,9 @@ def open_folder(
         path: The folder.
         info: Metadata of the set.
         extra: Further content of ``info.json``, as JSON types; replaces entries of the same names.
-        accept_code_change: Whether a set begun with other source code may be continued; the
-            digests of the earlier code are kept in ``info.json``.
 
     Raises:
-        ValueError: The folder holds another set, a set begun with other source code, or something
-            else.
+        ValueError: The folder holds another set, or something else.
     """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
@@ -220,16 +172,6 @@ def open_folder(
         stored, known = read_info(path)
         _check_same_set(path, stored, info)
         merged = {**known, **(extra or {})}
-        if stored.code != info.code:
-            if not accept_code_change:
-                raise ValueError(
-                    f"{path} holds episodes that other source code simulated (digest there "
-                    f"'{stored.code[:12]}', here '{info.code[:12]}'), so they may differ from new "
-                    "ones; choose another folder, or accept it: accept_code_change=True, on the "
-                    "command line --accept-code-change"
-                )
-            merged[_EARLIER_CODE] = [*known.get(_EARLIER_CODE, []), stored.code]
-            stored = dataclasses.replace(stored, code=info.code)
         if known != merged:
             _write_info(path, stored, merged)
     else:
@@ -258,9 +200,10 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
     try:
         if not isinstance(extra, dict):
             raise TypeError("it has no extra")
-        # Fields that older folders lack have defaults that mean "unknown".
-        return EpisodesInfo(**fields), extra
-    except (TypeError, ValueError) as error:
+        # Fields that older folders lack have defaults that mean "unknown"; others mean nothing now.
+        known = {field.name for field in dataclasses.fields(EpisodesInfo)}
+        return EpisodesInfo(**{name: fields[name] for name in known & fields.keys()}), extra
+    except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{file} does not describe episodes: {shortened(str(error))}") from error
 
 
@@ -299,7 +242,7 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
             Episodes(info, found)  # Checks them.
         for episode in found:
             known, where = episodes.setdefault(episode.index, (episode, shard))
-            if known is not episode and not _is_same(known, episode):
+            if known is not episode and not is_same(known, episode):
                 raise ValueError(
                     f"episode {episode.index} of {where} differs from that of {shard.name}; remove "
                     "one of the shards"
@@ -332,7 +275,6 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
         if there[name] != here[name]
     }
     versions = differences.pop("versions", None)
-    differences.pop("code", None)  # Which may be accepted.
     if differences:
         raise ValueError(
             f"{path} holds episodes of another set and cannot be continued "
@@ -342,7 +284,8 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
         _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
 
 
-def _is_same(a: Episode, b: Episode) -> bool:
+def is_same(a: Episode, b: Episode) -> bool:
+    """Whether two episodes are the same to the last bit."""
     for field in dataclasses.fields(Episode):
         left, right = getattr(a, field.name), getattr(b, field.name)
         if isinstance(left, np.ndarray):

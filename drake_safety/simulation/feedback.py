@@ -13,11 +13,11 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.files.progress import shown
 from drake_safety.learning.feedback import FeedbackSet, feedback_sets
-from drake_safety.learning.progress import shown
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.simulation.capabilities import CanStartAnywhere, pairing_options, require
+from drake_safety.simulation.capabilities import CanStartAnywhere, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
@@ -80,12 +80,12 @@ def run_pairs(
         progress: Called with the number of episodes done and in all, two per pair; True shows it.
         extra: Stored with the episodes' info.
         **loop_options: Options of the task; they replace those of
-            :func:`~drake_safety.simulation.capabilities.pairing_options`.
+            ``pairing_options`` of the task.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
     """
-    loop_options = pairing_options(scenario, variation) | loop_options
+    loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
     with shown(progress, lambda stages: partial(stages, "episodes and their twins")) as report:
 
@@ -187,9 +187,8 @@ def run_twins(
     # pydrake never frees a system in Python: one loop serves every call.
     info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(
-        _twin_batch,
-        list(range(len(windows))),
-        lambda batch: (scenario, seed, [windows[i] for i in batch]),
+        partial(_twin_batch, scenario, seed),
+        list(windows),
         num_workers=num_workers,
         progress=progress,
         stage="nominal twins",

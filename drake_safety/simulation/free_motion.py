@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.segments import DivergenceError
-from drake_safety.simulation.capabilities import CanFall, remove_visuals
+from drake_safety.simulation.capabilities import CanFall
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng
@@ -67,7 +67,7 @@ def run_free(
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
     if not realtime_rate:
-        remove_visuals(loop, context)
+        loop.remove_visuals(context)
     loop.reset(context, episode_rng(seed, index))
     recorder = Recorder(loop, ("margins", *ports))
     margins_port = loop.GetOutputPort("margins")

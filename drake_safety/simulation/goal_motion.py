@@ -13,7 +13,6 @@ from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
     HasGoals,
-    remove_visuals,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -109,7 +108,7 @@ def run_to_goal(
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
-    remove_visuals(loop, context)
+    loop.remove_visuals(context)
     with_goals = require(loop, HasGoals)
     with_goals.reset_standing(context, goal, episode_rng(seed, 0))
     if push is not None:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -19,17 +19,15 @@ from drake_safety.plants.obstacles import remove_visuals
 from drake_safety.plants.physics import Physics, Scene, add_physics
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
-from drake_safety.robots.shift import InputShift
+from drake_safety.robots.shift import Fault, Shift
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
+from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
-
-if TYPE_CHECKING:
-    from drake_safety.simulation.scenario import Scenario
 
 UPDATE_TICK = 0.25
 """Time between two systems that update one after the other, as a share of the plant's step.
@@ -101,7 +99,7 @@ class LeggedLoop(PlannedLoop):
 
     view: View = View()
 
-    def __init__(self, scenario: "Scenario", variation: str, assessment: SafetyAssessment | None):
+    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
@@ -109,7 +107,7 @@ class LeggedLoop(PlannedLoop):
         self._push_source: PushSource | None = None
 
     @classmethod
-    def model_files(cls, scenario: "Scenario") -> list[Path]:
+    def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
 
@@ -144,17 +142,28 @@ class LeggedLoop(PlannedLoop):
         )
         self._observer = self._observers.add("observer", noise)
         seen_noise = combined(noise, self.variation.input_noise)
-        shift = InputShift() if self.variation.shift is None else self.variation.shift.inputs
-        if shift == InputShift():
-            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
-        else:
-            self._assessor_observer = self._observers.add_shifted(
-                "assessor_observer", seen_noise, shift
+        faults = (self.variation.shift or Shift()).sensor_faults
+        if faults:
+            self._assessor_observer = self._observers.add_faulty(
+                "assessor_observer", seen_noise, faults
             )
+        else:
+            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
         self._true_observer = self._observers.add("true_observer", ObservationNoise())
         self.state_names = self._assessor_observer.state_names
         self.output_names = self._assessor_observer.output_names
         return self._observer.GetOutputPort("measured_plant_state")
+
+    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
+        """Adds the variation's delay of the command between controller and robot."""
+        delay_s = (self.variation.shift or Shift()).command_delay_s
+        if not delay_s:
+            return command
+        names = [str(i) for i in range(command.size())]
+        faults = [Fault(kind="delay", value=delay_s)]
+        period_s = self.scenario.time_step_s
+        late = add_faults(builder, "command_delay", command, faults, names, period_s=period_s)
+        return late.get_output_port()
 
     def _watch(
         self,
@@ -279,7 +288,7 @@ class LeggedLoop(PlannedLoop):
         return assessor
 
     def remove_visuals(self, context: Context) -> None:
-        """Removes the visual shapes, unless the diagram has a visualiser; see `HasVisuals`."""
+        """Removes the visual shapes, unless the diagram has a visualiser."""
         if not self._is_shown:
             remove_visuals(self.plant, self.scene_graph, context)
 

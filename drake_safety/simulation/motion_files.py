@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.learning.assessment_file import replacing
+from drake_safety.files.atomic import replacing
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.simulation.dataset import open_folder
 from drake_safety.simulation.watched_motion import WatchedMotion

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import AffineSystem, RandomSource
+from pydrake.systems.primitives import RandomSource
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
-from drake_safety.plants.sampled_delay import SampledDelay
 from drake_safety.robots.robot import ObservationNoise
-from drake_safety.robots.shift import InputShift
+from drake_safety.robots.shift import Fault
+from drake_safety.systems.sensor_faults import SensorFaults
 from drake_safety.systems.state_observer import StateObserver
 
 
@@ -45,6 +46,7 @@ class Observers:
         self.mirror: Mirror | None = options.get("mirror")
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
+        self._faults: list[SensorFaults] = []
 
     def add(self, name: str, noise: ObservationNoise) -> StateObserver:
         """Returns the observer of a noise level, and adds it if there is none yet.
@@ -71,33 +73,23 @@ class Observers:
         self._observers[key] = observer
         return observer
 
-    def add_shifted(self, name: str, noise: ObservationNoise, shift: InputShift) -> StateObserver:
-        """Adds an observer whose measurement has a fault.
-
-        Args:
-            name: Name of the system.
-            noise: Standard deviations.
-            shift: The fault.
-        """
+    def add_faulty(
+        self, name: str, noise: ObservationNoise, faults: Sequence[Fault]
+    ) -> StateObserver:
+        """Adds an observer whose measurement has faults."""
         measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
-        n_q, n_v = self._kinematics.num_positions, self._kinematics.num_velocities
-        scale, bias = np.ones(n_q + n_v), np.zeros(n_q + n_v)
-        bias[7:n_q] = shift.joint_bias_rad
-        scale[n_q:] = shift.velocity_scale
-        delay = SampledDelay(
-            len(scale), shift.delay_s, period_s=self._period_s, frozen_at_s=shift.frozen_at_s
+        names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)
+        faulty = add_faults(
+            self._builder, f"{name}_faults", measured, faults, names, period_s=self._period_s
         )
-        fault = AffineSystem(D=np.diag(scale), y0=bias)
+        self._faults.append(faulty)
         observer = StateObserver(self._kinematics, **self._options)
-        parts = [(f"{name}_delay", delay), (f"{name}_fault", fault), (name, observer)]
-        for part_name, system in parts:
-            self._builder.AddNamedSystem(part_name, system)
-            self._builder.Connect(measured, system.get_input_port(0))
-            measured = system.get_output_port(0)
+        self._builder.AddNamedSystem(name, observer)
+        self._builder.Connect(faulty.get_output_port(), observer.GetInputPort("plant_state"))
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
-        """Reseeds every noise source.
+        """Reseeds every noise source and the noise of faults.
 
         Args:
             context: The root Context.
@@ -109,6 +101,8 @@ class Observers:
                 source.GetMyMutableContextFromRoot(context),
                 RandomGenerator(int(rng.integers(2**31))),
             )
+        for faulty in self._faults:
+            faulty.set_seed(faulty.GetMyMutableContextFromRoot(context), int(rng.integers(2**31)))
 
     def silence(self, context: Context) -> None:
         """Sets the noise to zero until the next sample.
@@ -119,6 +113,23 @@ class Observers:
         for source in self._sources:
             source_context = source.GetMyMutableContextFromRoot(context)
             source_context.get_mutable_discrete_state_vector().SetZero()
+
+
+def add_faults(
+    builder: DiagramBuilder,
+    name: str,
+    port: OutputPort,
+    faults: Sequence[Fault],
+    names: Sequence[str],
+    *,
+    period_s: float,
+) -> SensorFaults:
+    """Adds faults of a signal, sampled last in each period: after the updates of commands."""
+    system = builder.AddNamedSystem(
+        name, SensorFaults(names, faults, period_s=period_s, offset_s=0.95 * period_s)
+    )
+    builder.Connect(port, system.get_input_port())
+    return system
 
 
 def combined(one: ObservationNoise, other: ObservationNoise) -> ObservationNoise:

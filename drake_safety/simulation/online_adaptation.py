@@ -25,9 +25,9 @@ class OnlineAdaptation:
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Whenever the recorder has finished windows, their nominal twins are
-    simulated; after every k_u windows or segments (`AdaptationParameters.update_unit`) the prior
-    assessment is adapted to the feedback so far, and the assessor adopts the result. The simulation
-    waits meanwhile. The object keeps feedback of one simulation; use another one for another.
+    simulated; after every k_u windows the prior assessment is adapted to the feedback so far, and
+    the assessor adopts the result. The simulation waits meanwhile. The object keeps feedback of one
+    simulation; use another one for another.
 
     ```python
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
@@ -104,7 +104,7 @@ class OnlineAdaptation:
         )
         new = feedback_of_windows(self._scenario, self._recorder, windows, run=self._run)
         self.feedback = [*self.feedback, *new][-self._capacity :]
-        self._num_new += self._count(new)
+        self._num_new += len(new)
         if self._num_new < self._prior.parameters.adaptation.update_interval:
             return
         self._num_new = 0
@@ -112,9 +112,3 @@ class OnlineAdaptation:
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self.num_updates += 1
         self._assessor.adopt(self._assessor.GetMyMutableContextFromRoot(root_context), adapted)
-
-    def _count(self, feedback: list[FeedbackSet]) -> int:
-        """Counts feedback in the unit of k_u."""
-        if self._prior.parameters.adaptation.update_unit == "pairs" or not feedback:
-            return len(feedback)
-        return len(self._prior.feedback_segments(feedback))

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.inputs import is_rate
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -20,9 +15,6 @@ from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
-
-if TYPE_CHECKING:
-    from drake_safety.simulation.scenario import Scenario
 
 
 class PlannedLoop(ClosedLoop):
@@ -34,38 +26,8 @@ class PlannedLoop(ClosedLoop):
     given start.
 
     Attributes:
-        angular_constraints: Constraints whose margins are angles [rad]; the others are lengths [m].
-        judging_options: Options of the diagram for evaluation, if they differ from training's.
-        paper_options: Options of the diagram for training episodes of the paper's mode, which has
-            no disturbances but the offsets of the initial state.
-        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         plant_state_sizes: n_q and n_v.
     """
-
-    angular_constraints: tuple[str, ...] = ()
-    judging_options: Mapping[str, Any] = MappingProxyType({})
-    paper_options: Mapping[str, Any] = MappingProxyType({})
-
-    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
-        super().__init__(scenario, variation, assessment)
-        self.monitor_period_s = scenario.control_period_s
-
-    @classmethod
-    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
-        """Options with which an actual variation and its nominal twin can start alike."""
-        del scenario, variation
-        return {}
-
-    @classmethod
-    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
-        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
-        del robot
-        return stated
-
-    @property
-    def rate_names(self) -> list[str]:
-        """States and features that depend on velocities."""
-        return [*filter(is_rate, self.state_names)]
 
     def _check_variation(self, *varied: str) -> None:
         """Checks that a variation of a task's own plant changes only the entries ``varied``."""

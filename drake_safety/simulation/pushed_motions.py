@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from os import PathLike
 
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     HasGoals,
-    judging_options,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -91,15 +91,14 @@ def run_pushed_motions(
     pairs: dict[int, Pair] = {}
     folder = None
     if path is not None:
-        options = judging_options(scenario.task_class())
+        options = scenario.task_class().judging_options
         loop = scenario.make_loop(variation, **options)
         folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
         pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
     remaining = [index for index in range(num_motions) if index not in pairs]
     results = run_batches(
-        _motion_batch,
+        partial(_motion_batch, scenario, variation, seed),
         remaining,
-        lambda batch: (scenario, variation, seed, batch),
         num_workers=num_workers,
         progress=progress,
         num_done=len(pairs),
@@ -114,5 +113,5 @@ def run_pushed_motions(
 
 
 def _motion_batch(scenario: Scenario, variation: str, seed: int, indices: list[int]) -> list[Pair]:
-    loop = worker_loop(scenario, variation, judging_options(scenario.task_class()))
+    loop = worker_loop(scenario, variation, scenario.task_class().judging_options)
     return [run_pushed_motion(loop, index, seed=seed) for index in indices]

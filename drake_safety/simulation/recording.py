@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -22,10 +21,10 @@ from drake_safety.learning.segments import (
     installed_versions,
 )
 from drake_safety.simulation.contract import REQUIRED_PORTS
+from drake_safety.simulation.dataset import is_same
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.rollouts import collect_episodes, episode_rng
-from drake_safety.simulation.scenario import source_digest
-from drake_safety.simulation.worker_processes import Progress
+from drake_safety.simulation.worker_processes import Progress, Sent
 
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 
@@ -52,7 +51,6 @@ def record_episodes(
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
-    accept_code_change: bool = False,
 ) -> Episodes:
     """Simulates a set of episodes of any diagram, in worker processes.
 
@@ -96,12 +94,10 @@ def record_episodes(
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         seed: Seed of the set.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes; episodes of the same set that it already holds are not
-            simulated again. A set is identified by name, parameters, ports, times and the source
-            text of ``make_diagram`` and ``reset``, not by the code that these call.
+        path: Folder for the episodes; those of the same set that it already holds are kept. A set
+            is identified by name, parameters, ports, times and seed, and by one of its episodes,
+            which is simulated again and must be the same to the last bit.
         progress: Called with the number done and in all; True shows it.
-        accept_code_change: Whether to continue a folder's set begun with another version of this
-            package.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
@@ -109,7 +105,8 @@ def record_episodes(
 
     Raises:
         ValueError: A port is missing or its size fits no other, the number of names is not that
-            of the entries, a time is out of range, or the folder holds another set.
+            of the entries, a time is out of range, the folder holds another set or one of another
+            diagram, or the diagram keeps state outside its Context.
         EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
@@ -124,13 +121,14 @@ def record_episodes(
     timing = EpisodeTiming(
         step_s=step_s, num_steps=round(duration_s / step_s), monitor_period_s=period_s
     )
-    make = partial(make_diagram, **dict(parameters or {}))
-    used, sizes = _used_ports(make(), dict(ports or {}))
+    make, reset = Sent(partial(make_diagram, **dict(parameters or {}))), Sent(reset)
+    # The diagram is built anew for each call: a function does not tell whether its result changed.
+    run = uuid.uuid4().hex
+    used, sizes = _used_ports(_worker_diagram(make, run), dict(ports or {}))
+    identity = (name, timing, used, sorted((parameters or {}).items()))
     info = EpisodesInfo(
         scenario=name,
-        scenario_hash=_hash(
-            name, timing, used, sorted((parameters or {}).items()), make_diagram, reset
-        ),
+        scenario_hash=hashlib.sha256(repr(identity).encode()).hexdigest(),
         variation="nominal",
         seed=seed,
         step_s=step_s,
@@ -141,18 +139,14 @@ def record_episodes(
         constraint_names=_names("constraint", constraint_names, sizes["margins"]),
         versions=installed_versions("drake", "numpy"),
         num_steps=timing.num_steps,
-        code=source_digest(),
     )
-    # The diagram is built anew for each call: a function does not tell whether its result changed.
-    run = uuid.uuid4().hex
     return collect_episodes(
         info,
         num_episodes,
-        lambda batch: (_record_batch, run, make, reset, used, timing, info, batch),
+        partial(_record_batch, run, make, reset, used, timing, info),
         num_workers=num_workers,
         path=path,
         progress=progress,
-        accept_code_change=accept_code_change,
     )
 
 
@@ -166,8 +160,8 @@ def _record_batch(
     indices: list[int],
 ) -> list[Episode]:
     diagram = _worker_diagram(make, run)
-    episodes = []
-    for index in indices:
+
+    def record(index: int) -> Episode:
         who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
         simulator = Simulator(diagram)
         try:
@@ -175,16 +169,22 @@ def _record_batch(
             first_step = reset(diagram, simulator.get_mutable_context(), rng)
         except Exception as error:
             raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
-        episodes.append(
-            record_episode(
-                simulator,
-                ports,
-                timing,
-                constraint_names=info.constraint_names,
-                who=who,
-                index=index,
-                first_step=first_step or 0,
-            )
+        return record_episode(
+            simulator,
+            ports,
+            timing,
+            constraint_names=info.constraint_names,
+            who=who,
+            index=index,
+            first_step=first_step or 0,
+        )
+
+    episodes = [record(index) for index in indices]
+    if indices[0] == 0 and not is_same(episodes[0], record(0)):
+        raise ValueError(
+            f"record_episodes: episode 0 of '{info.scenario}', simulated a second time, differs: "
+            "the diagram, or its reset, keeps state outside its Context, such as in an attribute "
+            "of a system; declare it as state"
         )
     return episodes
 
@@ -238,26 +238,6 @@ def _names(what: str, given: Sequence[str] | None, size: int) -> list[str]:
             f"record_episodes: {what}_names has {len(given)} names, the port has {size} entries"
         )
     return list(given)
-
-
-def _hash(*parts: Any) -> str:
-    """SHA-256 of values and of the source text of functions and classes."""
-    digest = hashlib.sha256()
-    for part in parts:
-        text = repr(part)
-        if isinstance(part, partial):
-            text = _hash(part.func, part.args, sorted(part.keywords.items()))
-        elif callable(part):
-            is_text = inspect.isroutine(part) or inspect.isclass(part)
-            try:
-                text = inspect.getsource(part if is_text else type(part))
-            except OSError as error:
-                raise ValueError(
-                    f"record_episodes: the source of {part} cannot be read, expected a function or "
-                    "class in a file or a notebook: a change of it must be noticed"
-                ) from error
-        digest.update(text.encode() + b"\0")
-    return digest.hexdigest()
 
 
 _DIAGRAMS: dict[str, Diagram] = {}

@@ -6,12 +6,15 @@ import hashlib
 import logging
 from collections.abc import Callable
 from contextlib import closing, nullcontext
+from functools import partial
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.segments import (
     DIVERGED,
     Episode,
@@ -23,12 +26,10 @@ from drake_safety.simulation.capabilities import (
     CanStartAnywhere,
     HasGoals,
     OffersPlans,
-    monitor_period_s,
-    remove_visuals,
     require,
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
-from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes
+from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
@@ -75,7 +76,6 @@ def episodes_info(
         feature_names=list(loop.feature_names),
         versions=installed_versions("drake", "numpy", loop.variation.engine),
         num_steps=scenario.num_steps,
-        code=scenario.code_digest(),
         preview_stride=scenario.assessment.preview_stride,
     )
 
@@ -118,7 +118,7 @@ def run_episode(
     scenario = loop.scenario
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    remove_visuals(loop, context)
+    loop.remove_visuals(context)
     rng = episode_rng(seed, index)
     first_step = 0
     if start is not None:
@@ -137,7 +137,7 @@ def run_episode(
         EpisodeTiming(
             step_s=scenario.step_s,
             num_steps=scenario.num_steps,
-            monitor_period_s=monitor_period_s(loop),
+            monitor_period_s=loop.monitor_period_s,
         ),
         constraint_names=loop.constraint_names,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",
@@ -187,7 +187,6 @@ def run_episodes(
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
     is_standing: bool = False,
-    accept_code_change: bool = False,
     **loop_options: Any,
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
@@ -201,19 +200,19 @@ def run_episodes(
         variation: The plant.
         seed: Seed of the set.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes; episodes of the same set that it already holds are not
-            simulated again.
+        path: Folder for the episodes; those of the same set that it already holds are kept, if one
+            of them, simulated again, is the same to the last bit.
         progress: Called with the number done and in all; True shows it.
         extra: Stored with the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             cannot be stored.
         is_standing: Whether episodes begin in the standing posture; requires goals.
-        accept_code_change: Whether to continue a folder's set begun with other source code.
         **loop_options: Options of the task; part of the set's hash.
 
     Raises:
-        ValueError: The folder holds another set or one of other source code, the task takes no
-            goals, there is not one finite goal per episode, or both goals and a folder are given.
+        ValueError: The folder holds another set or one that is not the same any more, the task
+            takes no goals, there is not one finite goal per episode, or both goals and a folder are
+            given.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if path is not None and goals is not None:
@@ -225,69 +224,51 @@ def run_episodes(
     return collect_episodes(
         episodes_info(loop, seed, loop_options),
         num_episodes,
-        lambda batch: (
-            _episode_batch,
-            scenario,
-            variation,
-            loop_options,
-            seed,
-            batch,
-            None if goals is None else goals[batch],
-            is_standing,
-        ),
+        partial(_episode_batch, scenario, variation, loop_options, seed, goals, is_standing),
         num_workers=num_workers,
         path=path,
         progress=progress,
         extra=extra,
-        accept_code_change=accept_code_change,
     )
 
 
 def collect_episodes(
     info: EpisodesInfo,
     num_episodes: int,
-    task: Callable[[list[int]], tuple],
+    simulate: Callable[[list[int]], list[Episode]],
     *,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
-    accept_code_change: bool = False,
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    Args:
-        info: Metadata of the set.
-        num_episodes: Size of the set.
-        task: Maps a batch of indices to a function at module level and its arguments; the function
-            returns the episodes.
-        num_workers: See :func:`run_episodes`, as for all that follow.
-        path: The folder.
-        progress: The callback.
-        extra: Stored with the info.
-        accept_code_change: Whether to continue a set begun with other source code.
+    ``simulate`` returns the episodes of some indices; for the rest see :func:`run_episodes`.
     """
-    done = completed(path) & set(range(num_episodes)) if path is not None else set()
-    remaining = [index for index in range(num_episodes) if index not in done]
-    episodes: list[Episode] = []
-    writer = None
-    if path is not None:
-        writer = EpisodeWriter(path, info, extra, accept_code_change=accept_code_change)
-        episodes += (e for e in load_episodes(path) if e.index in done) if done else ()
-    results = run_batches(
-        _call,
-        remaining,
-        task,
-        num_workers=num_workers,
-        progress=progress,
-        num_done=len(done),
-        stage=f"episodes of '{info.scenario}'",
-    )
-    with writer or nullcontext(), closing(results):
-        for episode in results:
-            episodes.append(episode)
-            if writer is not None:
-                writer.append(episode)
+    with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
+        episodes: list[Episode] = []
+        if writer is not None:
+            episodes += (e for e in load_episodes(writer.path) if e.index < num_episodes)
+            if episodes:
+                _check_kept(writer.path, episodes, simulate)
+                _LOGGER.warning(
+                    "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
+                )
+        kept = {episode.index for episode in episodes}
+        results = run_batches(
+            simulate,
+            [index for index in range(num_episodes) if index not in kept],
+            num_workers=num_workers,
+            progress=progress,
+            num_done=len(kept),
+            stage=f"episodes of '{info.scenario}'",
+        )
+        with closing(results):
+            for episode in results:
+                episodes.append(episode)
+                if writer is not None:
+                    writer.append(episode)
     collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
     if collected.num_diverged:
         which = [episode.index for episode in collected if episode.cause == DIVERGED]
@@ -301,8 +282,20 @@ def collect_episodes(
     return collected
 
 
-def _call(function: Callable[..., list[Episode]], *arguments: Any) -> list[Episode]:
-    return function(*arguments)
+def _check_kept(
+    path: Path, kept: list[Episode], simulate: Callable[[list[int]], list[Episode]]
+) -> None:
+    """Simulates one episode again, a long unsafe one if there is one."""
+    one = min(kept, key=lambda episode: (episode.is_safe, -episode.num_steps, episode.index))
+    with ONE_BLAS_THREAD:
+        (again,) = simulate([one.index])
+    if not is_same(one, again):
+        raise ValueError(
+            f"{path} holds {len(kept)} episodes of this set that are not the same any more: "
+            f"episode {one.index}, simulated again, differs. The diagram, the code, a package or "
+            "the kind of machine has changed; choose another folder, or remove this one "
+            "(`load_episodes` reads it as it is)"
+        )
 
 
 def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np.ndarray:
@@ -344,13 +337,18 @@ def _episode_batch(
     variation: str,
     options: dict[str, Any],
     seed: int,
-    indices: list[int],
     goals: np.ndarray | None,
     is_standing: bool,
+    indices: list[int],
 ) -> list[Episode]:
     loop = worker_loop(scenario, variation, options)
-    chosen = [None] * len(indices) if goals is None else list(goals)
     return [
-        run_episode(loop, index, seed=seed, goal=goal, is_standing=is_standing)
-        for index, goal in zip(indices, chosen, strict=True)
+        run_episode(
+            loop,
+            index,
+            seed=seed,
+            goal=None if goals is None else goals[index],
+            is_standing=is_standing,
+        )
+        for index in indices
     ]

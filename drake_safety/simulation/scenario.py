@@ -8,7 +8,7 @@ import math
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +23,6 @@ from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.systems.safety_assessor import ON_ALARM
 
 if TYPE_CHECKING:
@@ -162,7 +161,7 @@ class Scenario:
         Defaults are included, so that episodes from before and after a change of one do not mix.
         The assessment's parameters except those of the preview, the task's online parameters and
         the other variations are left out: episodes stay valid when only these change. Source code
-        is covered by :meth:`code_digest`.
+        is not covered.
 
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
@@ -192,51 +191,6 @@ class Scenario:
         for path in task.model_files(self):
             digest.update(_LOOKS.sub(b"", Path(path).read_bytes()))
         return digest.hexdigest()
-
-    def code_digest(self) -> str:
-        """SHA-256 of the source code of this package's simulation and of the task's module.
-
-        Modules in the folder of the task's module that it imports are included.
-        """
-        return source_digest(own_files(sys.modules[self.task_class().__module__]))
-
-
-def source_digest(files: Iterable[Path] = ()) -> str:
-    """SHA-256 of this package's source code that determines a simulation, and of further files.
-
-    Args:
-        files: Files of a task's module; identified by name, whatever their folder.
-    """
-    root = Path(__file__).parents[1]
-    package = [path for room in _SIMULATING_ROOMS for path in (root / room).rglob("*.py")]
-    named = {path.relative_to(root).as_posix(): path for path in package}
-    named |= {path.name: path for path in files}
-    digest = hashlib.sha256()
-    for name in sorted(named):
-        digest.update(name.encode() + b"\0" + named[name].read_bytes() + b"\0")
-    return digest.hexdigest()
-
-
-_SIMULATING_ROOMS = ("control", "plants", "robots", "simulation", "systems")
-
-
-def own_files(module: ModuleType) -> set[Path]:
-    """The files of a module and of the modules in its folder that it imports, recursively.
-
-    Args:
-        module: The module, such as a task's.
-    """
-    files: dict[Path, ModuleType] = {}
-    waiting = [module]
-    while waiting:
-        one = waiting.pop()
-        file = Path(getattr(one, "__file__", None) or "")
-        if file in files or (files and file.parent != next(iter(files)).parent):
-            continue
-        files[file] = one
-        names = {getattr(value, "__module__", None) for value in vars(one).values()}
-        waiting += [sys.modules[name] for name in names if name in sys.modules]
-    return set(files)
 
 
 _LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
@@ -420,7 +374,7 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
     scenario, parameters = _parsed(text, name, folder)
     scenario.folder = task_folder
     task = scenario.task_class()
-    if isinstance(parameters, dict) and issubclass(task, PlannedLoop):
+    if isinstance(parameters, dict):
         parameters = task.complete_parameters(scenario.robot, parameters)
     scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
     return scenario

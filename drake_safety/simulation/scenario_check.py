@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydrake.geometry import Sphere
@@ -14,12 +13,12 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
-from drake_safety.learning.progress import StageProgress
+from drake_safety.files.progress import StageProgress
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
-from drake_safety.simulation.capabilities import HasBall, HasOwnFiles
+from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -225,10 +224,8 @@ def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
 
 
 def _own(state: _State, scenario: Scenario) -> Iterator[Finding]:
-    task: Any = scenario.task_class()
-    kinematics = state.kinematics
-    if isinstance(task, HasOwnFiles) and kinematics is not None:
-        yield from task.check_files(scenario, kinematics)
+    if state.kinematics is not None:
+        yield from scenario.task_class().check_files(scenario, state.kinematics)
 
 
 def _diagram(state: _State, scenario: Scenario) -> Iterator[Finding]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -289,15 +290,8 @@ def run_throws(
     options = {"ball": True, "recovery": trigger_times_s is not None}
     times = trigger_times_s or {}
     logs = run_batches(
-        _throw_batch,
-        indices,
-        lambda batch: (
-            scenario,
-            variation,
-            options,
-            seed,
-            [(i, times.get(i, math.nan)) for i in batch],
-        ),
+        partial(_throw_batch, scenario, variation, options, seed),
+        [(i, times.get(i, math.nan)) for i in indices],
         num_workers=num_workers,
         progress=progress,
         stage="throws",

@@ -15,12 +15,11 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction
-from drake_safety.systems.float_system import FloatSystem
 
 _LARGEST_NOVELTY = 1e6
 
 
-class BeliefEvaluator(FloatSystem, LeafSystem):
+class BeliefEvaluator(LeafSystem):
     """Evaluates Γ on the measured state and the upcoming desired trajectory.
 
     .. pydrake_system::

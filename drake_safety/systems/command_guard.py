@@ -9,12 +9,11 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.control.policy import CommandLimits
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.systems.float_system import FloatSystem
 
 _SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
 
 
-class CommandGuard(FloatSystem, LeafSystem):
+class CommandGuard(LeafSystem):
     """Stands between whoever commands a walking robot and its policy.
 
     .. pydrake_system::

@@ -6,10 +6,9 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.systems.float_system import FloatSystem
 
 
-class CrouchController(FloatSystem, LeafSystem):
+class CrouchController(LeafSystem):
     """Moves the joints' set points towards a posture, never far from the measured joints.
 
     .. pydrake_system::

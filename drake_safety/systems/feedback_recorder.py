@@ -10,7 +10,6 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
 from drake_safety.learning.segments import RECORDED, Episode, Episodes, EpisodesInfo
-from drake_safety.systems.float_system import FloatSystem
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +55,7 @@ class Recording:
         return replace(self, rows=(), times_s=(), plant_state=None)
 
 
-class FeedbackRecorder(FloatSystem, LeafSystem):
+class FeedbackRecorder(LeafSystem):
     """Records windows of a running robot's motion; the label of each is how it ended.
 
     .. pydrake_system::

@@ -7,10 +7,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import gravity_in_foot_plane
-from drake_safety.systems.float_system import FloatSystem
 
 
-class GravityFeatures(FloatSystem, LeafSystem):
+class GravityFeatures(LeafSystem):
     """Shows the slope of the ground, which the state relative to the feet does not.
 
     .. pydrake_system::

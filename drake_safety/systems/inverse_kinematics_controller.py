@@ -9,13 +9,12 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
-from drake_safety.systems.float_system import FloatSystem
 
 _RATE_SHARE = 0.7  # Of a joint's speed limit; the rest is left for the servo's overshoot.
 _LIFTED_M = 0.005  # Height of a foot's set point above which the foot carries no weight.
 
 
-class InverseKinematicsController(FloatSystem, LeafSystem):
+class InverseKinematicsController(LeafSystem):
     """Joint positions of a level base over given feet, with a gravity offset.
 
     .. pydrake_system::

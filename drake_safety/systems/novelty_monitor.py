@@ -12,13 +12,12 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.innovation import KINDS, Innovation, describe
 from drake_safety.learning.novelty import Novelty
-from drake_safety.systems.float_system import FloatSystem
 
 LEVELS = KINDS[1:]
 """What the monitor watches, in the order of its port ``levels``."""
 
 
-class NoveltyMonitor(FloatSystem, LeafSystem):
+class NoveltyMonitor(LeafSystem):
     """Watches how each measured state follows from the last one.
 
     .. pydrake_system::

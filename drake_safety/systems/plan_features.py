@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 
-class PlanFeatures(FloatSystem, LeafSystem):
+class PlanFeatures(LeafSystem):
     """Evaluates the safe set's features on the measured state and the desired preview.
 
     .. pydrake_system::

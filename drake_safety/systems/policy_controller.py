@@ -7,13 +7,12 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.policy import Policy
-from drake_safety.systems.float_system import FloatSystem
 
 ACTING, HELD = 0.0, 1.0
 """Values of ``status``: the network's action, or the last finite one."""
 
 
-class PolicyController(FloatSystem, LeafSystem):
+class PolicyController(LeafSystem):
     """Evaluates a policy every period and holds its joint set points.
 
     .. pydrake_system::

@@ -9,14 +9,12 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.systems.float_system import FloatSystem
-
 _BODY, _FORCE, _START, _DURATION = 0, slice(1, 4), 4, 5
 _SIZE = 6
 _TOLERANCE_S = 1e-9
 
 
-class PushSource(FloatSystem, LeafSystem):
+class PushSource(LeafSystem):
     """Pushes one body of a robot at its centre of mass; the push is a parameter of the Context.
 
     .. pydrake_system::

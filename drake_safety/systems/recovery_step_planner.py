@@ -21,12 +21,11 @@ from drake_safety.control.recovery_step import (
     swing_position,
 )
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
-from drake_safety.systems.float_system import FloatSystem
 
 _IDLE, _STEPPING, _RETURNING, _DONE = 0.0, 1.0, 2.0, 3.0
 
 
-class RecoveryStepPlanner(FloatSystem, LeafSystem):
+class RecoveryStepPlanner(LeafSystem):
     """Steps with alternating groups of feet, then returns the base to the nominal set point.
 
     .. pydrake_system::

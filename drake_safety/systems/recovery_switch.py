@@ -7,12 +7,11 @@ from pydrake.systems.primitives import PortSwitch
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 
-class RecoverySwitch(FloatSystem, Diagram):
+class RecoverySwitch(Diagram):
     """Passes the nominal set point until the probability is below a threshold, then recovery steps.
 
     .. pydrake_system::

@@ -8,10 +8,9 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
 
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.systems.float_system import FloatSystem
 
 
-class RecoveryTrigger(FloatSystem, LeafSystem):
+class RecoveryTrigger(LeafSystem):
     """Switches to recovery when the probability falls below Γ_thre, and back when that is done.
 
     .. pydrake_system::

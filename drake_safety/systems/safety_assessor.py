@@ -6,14 +6,13 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
-from drake_safety.systems.float_system import FloatSystem
 from drake_safety.systems.novelty_monitor import NoveltyMonitor
 
 ON_ALARM = ("unknown", "report")
 """What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
 
 
-class SafetyAssessor(FloatSystem, Diagram):
+class SafetyAssessor(Diagram):
     """Γ in a diagram: a :class:`BeliefEvaluator` and a :class:`NoveltyMonitor`, connected.
 
     .. pydrake_system::

@@ -8,8 +8,6 @@ from typing import Protocol
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_safety.systems.float_system import FloatSystem
-
 
 class SafeSet(Protocol):
     """A safe set: named constraints with signed margins."""
@@ -31,7 +29,7 @@ class FeaturedSafeSet(SafeSet, Protocol):
         ...
 
 
-class SafetyMonitor(FloatSystem, LeafSystem):
+class SafetyMonitor(LeafSystem):
     """Evaluates the safe set on the plant's true state.
 
     .. pydrake_system::

@@ -16,10 +16,9 @@ from drake_safety.control.observation import (
     walking_state_names,
 )
 from drake_safety.robots.robot import ObservationNoise
-from drake_safety.systems.float_system import FloatSystem
 
 
-class StateObserver(FloatSystem, LeafSystem):
+class StateObserver(LeafSystem):
     """Measures a robot: plant state plus noise, the stance-frame state s_k, the output z_k.
 
     .. pydrake_system::

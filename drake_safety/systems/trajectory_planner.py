@@ -11,8 +11,6 @@ from pydrake.polynomial import Polynomial
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.systems.float_system import FloatSystem
-
 
 def interpolate(
     start: np.ndarray,
@@ -94,7 +92,7 @@ def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
 
 
-class TrajectoryPlanner(FloatSystem, LeafSystem):
+class TrajectoryPlanner(LeafSystem):
     """Evaluates a plan z*(t) and its next H samples.
 
     .. pydrake_system::

@@ -16,13 +16,12 @@ from drake_safety.control.whole_body_model import (
     WholeBodyReference,
 )
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
-from drake_safety.systems.float_system import FloatSystem
 
 NOT_FINITE = 1
 """Solver status of an update with a non-finite state or set point."""
 
 
-class WholeBodyController(FloatSystem, LeafSystem):
+class WholeBodyController(LeafSystem):
     """Torques that track weighted tasks with the feet at rest, from one QP per update.
 
     .. pydrake_system::
@@ -41,8 +40,9 @@ class WholeBodyController(FloatSystem, LeafSystem):
     without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]; while they are
     not connected, the set point is that of :meth:`set_reference`, at rest. The command is a
     discrete state, so the outputs have no direct feedthrough. ``solver_status`` is 0 if the last
-    program was solved, negative if it was not (daqp's exit flag: -1 infeasible) and ``NOT_FINITE``
-    if its inputs were not finite; the last command is then held, initially zero torque.
+    program was solved, negative if it was not (daqp's exit flag: -1 infeasible, -4 too many
+    iterations) and ``NOT_FINITE`` if its inputs were not finite; the last command is then held,
+    initially zero torque.
     ``num_failures`` counts the updates since the initialisation whose status was not 0.
 
     Args:

@@ -1,0 +1,1 @@
+"""Files and folders written whole, and the progress of long computations."""

@@ -1,0 +1,109 @@
+"""Progress of long computations: bars on a terminal, elsewhere a plain line every few seconds."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+LINE_PERIOD_S = 10.0
+"""Longest time without a line where there are no bars [s]."""
+
+StageProgress = Callable[[str, int, int], Any]
+"""Called with the name of a stage, the number done and the number wanted."""
+
+_Report = TypeVar("_Report", bound=Callable[..., Any])
+
+
+@contextmanager
+def open_stages(
+    console: Console | None = None, *, period_s: float = LINE_PERIOD_S
+) -> Iterator[StageProgress]:
+    """Shows stages while the block runs: bars on a terminal and in a notebook, lines elsewhere.
+
+    Args:
+        console: Where it prints; standard error by default.
+        period_s: Time between two lines [s].
+    """
+    import rich.console
+    from rich import progress as columns
+
+    console = console or rich.console.Console(stderr=True)
+    # A log file that is told to have colours is no terminal either.
+    is_live = console.is_jupyter or (console.is_interactive and console.file.isatty())
+    numbers = [
+        columns.MofNCompleteColumn(),
+        columns.TimeElapsedColumn(),
+        columns.TextColumn("left"),
+        columns.TimeRemainingColumn(),
+    ]
+    bars = columns.Progress(
+        columns.TextColumn("{task.description:<34}", markup=False),
+        columns.BarColumn(bar_width=30),
+        *numbers,
+        console=console,
+        disable=not is_live,
+        speed_estimate_period=24 * 3600.0,
+    )
+    tasks: dict[str, columns.TaskID] = {}
+
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            # What an earlier run has done says nothing about the time left.
+            tasks[stage] = bars.add_task(stage, total=total, completed=done)
+        task = bars.tasks[tasks[stage]]
+        was_finished = task.finished
+        bars.update(task.id, completed=done, total=total)
+        if task.finished and not was_finished and not is_live:
+            print_task(task)
+
+    def print_line(*words: str) -> None:
+        console.print(*words, highlight=False, markup=False, soft_wrap=True)
+
+    def print_task(task: columns.Task) -> None:
+        print_line(f"{task.description}:", *(str(column(task)) for column in numbers))
+
+    def tick() -> None:
+        while not is_over.wait(period_s):
+            unfinished = [task for task in bars.tasks if not task.finished]
+            for task in unfinished:
+                print_task(task)
+            if not unfinished:
+                after = f", after '{bars.tasks[-1].description}'" if bars.tasks else ""
+                print_line(f"still working{after}")
+
+    is_over = threading.Event()
+    if is_live:
+        with bars:
+            yield report
+        return
+    ticking = threading.Thread(target=tick, name="progress", daemon=True)
+    ticking.start()
+    try:
+        yield report
+    finally:
+        is_over.set()
+        ticking.join()
+
+
+@contextmanager
+def shown(
+    progress: _Report | bool | None, of_stages: Callable[[StageProgress], _Report]
+) -> Iterator[_Report | None]:
+    """Yields the callback that an argument ``progress`` stands for.
+
+    Args:
+        progress: A callback, True to show the progress while the block runs, or None or False.
+        of_stages: Makes the callback that shows it.
+    """
+    if not isinstance(progress, bool):
+        yield progress
+    elif not progress:
+        yield None
+    else:
+        with open_stages() as stages:
+            yield of_stages(stages)

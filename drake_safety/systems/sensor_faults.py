@@ -1,0 +1,168 @@
+"""SensorFaults: faults of a vector signal, between what measures it and what reads it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.robots.reading import did_you_mean
+from drake_safety.robots.shift import Fault
+
+_TOLERANCE_S = 1e-9
+
+
+class SensorFaults(LeafSystem):
+    """Passes a vector with faults of some entries, one after the other, each from its start on.
+
+    .. pydrake_system::
+
+        name: SensorFaults
+        input_ports:
+        - input
+        output_ports:
+        - output
+
+    :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
+    start, the output has the input's bits. Delays, ``half_rate`` and ``freeze`` hold samples, which
+    are taken at multiples of the period like those of Drake's discrete systems: at a sample, a
+    delay's output is the input of ``value / period_s`` samples ago. Until the first sample is that
+    old, it is the first sample. All memory is discrete state; the seed of noise is a parameter.
+
+    Args:
+        names: Names of the entries.
+        faults: The faults.
+        period_s: Sampling period of noise and of faults that hold samples [s].
+        offset_s: Time of the first sample [s].
+
+    Raises:
+        ValueError: No entry has a fault's name, a swap is not of two entries, or a delay is not a
+            multiple of the period: between samples nothing is known of the signal.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        faults: Sequence[Fault] = (),
+        *,
+        period_s: float,
+        offset_s: float = 0.0,
+    ):
+        super().__init__()
+        self._period_s, self._offset_s = period_s, offset_s
+        self._input = self.DeclareVectorInputPort("input", len(names))
+        self._faults = [(fault, _indices(fault, list(names))) for fault in faults]
+        # Of each fault the samples that it holds, the latest first; NaN before the first one.
+        self._shapes = [(self._num_held(fault), len(entries)) for fault, entries in self._faults]
+        for shape in self._shapes:
+            self.DeclareDiscreteState(np.full(shape, np.nan).ravel())
+        if any(num_held for num_held, _ in self._shapes):
+            self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        self._seed = self.DeclareNumericParameter(BasicVector([0.0]))
+        self.DeclareVectorOutputPort("output", BasicVector(len(names)), self._calc_output)
+
+    def set_seed(self, context: Context, seed: int) -> None:
+        """Sets the seed of the noise in this system's Context; it is 0 by default."""
+        context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
+
+    def _num_held(self, fault: Fault) -> int:
+        if fault.kind != "delay":
+            return int(fault.kind in ("half_rate", "freeze"))
+        periods = (fault.value or 0.0) / self._period_s
+        if abs(periods - round(periods)) > 1e-6:
+            lower, upper = (n * self._period_s for n in (int(periods), int(periods) + 1))
+            raise ValueError(
+                f"sensor faults: a delay must be a multiple of the period {self._period_s:g} s, "
+                f"such as {lower:g} or {upper:g}; got {fault.value:g}"
+            )
+        return round(periods)
+
+    def _num_samples(self, context: Context) -> int:
+        """The number of periods that have passed since the first sample."""
+        elapsed_s = context.get_time() - self._offset_s + _TOLERANCE_S
+        return int(elapsed_s // self._period_s)
+
+    def _held(self, context: Context, index: int) -> np.ndarray:
+        return context.get_discrete_state(index).get_value().reshape(self._shapes[index])
+
+    def _signals(self, context: Context) -> list[np.ndarray]:
+        """The input, and the signal after each fault."""
+        signals = [self._input.Eval(context)]
+        for i, (fault, entries) in enumerate(self._faults):
+            signal = signals[-1]
+            elapsed_s = context.get_time() - fault.start_s
+            if elapsed_s >= -_TOLERANCE_S:
+                signal = signal.copy()
+                signal[entries] = self._faulty(context, i, signal[entries], max(elapsed_s, 0.0))
+            signals.append(signal)
+        return signals
+
+    def _faulty(self, context: Context, index: int, x: np.ndarray, elapsed_s: float) -> np.ndarray:
+        fault, value = self._faults[index][0], self._faults[index][0].value or 0.0
+        match fault.kind:
+            case "bias":
+                return x + value
+            case "drift":
+                return x + value * elapsed_s
+            case "zero":
+                return np.zeros_like(x)
+            case "scale":
+                return value * x
+            case "swap":
+                return x[::-1]
+            case "noise":
+                seed = int(context.get_numeric_parameter(self._seed).GetAtIndex(0))
+                # A generator a sample, so that the noise needs no state.
+                rng = np.random.default_rng([seed, index, self._num_samples(context) + 1])
+                return x + value * rng.standard_normal(len(x))
+        held = self._held(context, index)
+        if not len(held) or np.isnan(held).any() or self._renews(context, fault):
+            return x
+        return held[-1]
+
+    def _renews(self, context: Context, fault: Fault) -> bool:
+        """Whether a sensor of half the rate is sampled now."""
+        if fault.kind != "half_rate":
+            return False
+        num_samples = self._num_samples(context)
+        since_s = context.get_time() - self._offset_s - num_samples * self._period_s
+        return num_samples % 2 == 0 and since_s < _TOLERANCE_S
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        now = context.get_time() + _TOLERANCE_S
+        for i, signal in enumerate(self._signals(context)[:-1]):
+            fault, entries = self._faults[i]
+            held, latest = self._held(context, i), signal[entries]
+            renews = {
+                "delay": True,
+                "half_rate": self._num_samples(context) % 2 == 0,
+                "freeze": now < fault.start_s,
+            }
+            if np.isnan(held).any():
+                discrete_state.set_value(i, np.tile(latest, len(held)))
+            elif renews.get(fault.kind, False):
+                discrete_state.set_value(i, np.vstack([latest, held])[: len(held)].ravel())
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._signals(context)[-1])
+
+
+def _indices(fault: Fault, names: list[str]) -> list[int]:
+    for entry in fault.entries:
+        if not any(entry == name or re.fullmatch(entry, name) for name in names):
+            raise ValueError(
+                f"sensor faults: no entry '{entry}'{did_you_mean(entry, names)}; they are {names}"
+            )
+    indices = [
+        i
+        for i, name in enumerate(names)
+        if any(entry == name or re.fullmatch(entry, name) for entry in fault.entries)
+    ]
+    if fault.kind == "swap" and len(indices) != 2:
+        raise ValueError(
+            f"sensor faults: a swap is of two entries; {fault.entries} are "
+            f"{[names[i] for i in indices]}"
+        )
+    return indices

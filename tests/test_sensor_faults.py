@@ -1,0 +1,188 @@
+"""SensorFaults: faults of a vector, between what measures it and what reads it."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety import Fault, SensorFaults
+
+NAMES = ["slow", "fast_1", "fast_2"]
+PERIOD_S = 0.1
+RATES = np.array([1.0, 10.0, -20.0])
+SHIFTS_PAGE = Path(__file__).resolve().parents[1] / "docs/shifts.md"
+
+
+class Bench:
+    """A signal ``5 + RATES t`` with faults."""
+
+    def __init__(self, *faults, period_s=PERIOD_S):
+        builder = DiagramBuilder()
+        line = PiecewisePolynomial.FirstOrderHold([0.0, 9.0], 5.0 + np.outer(RATES, [0.0, 9.0]))
+        source = builder.AddSystem(TrajectorySource(line))
+        self.system = builder.AddSystem(SensorFaults(NAMES, faults, period_s=period_s))
+        builder.Connect(source.get_output_port(), self.system.get_input_port())
+        builder.ExportOutput(self.system.get_output_port(), "output")
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.own = self.system.GetMyMutableContextFromRoot(self.context)
+
+    def at(self, time_s):
+        """Input and output at a later time, as a system with an event then reads them."""
+        self.simulator.AdvanceTo(time_s)
+        output = self.system.get_output_port().Eval(self.own)
+        return self.system.get_input_port().Eval(self.own), output
+
+
+def true(time_s):
+    return 5.0 + RATES * time_s
+
+
+def test_ports_and_feedthrough():
+    system = SensorFaults(NAMES, period_s=PERIOD_S)
+    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == [
+        "input"
+    ]
+    assert [system.get_output_port(i).get_name() for i in range(system.num_output_ports())] == [
+        "output"
+    ]
+    assert system.HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        [],
+        [Fault(kind=kind, value=1.0, start_s=8.0) for kind in ("bias", "drift", "scale", "noise")],
+        [Fault(kind="delay", value=0.5, start_s=8.0), Fault(kind="delay", value=0.0)],
+        [Fault(kind=kind, start_s=8.0) for kind in ("zero", "half_rate", "freeze")],
+        [Fault(kind="swap", entries=["fast_."], start_s=8.0)],
+    ],
+)
+def test_without_faults_and_before_their_start_the_bits_pass(faults):
+    bench = Bench(*faults)
+    for time_s in (0.0, 0.05, 0.1, 1.0, 1.03, 7.9):
+        seen, passed = bench.at(time_s)
+        assert passed.tobytes() == seen.tobytes()
+
+
+def test_without_faults_nothing_is_updated():
+    bench = Bench()
+    bench.at(1.0)
+    assert bench.simulator.get_num_discrete_updates() == 0
+    assert bench.own.num_discrete_state_groups() == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (Fault(kind="bias", value=0.5), true(1.25) + 0.5),
+        (Fault(kind="drift", value=0.5, start_s=1.0), true(1.25) + 0.125),
+        (Fault(kind="zero"), np.zeros(3)),
+        (Fault(kind="scale", value=0.5), 0.5 * true(1.25)),
+        (Fault(kind="scale", value=2.0, entries=["slow"]), true(1.25) * [2.0, 1.0, 1.0]),
+        (Fault(kind="swap", entries=["slow", "fast_2"]), true(1.25)[[2, 1, 0]]),
+        # Samples at multiples of 0.1 s; a reader between two finds the earlier one.
+        (Fault(kind="delay", value=0.3), true(1.0)),
+        (Fault(kind="half_rate"), true(1.2)),
+        (Fault(kind="freeze", start_s=0.85), true(0.8)),
+        (Fault(kind="freeze"), true(0.0)),
+    ],
+)
+def test_each_fault_by_hand(fault, expected):
+    np.testing.assert_allclose(Bench(fault).at(1.25)[1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fault", "ages"),
+    [
+        (Fault(kind="delay", value=0.1), [0, 1, 1, 1, 1]),
+        (Fault(kind="delay", value=0.3), [0, 1, 2, 3, 3]),
+        (Fault(kind="delay", value=0.3, start_s=0.2), [0, 0, 2, 3, 3]),
+        (Fault(kind="half_rate"), [0, 1, 0, 1, 0]),
+        (Fault(kind="freeze", start_s=0.2), [0, 0, 1, 2, 3]),
+    ],
+)
+def test_at_the_samples_a_fault_shows_an_input_of_exact_age(fault, ages):
+    bench = Bench(fault)
+    for k, age in enumerate(ages):
+        np.testing.assert_allclose(bench.at(k * PERIOD_S)[1], true((k - age) * PERIOD_S))
+
+
+def test_a_delay_between_two_samples_is_refused():
+    delay = Fault(kind="delay", value=0.004)
+    with pytest.raises(ValueError, match=r"multiple of the period 0\.01 s, such as 0 or 0\.01"):
+        Bench(delay, period_s=0.01)
+    np.testing.assert_allclose(Bench(delay, period_s=0.002).at(1.0)[1], true(0.996))
+
+
+def test_faults_act_one_after_the_other():
+    add, double = Fault(kind="bias", value=1.0), Fault(kind="scale", value=2.0)
+    np.testing.assert_allclose(Bench(add, double).at(1.0)[1], 2.0 * (true(1.0) + 1.0))
+    np.testing.assert_allclose(Bench(double, add).at(1.0)[1], 2.0 * true(1.0) + 1.0)
+    late = Bench(Fault(kind="drift", value=1.0), Fault(kind="delay", value=0.2)).at(1.0)[1]
+    np.testing.assert_allclose(late, true(0.8) + 0.8)
+
+
+def test_noise_is_normal_is_held_for_a_period_and_follows_from_the_seed():
+    def noise(seed):
+        bench = Bench(Fault(kind="noise", value=0.5, entries=["slow"]))
+        bench.system.set_seed(bench.own, seed)
+        rows = [np.subtract(*bench.at(0.02 * k)) for k in range(440)]
+        assert not np.any([row[1:] for row in rows])
+        return np.array([row[0] for row in rows])
+
+    first = noise(1)
+    np.testing.assert_array_equal(noise(1), first)
+    assert not np.array_equal(noise(2), first)
+    held = first.reshape(88, 5)
+    np.testing.assert_allclose(np.ptp(held, axis=1), 0.0, atol=1e-12)
+    assert np.std(held[:, 0]) == pytest.approx(0.5, rel=0.2)
+    assert np.mean(held[:, 0]) == pytest.approx(0.0, abs=0.15)
+
+
+def test_all_memory_is_in_the_context():
+    bench = Bench(Fault(kind="delay", value=0.3), Fault(kind="half_rate"))
+    bench.at(1.0)
+    copied = bench.context.Clone()
+    first = [bench.at(t)[1] for t in (1.1, 1.2, 1.3)]
+    bench.simulator.reset_context(copied)
+    again = []
+    for time_s in (1.1, 1.2, 1.3):
+        bench.simulator.AdvanceTo(time_s)
+        again.append(bench.system.get_output_port().Eval(bench.system.GetMyContextFromRoot(copied)))
+    np.testing.assert_array_equal(again, first)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: Fault(kind="freze"),
+            r"one of .*; got 'freze' \(did you mean 'freeze'",
+        ),
+        (lambda: Fault(kind="drift"), "'drift' needs a value; got None"),
+        (lambda: Fault(kind="zero", value=1.0), "'zero' has no value; got 1.0"),
+        (lambda: Fault(kind="delay", value=-0.1), "value of 'delay' is out of range; got -0.1"),
+        (lambda: Fault(kind="bias", value=np.nan), "value of 'bias' is out of range; got nan"),
+        (lambda: Fault(kind="zero", start_s=-1.0), "start_s must not be negative; got -1.0"),
+        (lambda: Bench(Fault(kind="zero", entries=["slov"])), r"no entry 'slov' \(did you mean"),
+        (lambda: Bench(Fault(kind="swap", entries=["slow"])), "a swap is of two entries"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_example_of_the_documentation_runs():
+    page = SHIFTS_PAGE.read_text(encoding="utf-8")
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], names)
+    # Speed 0.5 m/s; of the position the drift since 0.4 s is left, and the speed is 0.1 s old.
+    np.testing.assert_allclose(names["seen"], [0.5 * 0.98 + 0.02 * 0.58, 0.5], atol=1e-9)
