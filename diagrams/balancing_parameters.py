@@ -13,6 +13,7 @@ from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (
     BALANCING_REFERENCE,
+    GRAVITY_M_S2,
     RobotSize,
     overlaid,
     scaled_defaults,
@@ -49,7 +50,6 @@ class BalancingParameters:
     """Balls of ``drake-safety run --push ball``."""
 
 
-_GRAVITY = 9.81
 _LEAST_TWIST_RAD = 0.2  # Feet that slip at a smaller twist cannot hold the heading.
 _QUANTITIES: dict[str, Any] = {
     "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
@@ -123,5 +123,5 @@ def largest_twist(kinematics: RobotKinematics) -> float:
     joints_per_yaw = np.linalg.lstsq(J[:, NUM_BASE_VELOCITIES:], J[:, 2], rcond=None)[0]
     torque_per_yaw = 0.5 * float(np.square(joints_per_yaw) @ stiffness)
     radius_m = float(np.linalg.norm(kinematics.nominal_contacts, axis=1).mean())
-    torque = robot.foot_friction * kinematics.total_mass * _GRAVITY * radius_m
+    torque = robot.foot_friction * kinematics.total_mass * GRAVITY_M_S2 * radius_m
     return torque / torque_per_yaw if torque_per_yaw > 0 else math.inf

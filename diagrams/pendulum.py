@@ -11,13 +11,13 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.trajectory_planner import interpolate
 
 _NUM_OUTLOOK = 41  # Samples of the plan from now to its end, for the features.
-_GRAVITY = 9.81  # [m/s^2].
 
 
 @dataclass(kw_only=True)
@@ -73,7 +73,7 @@ class PendulumSafeSet:
 
     def __init__(self, parameters: PendulumParameters, preview_step_s: float):
         self._parameters, self._step_s = parameters, preview_step_s
-        self._time_s = math.sqrt(parameters.length_m / _GRAVITY)
+        self._time_s = math.sqrt(parameters.length_m / GRAVITY_M_S2)
         points = ("capture", "goal", "plan", "plan_capture", "plan_effort")
         reserves = ["now_margin", *(f"{point}_reserve" for point in points)]
         self.feature_names = [f"{reserve}_{side}" for reserve in reserves for side in self.names]
@@ -159,7 +159,7 @@ class PendulumController(LeafSystem):
 
     def __init__(self, parameters: PendulumParameters, period_s: float):
         super().__init__()
-        weight = parameters.mass_kg * _GRAVITY * parameters.length_m
+        weight = parameters.mass_kg * GRAVITY_M_S2 * parameters.length_m
         limit = parameters.effort_share * weight
         sizes = {"plant_state": 2, "desired_output": 3, "desired_output_rate": 3}
         ports = [self.DeclareVectorInputPort(name, size) for name, size in sizes.items()]
@@ -269,5 +269,5 @@ class Pendulum(PlannedLoop):
         values.set_mass(variation.mass_scale * parameters.mass_kg)
         values.set_length(parameters.length_m)
         values.set_damping(parameters.damping + variation.joint_damping)
-        values.set_gravity(_GRAVITY)
+        values.set_gravity(GRAVITY_M_S2)
         pendulum_context.SetContinuousState([math.pi + start.q[0], start.v[0]])

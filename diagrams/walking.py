@@ -8,19 +8,19 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy_files import (
+from drake_safety.control.policy import (
     load_policy,
-    missing_entries,
+    network_file,
     read_policy_file,
     with_policy,
 )
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
-from drake_safety.diagrams.walking_recovery import RecoveryBranches
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
@@ -33,6 +33,7 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.policy_controller import PolicyController
+from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 _NUM_OUTLOOK = 9  # Samples of the commands from now to the end, for the features.
 _SETTLING_S = 1.0
@@ -130,17 +131,9 @@ class Walking(LeggedLoop):
             builder.ExportOutput(guard_system.GetOutputPort("is_changed"), "guard_active")
         self._guard = guard_system
         command = desired["desired_output"]
-        trigger = branches = None
+        trigger = None
         if recovery:
-            branches = RecoveryBranches(
-                builder,
-                parameters.recovery,
-                initial_uncertainty=scenario.assessment.initial_uncertainty,
-                period_s=scenario.control_period_s,
-                offset_s=self.tick_s,
-            )
-            trigger = branches.trigger
-            command = branches.command(command)
+            trigger, command = self._add_recovery(builder, command)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
             # After guard or trigger.
@@ -148,17 +141,7 @@ class Walking(LeggedLoop):
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
-        joint_state = controller.GetOutputPort("desired_joint_state")
-        if branches is not None:
-            joint_state = branches.joints(
-                self.kinematics,
-                self.policy,
-                policy_file(scenario, parameters.recovery.policy),
-                nominal=joint_state,
-                measured=measured,
-                command=desired["desired_output"],
-            )
-        joint_state = self._delayed(builder, joint_state)
+        joint_state = self._delayed(builder, controller.GetOutputPort("desired_joint_state"))
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
         self._watch(
@@ -193,16 +176,53 @@ class Walking(LeggedLoop):
         self._settled: EpisodeStart | None = None
         self.finish(builder)
 
+    def _add_recovery(
+        self, builder: DiagramBuilder, nominal: OutputPort
+    ) -> tuple[RecoveryTrigger, OutputPort]:
+        """The trigger, and the command, or a share of it during recovery."""
+        recovery = self.scenario.parameters.recovery
+        trigger = builder.AddNamedSystem(
+            "recovery_trigger",
+            RecoveryTrigger(
+                threshold=recovery.threshold,
+                initial_uncertainty=self.scenario.assessment.initial_uncertainty,
+                persistence_s=recovery.persistence_s,
+                period_s=self.scenario.control_period_s,
+                offset_s=self.tick_s,
+            ),
+        )
+        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
+        share = recovery.slower_share if recovery.branch == "slower" else 0.0
+        slower = builder.AddNamedSystem("slower_command", MatrixGain(share * np.eye(3)))
+        builder.Connect(nominal, slower.get_input_port())
+        switch = builder.AddNamedSystem("command_switch", PortSwitch(nominal.size()))
+        builder.Connect(
+            trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
+        )
+        builder.Connect(nominal, switch.DeclareInputPort("nominal"))
+        builder.Connect(slower.get_output_port(), switch.DeclareInputPort("recovery"))
+        return trigger, switch.GetOutputPort("value")
+
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
-        policy = read_policy_file(policy_file(scenario))
-        return [*super().model_files(scenario), *policy.files, policy.network]
+        path = policy_file(scenario)
+        network = network_file(read_policy_file(path), str(path.parent))
+        return [*super().model_files(scenario), path, network]
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
-        """Findings about the policy: what its files lack, and how to mend it."""
-        return _policy_findings(policy_file(scenario), kinematics)
+        """A finding about the policy: whether its file is complete and fits the robot."""
+        path = policy_file(scenario)
+        try:
+            policy = load_policy(path, kinematics)
+        except ValueError as error:
+            yield failed("policy", str(error), f"correct what the message names, or {path.name}")
+        else:
+            yield passed(
+                "policy",
+                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
+            )
 
     @property
     def target_box(self) -> np.ndarray:
@@ -358,38 +378,6 @@ class Walking(LeggedLoop):
         return np.zeros(3)  # Commands are in the heading frame, wherever the feet are.
 
 
-def policy_file(scenario: Scenario, name: str | None = None) -> Path:
-    """A policy file, relative to the folder of a scenario's robot.
-
-    Args:
-        scenario: A scenario of the walking task.
-        name: The file; that of the scenario by default.
-    """
-    folder = Path(load_robot(scenario.robot).source_dir)
-    return folder / (scenario.parameters.policy if name is None else name)
-
-
-def _policy_findings(path: Path, kinematics: RobotKinematics) -> Iterator[Finding]:
-    """Checks that a policy's files say all that a robot needs, and fit it.
-
-    An error in the files is a finding, never an exception.
-
-    Args:
-        path: The policy file.
-        kinematics: The robot.
-
-    Yields:
-        One finding for each entry that is missing, or one for all.
-    """
-    try:
-        missing = list(missing_entries(path, kinematics.joint_names))
-        for what, remedy in missing:
-            yield failed("policy", what, remedy)
-        if not missing:
-            policy = load_policy(path, kinematics)
-            yield passed(
-                "policy",
-                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
-            )
-    except ValueError as error:
-        yield failed("policy", str(error), f"correct what the message names, or {path.name}")
+def policy_file(scenario: Scenario) -> Path:
+    """The policy file of a scenario of the walking task, beside its robot's YAML file."""
+    return Path(load_robot(scenario.robot).source_dir) / scenario.parameters.policy

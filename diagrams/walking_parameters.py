@@ -11,7 +11,7 @@ from drake_safety.control.walking_safe_set import WalkingLimits
 from drake_safety.plants.pushes import Push, RandomPushes
 from drake_safety.simulation.legged_loop import View
 
-BRANCHES = ("stop", "slower", "crouch", "policy")
+BRANCHES = ("stop", "slower")
 """What a robot does when it recovers."""
 _RAMP_S = 0.1  # From one command to the next.
 
@@ -169,32 +169,19 @@ class WalkingRecovery:
     """What the robot does when the probability falls below a threshold."""
 
     branch: str = "stop"
-    """"stop": a command of zero; "slower": a share of the command; "crouch": down to a posture,
-    with damping; "policy": another policy."""
+    """``stop``: a command of zero; ``slower``: a share of the command."""
     threshold: float = 0.5
     """Γ_thre, of the probability; not tuned."""
     persistence_s: float = 0.04
     """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
     move, a single row can be unlike those of training."""
     slower_share: float = 0.3
-    """Share of the command for "slower"."""
-    crouch: dict[str, float] = field(default_factory=dict)
-    """Joint positions of the crouched posture [rad], by regular expression; the others keep those
-    of the standing posture."""
-    crouch_step_rad: float = 0.3
-    """Largest distance of the crouch's set points from the measured joints [rad]."""
-    policy: str = ""
-    """Policy file of "policy", relative to the folder of the robot's YAML file."""
+    """Share of the command for ``slower``."""
 
     def __post_init__(self) -> None:
         if self.branch not in BRANCHES:
             raise ValueError(
                 f"recovery: branch must be one of {list(BRANCHES)}; got '{self.branch}'"
-            )
-        if (self.branch == "policy") != bool(self.policy):
-            raise ValueError(
-                "recovery: 'policy' names the file of branch 'policy', and of no other; got branch "
-                f"'{self.branch}' and policy '{self.policy}'"
             )
 
 

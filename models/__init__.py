@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drake_safety.robots.model_files import add_to_package_map, required_file
+from drake_safety.robots.model_files import add_to_package_map, model_file
 from drake_safety.robots.reading import did_you_mean
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
@@ -43,5 +43,5 @@ def robot_files(name: str) -> list[Path]:
     """
     robot = load_robot(name)
     folder = Path(robot.source_dir)
-    model = required_file(robot.urdf, robot.source_dir, robot.requires)
+    model = model_file(robot.urdf, robot.source_dir, robot.requires)
     return [Path(name) if name not in robot_names() else folder / "robot.yaml", model]

@@ -7,6 +7,7 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablate import ablate
 from studies.adaptation import adaptation
+from studies.animation import animation
 from studies.bench import bench
 from studies.converged import converged
 from studies.kills import kills
@@ -30,6 +31,7 @@ app.command()(ablate)
 app.command()(plan_study)
 app.command("learning-curve")(train_fewer)
 app.command()(adaptation)
+app.command()(animation)
 app.command()(readings)
 app.command()(converged)
 app.command()(kills)

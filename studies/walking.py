@@ -138,8 +138,6 @@ def walking(
             fallen = fallen[:recovered]
             alone = [motion for motion in pushed if motion.index in set(fallen)]
             for branch in BRANCHES:
-                if branch == "policy" and not loaded.parameters.recovery.policy:
-                    continue
                 again = sets.run("push", fallen, _PUSHED_S, branch=branch)
                 estimates |= recovery_estimates(branch, alone, again)
         if commands:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
@@ -14,7 +15,6 @@ _NAMES = {
     "smallest_margin": "smallest margin, true state",
     "action_change": "the policy's change of action",
 }
-_BRANCHES = {"stop": "stop", "slower": "slower", "crouch": "crouch", "policy": "another policy"}
 
 
 def walking_text(results: Results) -> str:
@@ -61,7 +61,7 @@ def walking_text(results: Results) -> str:
             f"Inside the ranges it passes on {_percent(found['guard.unchanged_inside'])} of the "
             "time what is asked."
         )
-    branches = [name for name in _BRANCHES if results.has(f"recovery.{name}.saved")]
+    branches = [name for name in BRANCHES if results.has(f"recovery.{name}.saved")]
     if branches:
         n = found[f"recovery.{branches[0]}.saved"].n
         lines += [
@@ -72,7 +72,7 @@ def walking_text(results: Results) -> str:
         for name in branches:
             key = f"recovery.{name}"
             lines.append(
-                f"| {_BRANCHES[name]} | {_percent(found[f'{key}.saved'])} | "
+                f"| {name} | {_percent(found[f'{key}.saved'])} | "
                 f"{_plain(found[f'{key}.impact_m_s'])} | "
                 f"{_plain(found[f'{key}.impact_without_m_s'])} |"
             )

@@ -15,6 +15,8 @@ from drake_safety.cli import main
 from drake_safety.cli.target_run import alarm_row, named_push
 from drake_safety.cli.targets import join_targets, parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.planning.goal_verdict import assess_goal
@@ -277,7 +279,6 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
         viewer=None,
         start=lambda: started.append(True),
         save=lambda timeline, events, threshold: None,
-        save_animation=lambda *arguments: None,
     )
     monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
     monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)
@@ -310,8 +311,8 @@ def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
 
 
 def test_a_threshold_beside_the_assessment_is_not_believed(call, folder):
-    forged = {"value": -5.0, "low": -5.0, "high": -5.0, "n": 100}
-    (folder / "evaluation.json").write_text(json.dumps({"plans.sharpened.threshold": forged}))
+    forged = Estimate.exact(-5.0, 100)
+    Results({"plans.sharpened.threshold": forged}).write(folder / "evaluation.json")
     code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
     assert code == 1
     assert "unsafe" in told

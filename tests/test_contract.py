@@ -1,4 +1,4 @@
-"""check_contract: what a diagram lacks is told, item by item, and how to mend it."""
+"""check_contract: what a diagram lacks is told, item by item, and how to fix it."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,5 @@
 """`evaluate` and `calibrate` for plans with a goal."""
 
-import json
 import shutil
 
 import pytest
@@ -13,6 +12,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
 )
 from drake_safety.evaluation import figure_style
+from drake_safety.evaluation.results import Results
 from drake_safety.simulation import pushed_motions, rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
@@ -41,17 +41,14 @@ def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, caps
     printed = capsys.readouterr().out
     for title in ("all targets", "the other hand", "paper uses its next H steps"):
         assert title in printed
-    report = json.loads((folder / "evaluation.json").read_text())
-    assert (
-        report["plans.causes.right_cause"]["n"] == report["plans.causes.by_cause_probability"]["n"]
-    )
+    report = Results.read(folder / "evaluation.json")
+    assert report["plans.causes.right_cause"].n == report["plans.causes.by_cause_probability"].n
     for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
         for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
-            estimate = report[f"{prefix}.{name}.unsafe_recall"]
-            assert set(estimate) == {"value", "low", "high", "n"}
-    assert report["plans.outcomes.safe"]["n"] == 30
-    assert report["plans.other_hand.outcomes.safe"]["n"] == 10
-    assert report["plans.sharpened.threshold"]["n"] == report["calibration_episodes"] == 20
+            assert f"{prefix}.{name}.unsafe_recall" in report
+    assert report["plans.outcomes.safe"].n == 30
+    assert report["plans.other_hand.outcomes.safe"].n == 10
+    assert report["plans.sharpened.threshold"].n == report.entries["calibration_episodes"] == 20
     assert "plans.plane.sharpened.right" in report
     for name in ("plans", "plans_roc", "reachable_region"):
         assert (folder / f"{name}.png").is_file()
@@ -90,12 +87,12 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     monkeypatch.undo()
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, run, "--plane-step", 0) in (0, None)
-    report = json.loads((folder / "evaluation.json").read_text())
-    threshold = report["plans.sharpened.threshold"]["value"]
+    report = Results.read(folder / "evaluation.json")
+    threshold = report["plans.sharpened.threshold"].value
     assert threshold == pytest.approx(stored["sharpened"]["plan"].threshold)
-    assert report["calibration.sharpened.plan.promised_miss_rate"]["value"] == 0.1
-    missed = report["calibration.sharpened.plan.miss_rate"]["value"]
-    assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"]["value"])
+    assert report["calibration.plan.sharpened.promised_miss_rate"].value == 0.1
+    missed = report["calibration.plan.sharpened.miss_rate"].value
+    assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"].value)
     assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
     printed = " ".join(capsys.readouterr().out.split())
     assert "start as the 120 'nominal' episodes of its calibration" in printed
@@ -108,7 +105,7 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
     arguments = ("--plane-step", 0)
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
-    first = json.loads((folder / "evaluation.json").read_text())
+    first = Results.read(folder / "evaluation.json")
     hash_ = load_scenario(file).simulation_hash()
     kept = [
         fresh_episodes_folder(folder, hash_, seed, options)
@@ -122,9 +119,8 @@ def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shu
     # Once all are there, even a simulation that always fails is not needed.
     monkeypatch.setattr(rollouts, "run_episode", forbidden)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
-    again = json.loads((folder / "evaluation.json").read_text())
-    assert again.keys() == first.keys()
-    assert all(again[key] == first[key] for key in first if key.startswith("plans."))
+    again = Results.read(folder / "evaluation.json")
+    assert list(map(str, again.values())) == list(map(str, first.values()))
 
 
 @pytest.mark.slow
@@ -132,7 +128,7 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     options = ("--plane-step", 0, "--other-hand", 0, "--no-baselines", "--out", tmp_path)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *options) in (0, None)
-    report = json.loads((tmp_path / "evaluation.json").read_text())
+    report = Results.read(tmp_path / "evaluation.json")
     judged = {key.split(".")[1] for key in report if key.endswith(".brier")}
     assert judged == {"sharpened", "paper", "fair"}
 
@@ -174,7 +170,7 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
     options += ("--workers", 1, "--seed", 100, "--plane-step", 0, "--other-hand", 0)
     assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
     printed = capsys.readouterr().out
-    report = json.loads((folder / "evaluation.json").read_text())
+    report = Results.read(folder / "evaluation.json")
     judged = {key.split(".")[1] for key in report if key.startswith("monitoring.")}
     assert judged == {
         "motions",
@@ -186,16 +182,16 @@ def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shutt
         "smallest_margin",
     }
     pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
-    assert refused["n"] == 30 and pushed["n"] == 30 - round(30 * refused["value"])
-    assert 0 < pushed["value"] < 1
+    assert refused.n == 30 and pushed.n == 30 - round(30 * refused.value)
+    assert 0 < pushed.value < 1
     assert "Alarms on pushed motions" in printed
     assert (folder / "monitoring.png").is_file()
     # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
     monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
     monkeypatch.setattr(rollouts, "run_episode", None)
     assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
-    again = json.loads((folder / "evaluation.json").read_text())
-    assert all(again[key] == report[key] for key in report if key.startswith("monitoring."))
+    again = Results.read(folder / "evaluation.json")
+    assert str(again.select(set="monitoring")) == str(report.select(set="monitoring"))
 
 
 @pytest.mark.train

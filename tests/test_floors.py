@@ -46,7 +46,7 @@ EXTRAS = {
     "logs": ("drake_safety/logs/",),
     "mujoco": ("drake_safety/plants/mujoco",),
     "onnx": ("drake_safety/learning/onnx_graph.py",),
-    "report": ("drake_safety/evaluation/report/page",),
+    "report": ("drake_safety/evaluation/report.py",),
     "robots": ("drake_safety/robots/",),
     "train": (
         "drake_safety/control/policy_network.py",

@@ -53,7 +53,6 @@ def test_an_episode_is_recorded_with_its_timeline_and_events(monkeypatch, capsys
     ("options", "message"),
     [
         (["--push", "ball"], "run: --push: task 'CartPole' has no ball to throw"),
-        (["--animation"], "--animation needs a task with a robot on legs"),
         (["--target", "1 2 3"], "has no plans with a goal"),
     ],
 )

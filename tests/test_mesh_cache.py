@@ -8,7 +8,6 @@ import pytest
 
 from drake_safety.robots.mesh_cache import (
     cache_folder,
-    has_own_colours,
     is_shown,
     mesh_points,
     shown_mesh,
@@ -75,25 +74,22 @@ def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("materials", "shown", "own_colours"),
+    ("materials", "shown"),
     [
-        (None, True, False),
-        ("newmtl a\nKd 1 0 0\n", True, True),
-        ("newmtl a\nTr 0.0\n", True, True),
-        ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True, True),
-        ("newmtl a\nTr lots\n", True, True),
-        ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False, False),
+        (None, True),
+        ("newmtl a\nKd 1 0 0\n", True),
+        ("newmtl a\nTr 0.0\n", True),
+        ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True),
+        ("newmtl a\nTr lots\n", True),
+        ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False),
     ],
 )
-def test_an_obj_whose_materials_are_all_transparent_is_converted(
-    cache, tmp_path, materials, shown, own_colours
-):
+def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path, materials, shown):
     path = tmp_path / "hip.obj"
     trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
     if materials is not None:
         path.with_suffix(".mtl").write_text(materials)
     assert is_shown(path) == shown
-    assert has_own_colours(path) == own_colours
     found = shown_mesh(path, "0.2 0.4 0.6 1")
     assert (found == path) == shown
     if not shown:

@@ -258,7 +258,3 @@ def test_the_two_sides_have_mirrored_limits_and_equal_motors_and_masses(scene):
         assert joint.velocity_upper_limit() == mirrored.velocity_upper_limit(), one
     for one, other in partners_of(published, published.bodies).items():
         assert scene.bodies[one].default_mass() == scene.bodies[other].default_mass(), one
-
-
-def test_laikago_looks_the_same_whatever_packages_are_installed():
-    assert load_robot("laikago").visuals == ""

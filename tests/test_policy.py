@@ -167,10 +167,15 @@ def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
     [
         ({"joints": ["knee", "elbow"]}, r"lacks \['elbow'\]; it has \['hip', 'knee', 'tail'\]"),
         ({"joints": ["knee"]}, r"takes no observation of 11 entries .*joint_pos_rel 1"),
-        ({"observation": []}, "observation must list terms"),
-        ({"observation": [ObservationTerm(name="lidar")]}, r"unknown ones \['lidar'\]"),
-        ({"gains": {"knee": JointGains()}}, "joint 'hip' has no gains"),
-        ({"action_scale": {"knee": 1.0}}, r"no pattern for joints \['hip'\]"),
+        ({"default_positions": {}}, r"'default_positions' \[rad\], such as"),
+        ({"joints": []}, r"'joints' in the network's order; the robot has \['hip'"),
+        ({"observation": []}, "state in policy.yaml 'observation', the terms"),
+        (
+            {"observation": [ObservationTerm(name="lidar")]},
+            r"unknown terms \['lidar'\]; registered",
+        ),
+        ({"gains": {"knee": JointGains()}}, r"'gains' \[N·m/rad\] of joints \['hip'\]"),
+        ({"action_scale": {"knee": 1.0}}, r"'action_scale' \[rad\] of joints \['hip'\]"),
         (
             {"observation": [ObservationTerm(name="last_action", scale=[1.0, 2.0, 3.0])]},
             "has 2 entries; got 3 scales",

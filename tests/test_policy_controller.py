@@ -21,6 +21,7 @@ def controller(monkeypatch, evaluate=lambda batch: batch[:, :2] + 1.0):
     parameters = PolicyParameters(
         network="net.onnx",
         joints=["b", "a"],
+        default_positions={".*": 0.0},
         action_scale={".*": 0.5},
         gains={".*": JointGains(stiffness=1.0)},
         observation=[ObservationTerm(name=name) for name in terms],

@@ -45,7 +45,7 @@ def test_rows_are_selected_by_set_method_and_metric():
 
 def test_what_is_written_is_read_again_with_six_digits(tmp_path):
     estimates = {
-        "a.b.c": Estimate(1 / 3, 0.1, 0.9, 7),
+        "a.b.c": Estimate(1 / 3, 0.1, 0.9, np.int64(7)),
         "a.b.never": Estimate(math.inf, math.nan, math.nan, 3),
     }
     entries = {"command": "drake-safety evaluate Γ", "seed": 4}

@@ -6,12 +6,12 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 import yaml
-from pydrake.geometry import Box, Capsule, Role, Sphere
+from pydrake.geometry import Box, Capsule, Sphere
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.extras import MissingExtraError
-from drake_safety.robots import model_files, urdf_copy
+from drake_safety.robots import model_files
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import load_robot_file
@@ -144,39 +144,3 @@ def test_a_package_of_pips_is_found_by_its_share_folder_or_as_a_python_package()
     import jinja2
 
     assert str(model_file("package://jinja2/loaders.py")) == jinja2.loaders.__file__
-
-
-def seen(plant, scene_graph):
-    """Names of the shapes that are drawn, by body."""
-    inspector = scene_graph.model_inspector()
-    found = {}
-    for index in plant.GetBodyIndices(plant.GetModelInstanceByName("stool")):
-        geometries = inspector.GetGeometries(plant.GetBodyFrameIdOrThrow(index), Role.kIllustration)
-        found[plant.get_body(index).name()] = [type(inspector.GetShape(one)) for one in geometries]
-    return found
-
-
-def dressed(folder, visuals):
-    robot = write(folder, visuals=visuals)
-    shape = "<visual><geometry><sphere radius='0.3'/></geometry></visual>"
-    (folder / "looks.urdf").write_text(URDF[: URDF.index(" <visual>")] + shape + "</link></robot>")
-    return built(robot)
-
-
-def test_what_only_looks_other_comes_from_another_urdf_where_its_package_is(tmp_path):
-    plant, scene_graph, _ = dressed(tmp_path, "looks.urdf")
-    assert seen(plant, scene_graph)["seat"] == [Sphere]
-    plain, plain_graph, _ = dressed(tmp_path, "package://nobody-has-this/looks.urdf")
-    assert seen(plain, plain_graph)["seat"] == []
-    assert plant.num_collision_geometries() == plain.num_collision_geometries()
-
-
-def test_without_the_converter_a_robot_keeps_its_own_looks(tmp_path, monkeypatch):
-    def missing(path, rgba):
-        raise MissingExtraError(f"nothing converts {path.name}", "a-converter")
-
-    monkeypatch.setattr(urdf_copy, "shown_mesh", missing)
-    robot = write(tmp_path, visuals="looks.urdf")
-    (tmp_path / "looks.urdf").write_text(URDF)
-    plant, scene_graph, _ = built(robot)
-    assert seen(plant, scene_graph)["seat"] == []

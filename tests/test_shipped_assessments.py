@@ -52,7 +52,7 @@ def test_a_card_says_so_where_fresh_episodes_break_a_promise(tmp_path, missed):
     name = assessed_scenarios()[0]
     folder = shutil.copytree(shipped_folder(name), tmp_path / name)
     content = json.loads((folder / EVALUATION_FILE).read_text())
-    content["figures"]["calibration.sharpened.plan.miss_rate"] = [missed, missed, missed, 100]
+    content["figures"]["calibration.plan.sharpened.miss_rate"] = [missed, missed, missed, 100]
     (folder / EVALUATION_FILE).write_text(json.dumps(content))
     card = card_text(folder, load_scenario(name))
     broken = "`sharpened`, before the motion, calls 20.0 % (20.0–20.0) of 100 unsafe episodes safe"

@@ -24,6 +24,15 @@ def meshes_of(path):
     return [element.get("filename") for element in ET.parse(path).getroot().iter("mesh")]
 
 
+def loaded_quietly(copy, folder, caplog):
+    """The plant of the written copy, of which Drake does not warn."""
+    copy.write(folder / "copy.urdf")
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(folder / "copy.urdf"))
+    assert [record.getMessage() for record in caplog.records] == []
+    return plant
+
+
 def test_a_mesh_that_drake_shows_goes_along_as_it_is(tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
@@ -94,32 +103,24 @@ def test_a_mesh_of_an_installed_package_is_found(tmp_path):
     assert list(copy.meshes) == ["meshes/lowerleg.gltf"]
 
 
-def test_a_lost_collision_mesh_leaves_its_box_behind_turned_as_it_was(tmp_path):
-    stl(tmp_path / "foot.stl", TRIANGLE)
-    shape = mesh("collision", "foot.stl").replace(
-        "<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>'
-    )
-    links = LINK.format("foot", GOOD, shape), LINK.format("a", GOOD, "")
-    copy = simulatable_copy(written(tmp_path, *links))
-    (box,) = copy.lost_shapes["foot"]
-    # A quarter turn about z: x becomes y, and y becomes -x.
-    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 5]], atol=1e-12)
-    assert list(copy.root.iter("collision")) == []
-    assert copy.restore_boxes("foot") and not copy.restore_boxes("a")
-    assert copy.root.find(".//collision/geometry/box").get("size") == "1 2 4"
-    assert copy.root.find(".//collision/origin").get("xyz") == "-0.5 1 3"
-
-
-def test_the_box_of_another_format_is_the_same(tmp_path):
+@pytest.mark.parametrize("kind", ["stl", "ply"])
+def test_a_lost_collision_mesh_leaves_its_points_behind_turned_and_scaled(tmp_path, kind):
     trimesh = pytest.importorskip("trimesh")
-    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(tmp_path / "foot.ply")
-    shape = mesh("collision", "foot.ply")
+    trimesh.creation.box(bounds=[[0, 0, 0], [2, 1, 4]]).export(tmp_path / f"foot.{kind}")
+    shape = (
+        mesh("collision", f"foot.{kind}")
+        .replace("<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>')
+        .replace("/></geo", ' scale="1 1 2"/></geo')
+    )
     copy = simulatable_copy(written(tmp_path, LINK.format("foot", GOOD, shape)))
-    (box,) = copy.lost_shapes["foot"]
-    np.testing.assert_allclose(box, [[-0.5, -1, -2], [0.5, 1, 2]], atol=1e-6)
+    (points,) = copy.lost_meshes["foot"]
+    # A quarter turn about z: x becomes y, and y becomes -x.
+    box = [points.min(axis=0), points.max(axis=0)]
+    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
+    assert list(copy.root.iter("collision")) == [] and copy.bare_links() == ["foot"]
 
 
-def test_friction_and_impossible_inertias_are_mended_and_told(tmp_path):
+def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):
     odd = GOOD.replace('ixy="0"', 'ixy="3"')
     joint = (
         '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
@@ -144,20 +145,14 @@ def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
         '<safety_controller k_velocity="1"/><calibration rising="0"/></joint>'
     )
     copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, ""), nothing, joint))
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert [record.getMessage() for record in caplog.records] == []
+    loaded_quietly(copy, tmp_path, caplog)
 
 
-def test_inertias_beyond_the_triangle_inequality_are_mended_and_drake_takes_them(tmp_path, caplog):
+def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog):
     odd = '<inertia ixx="0.001" iyy="0.001" izz="0.007" ixy="0.0005" ixz="0" iyz="0"/>'
     copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
     assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert [record.getMessage() for record in caplog.records] == []
+    loaded_quietly(copy, tmp_path, caplog)
 
 
 def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path, caplog):
@@ -181,14 +176,10 @@ def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path,
         )
     )
     assert [one.get("name") for one in copy.root.iter("actuator")] == ["m_j"]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
-    assert plant.num_actuators() == 1
-    assert [record.getMessage() for record in caplog.records] == []
+    assert loaded_quietly(copy, tmp_path, caplog).num_actuators() == 1
 
 
-def test_a_material_of_two_colours_becomes_two(tmp_path):
+def test_a_material_of_two_colours_becomes_two(tmp_path, caplog):
     black = '<material name="black"><color rgba="0 0 0 {}"/></material>'
     box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
     parts = [
@@ -199,7 +190,5 @@ def test_a_material_of_two_colours_becomes_two(tmp_path):
     ]
     copy = simulatable_copy(written(tmp_path, *parts))
     assert [one.get("name") for one in copy.root.iter("material")] == ["black", "black", "black_1"]
-    copy.write(tmp_path / "copy.urdf")
-    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    Parser(plant).AddModels(str(tmp_path / "copy.urdf"))
+    loaded_quietly(copy, tmp_path, caplog)
     assert copy.notes == ["the material 'black' has 2 colours; now each has its own name"]

@@ -48,46 +48,6 @@ def test_a_visual_for_which_there_is_no_mesh_is_taken_out(tmp_path):
     assert list(copy.root.iter("visual")) == []
 
 
-def test_links_look_like_those_of_another_urdf_where_it_has_any_looks(tmp_path):
-    own = written(tmp_path, red_seat("own.obj") + LINK.format("leg", GOOD, mesh("visual", "b.obj")))
-    (tmp_path / "other").mkdir()
-    shapes = mesh("visual", "meshes/fine.obj") + mesh("visual", "meshes/bolts.obj")
-    painted = shapes.replace("</visual>", '<material name="red"/></visual>', 1)
-    other_red = '<material name="red"><color rgba="0.5 0 0 1"/></material>'
-    body = other_red + LINK.format("seat", GOOD, painted) + LINK.format("leg", GOOD, "")
-    other = written(tmp_path / "other", body + LINK.format("wheel", GOOD, mesh("visual", "w.obj")))
-    copy = read_urdf(own)
-    copy.take_visuals(read_urdf(other))
-    looks = {
-        link.get("name"): [shape.get("filename") for shape in link.iter("mesh")]
-        for link in copy.root.findall("link")
-    }
-    folder = (tmp_path / "other" / "meshes").resolve()
-    assert looks == {
-        "seat": [str(folder / "fine.obj"), str(folder / "bolts.obj")],
-        "leg": ["b.obj"],
-    }
-    # Either has its own red.
-    assert [one.get("name") for one in copy.root.iter("material")].count("visuals_red") == 2
-    assert [one.get("name") for one in copy.root.findall("material")] == ["red", "visuals_red"]
-
-
-def test_looks_of_a_link_that_lies_elsewhere_are_refused(tmp_path):
-    def stool(height):
-        return (
-            LINK.format("seat", GOOD, "")
-            + LINK.format("leg", GOOD, mesh("visual", "leg.obj"))
-            + '<joint name="hip" type="fixed"><parent link="seat"/><child link="leg"/>'
-            + f'<origin xyz="0 0 {height}" rpy="0 0 0"/></joint>'
-        )
-
-    (tmp_path / "other").mkdir()
-    copy = read_urdf(written(tmp_path, stool(-0.5)))
-    copy.take_visuals(read_urdf(written(tmp_path / "other", stool("-0.50"))))
-    with pytest.raises(ValueError, match=r"visuals of link 'leg' .*-0\.4.*, expected"):
-        copy.take_visuals(read_urdf(written(tmp_path / "other", stool(-0.4))))
-
-
 def test_collisions_go_and_visuals_stay(tmp_path):
     shapes = mesh("collision", "a.obj") + mesh("visual", "b.obj")
     copy = read_urdf(written(tmp_path, LINK.format("a", GOOD, shapes)))

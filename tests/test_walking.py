@@ -176,17 +176,11 @@ def test_a_push_accelerates_the_robot():
 
 
 @pytest.mark.parametrize(
-    ("branch", "options"),
-    [
-        ("stop", {}),
-        ("slower", {"slower_share": 0.5}),
-        ("crouch", {"crouch": {".*_thigh_joint": 1.3, ".*_calf_joint": -2.5}}),
-        ("policy", {"policy": "policy.yaml"}),
-    ],
+    ("branch", "slowest", "fastest"), [("stop", -0.15, 0.15), ("slower", 0.1, 0.8)]
 )
-def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, options):
+def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, slowest, fastest):
     scenario = load_scenario("go2_walking")
-    scenario.parameters.recovery = WalkingRecovery(branch=branch, **options)
+    scenario.parameters.recovery = WalkingRecovery(branch=branch, slower_share=0.5)
     loop = scenario.make_loop(recovery=True)
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
@@ -202,14 +196,8 @@ def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, options
     simulator.AdvanceTo(3.5)
     assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 1.0
     slower = loop.GetOutputPort("output").Eval(context)[0]
-    height = loop.GetOutputPort("plant_state").Eval(context)[6]
-    standing = loop.kinematics.standing_height
     assert loop.GetOutputPort("margins").Eval(context)[loop.constraint_names.index("tilt")] > 0.4
-    if branch in ("stop", "crouch"):
-        assert abs(slower) < 0.15
-    if branch == "slower":
-        assert 0.1 < slower < 0.8 * speed
-    assert (height < 0.75 * standing) == (branch == "crouch")
+    assert slowest < slower / speed < fastest
 
 
 def test_what_a_diagram_lacks_is_named():
@@ -221,5 +209,3 @@ def test_what_a_diagram_lacks_is_named():
         loop.set_guarded(loop.CreateDefaultContext(), True)
     with pytest.raises(ValueError, match=r"branch must be one of \['stop', .*got 'jump'"):
         WalkingRecovery(branch="jump")
-    with pytest.raises(ValueError, match="'policy' names the file of branch 'policy'"):
-        WalkingRecovery(branch="stop", policy="other.yaml")

@@ -83,10 +83,10 @@ def test_guard_recovery_and_speeds_compare_the_same_motions():
     guard = guard_estimates([falls, falls, stays], [stays, falls, stays], [motion([1], changed=1)])
     assert guard["guard.fewer_falls"].value == 0.5
     assert guard["guard.unchanged_inside"].value == 0.0
-    saved = recovery_estimates("crouch", [falls, falls], [stays, softer])
-    assert saved["recovery.crouch.saved"].value == 0.5
-    assert saved["recovery.crouch.impact_m_s"].value == 2.0
-    assert saved["recovery.crouch.impact_without_m_s"].value == 3.0
+    saved = recovery_estimates("slower", [falls, falls], [stays, softer])
+    assert saved["recovery.slower.saved"].value == 0.5
+    assert saved["recovery.slower.impact_m_s"].value == 2.0
+    assert saved["recovery.slower.impact_without_m_s"].value == 3.0
     assert speed_estimates([stays], [stays])["speed.difference_to_mujoco_m_s"].value == 0.0
 
 
@@ -118,7 +118,7 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
     for alarm in ("sharpened", "tilt"):
         keys += [f"alarm.{alarm}.{x}" for x in ("announced", "lead_s", "alarms_without_leaving")]
         keys.append(f"tours.{alarm}.false_alarms_per_hour")
-    for branch in ("stop", "crouch"):
+    for branch in ("stop", "slower"):
         keys += [f"recovery.{branch}.{x}" for x in ("saved", "impact_m_s", "impact_without_m_s")]
     results = Results(
         estimates=dict.fromkeys(keys, estimate),
@@ -131,5 +131,5 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
     plans["plans.outcomes.safe"] = estimate
     with_plans = walking_text(Results({**results, **plans}, results.entries))
     assert "| MLP | 0.500 (0.400–0.600) | 0.500" in with_plans
-    for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| crouch |"):
+    for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| slower |"):
         assert row in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -94,7 +93,7 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.files.atomic import replacing
+    from drake_safety.evaluation.results import Results
     from drake_safety.simulation.scenario import load_scenario
 
     loaded = load_scenario(scenario)
@@ -143,7 +142,7 @@ def adapt(
                     for key, estimate in _judge(one, fresh).items()
                 }
     differing, num_pairs = pairs.gap
-    report = {
+    entries = {
         "command": command_line(),
         "scenario": loaded.name,
         "scenario_hash": pairs.actual.info.scenario_hash,
@@ -155,11 +154,9 @@ def adapt(
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
         "versions": versions(),
-        **{key: estimate.to_json() for key, estimate in judged.items()},
     }
     file = folder / "adaptation.json"
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    Results(judged, entries).write(file)
     console.print(_adaptation_table(adapted, differing, num_pairs, name))
     if not differing:
         _print_unchanged(loaded, adapted, num_pairs)

@@ -37,10 +37,6 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
     from drake_safety.evaluation.timeline_figure import timeline_figure
     from drake_safety.simulation.free_motion import run_free
 
-    if settings.is_animated:
-        raise ValueError(
-            "run: --animation needs a task with a robot on legs; see recording.html for others"
-        )
     recording = Recording(settings)
     loop = settings.make_loop(recording.viewer)
     recording.start()

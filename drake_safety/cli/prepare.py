@@ -62,6 +62,13 @@ def new(
             dir_okay=False,
         ),
     ] = None,
+    motors: Annotated[
+        str | None,
+        typer.Option(
+            help="Joints in the order of the robot's motors, with commas, for a deploy.yaml, which "
+            "numbers them."
+        ),
+    ] = None,
     feet: Annotated[
         str | None,
         typer.Option(help="Links that touch the ground, with commas; the lowest by default."),
@@ -81,56 +88,50 @@ def new(
             f"policy {policy}"
         )
     # Before anything is written.
-    template = None if policy is None else survey_policy(policy)
-    moved: list[str] | None = []
-    if template is not None:
-        moved = template.joints or None
+    template = None if policy is None else survey_policy(policy, _names(motors))
     written = write_robot(
         name,
         urdf,
         task,
         Path(name) if out is None else out,
-        feet=None if feet is None else [link.strip() for link in feet.split(",")],
-        moved=moved,
+        feet=_names(feet) or None,
+        moved=() if template is None else template.joints or None,
     )
     files, asked = written.files, written.asked
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)
         files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
-    sizes = written.sizes
-    console.print(
-        f"{name}: {sizes.mass_kg:.1f} kg, its base '{sizes.base}' stands {sizes.height_m:.3f} m "
-        "high",
-        highlight=False,
-        soft_wrap=True,
-    )
+    mass_kg, height_m = written.sizes.mass_kg, written.sizes.height_m
+    _say(f"{name}: {mass_kg:.1f} kg, its base '{written.sizes.base}' stands {height_m:.3f} m high")
     for path in files:
         print_path("wrote", path)
     if written.fitted:
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(written.fitted.items()))
-        console.print(
+        _say(
             f"fitted {sum(written.fitted.values())} shapes in place of collision meshes that Drake "
             f"does not read: {kinds}. Look at them: drake-safety check {written.files[-1]} "
-            "--picture FILE",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+            "--picture FILE"
         )
-    for what in written.left_out:
-        console.print("note ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    for what in written.copy.left_out:
+        _say(f"note  {what}", "yellow")
     if written.bare:
-        console.print(
+        _say(
             f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
             "missing or cannot be read: everything passes through "
             f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
-            style="bold red",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+            "bold red",
         )
     for what in asked:
-        console.print("ask  ", what, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        _say(f"ask   {what}", "yellow")
     print_path("next: drake-safety check", written.files[-1])
+
+
+def _say(text: str, style: str | None = None) -> None:
+    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def _names(text: str | None) -> list[str]:
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def check(
@@ -179,7 +180,7 @@ def check(
             word, style = _WORDS[finding.is_ok, finding.is_warning]
             text = Text.assemble((word, style), f"  {finding.item}: {finding.message}")
             if finding.remedy:
-                text.append(f"\n         mend: {finding.remedy}")
+                text.append(f"\n         fix: {finding.remedy}")
             console.print(text, highlight=False, soft_wrap=True)
     if picture is not None:
         _draw(scenario, picture)

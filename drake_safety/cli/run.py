@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from drake_safety.simulation.throws import ThrowLog
 
 _DURATION_S = 5.0  # Of a run with balls.
+_AROUND_IMPACT_S = (-0.02, 0.16)  # The ball in the air, and its effect.
+_AFTER_TRIGGER_S = 0.3  # Feet in the air.
 _PORTS = (
     "safety_probability",
     "belief",
@@ -106,9 +108,6 @@ def run(
         bool, typer.Option("--meshcat", help="Show the run live in the browser, in real time.")
     ] = False,
     host: HostOption = LOOPBACK,
-    animation: Annotated[
-        bool, typer.Option("--animation", help="Also write animation.gif.")
-    ] = False,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
@@ -130,7 +129,6 @@ def run(
         duration_s=duration,
         folder=(out or learned.out) / "run",
         is_live=meshcat,
-        is_animated=animation,
         host=host,
     )
     print_shipped(learned)
@@ -183,14 +181,6 @@ def _run_with_balls(settings: RunSettings) -> None:
         _table_of_events(loop, settings.assessment, log, throws),
         f"recovery where the probability is below {loop.scenario.parameters.recovery.threshold:g}, "
         f"that of scenario '{loop.scenario.name}'",
-    )
-    recording.save_animation(
-        loop,
-        log.time_s,
-        {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]},
-        log.extra["safety_probability"][:, 0],
-        loop.scenario.parameters.recovery.threshold,
-        [start for start, _ in log.recovery_intervals_s],
     )
 
 
@@ -257,7 +247,9 @@ def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
         loop, {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}
     )
     triggers = [start for start, _ in log.recovery_intervals_s]
-    instants = still_times(log.time_s, [throw.time_s for throw in throws], triggers)
+    events = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
+    events += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
+    instants = still_times(log.time_s, events)
     return timeline_figure(
         log.time_s,
         log.extra["safety_probability"][:, 0],

@@ -47,7 +47,6 @@ class RunSettings:
         duration_s: Duration of the simulation [s]; None for the default.
         folder: Folder of recording and figures.
         is_live: Whether the run is shown in the browser, in real time.
-        is_animated: Whether an animation is written.
         host: Address that serves the page.
     """
 
@@ -60,7 +59,6 @@ class RunSettings:
     duration_s: float | None
     folder: Path
     is_live: bool
-    is_animated: bool = False
     host: str = LOOPBACK
 
     @property
@@ -127,41 +125,6 @@ class Recording:
         print_path("recording", recording)
         for path in pictures:
             print_path("picture  ", path)
-
-    def save_animation(
-        self,
-        loop: ClosedLoop,
-        time_s: np.ndarray,
-        states: Mapping[str, np.ndarray],
-        gamma: np.ndarray,
-        threshold: float,
-        event_times_s: Sequence[float],
-    ) -> None:
-        """Writes animation.gif beside the recording, if the settings ask for it.
-
-        Args:
-            loop: The simulated closed loop.
-            time_s: Instants of its log [s], (N,).
-            states: Positions and velocities by name of the model instance, (N, n).
-            gamma: Γ as triggers or alarms take it, (N,).
-            threshold: Threshold on Γ of triggers or alarms.
-            event_times_s: Times of these [s].
-        """
-        if not self._settings.is_animated:
-            return
-        from drake_safety.evaluation.animation import save_animation
-        from drake_safety.evaluation.stills import stack_positions
-
-        path = save_animation(
-            loop,
-            time_s,
-            stack_positions(loop, states),
-            gamma,
-            threshold,
-            self._settings.folder / "animation.gif",
-            event_times_s=event_times_s,
-        )
-        print_path("animation", path)
 
 
 def first_below(probability: np.ndarray, threshold: float) -> int | None:

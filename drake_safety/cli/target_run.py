@@ -105,15 +105,6 @@ def run_to_target(
         table_of_motion(loop, settings.assessment, motion, threshold),
         f"alarm where the probability is below {threshold:.3f} in any row, {origin}",
     )
-    alarm = alarm_row(motion, threshold)
-    recording.save_animation(
-        loop,
-        motion.time_s,
-        {loop.robot.name: motion.plant_state},
-        motion.extra["safety_probability"][:, 0],
-        threshold,
-        [] if alarm is None else [float(motion.time_s[alarm])],
-    )
     return True
 
 
@@ -157,7 +148,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
         motion: Log of the motion, with the assessor's outputs.
         threshold: Probability below which a row is an alarm.
     """
-    from drake_safety.evaluation.stills import render_stills, spread_times, stack_positions
+    from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
     from drake_safety.evaluation.timeline_figure import timeline_figure
 
     positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
@@ -167,7 +158,7 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
     if motion.push is not None:
         events += [motion.push.time_s, motion.push.time_s + motion.push.duration_s + _AFTER_PUSH_S]
     events = [instant for instant in events if instant <= motion.time_s[-1]]
-    instants = spread_times(motion.time_s, events, num_stills=_NUM_STILLS)
+    instants = still_times(motion.time_s, events, num_stills=_NUM_STILLS)
     alarm = alarm_row(motion, threshold)
     return timeline_figure(
         motion.time_s,

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from drake_safety.cli.console import console
-from drake_safety.robots.reading import did_you_mean
+from drake_safety.robots.reading import did_you_mean, is_number
 
 if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
@@ -59,18 +59,10 @@ def join_targets(args: Sequence[str]) -> list[str]:
             joined.append(word)
             continue
         numbers = [words.pop(0)]
-        while words and len(numbers) < 3 and _is_number(numbers[-1]) and _is_number(words[0]):
+        while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
             numbers.append(words.pop(0))
         joined.append(f"{word}={' '.join(numbers)}")
     return joined
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
@@ -90,7 +82,7 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     if text in named_targets:
         return np.array(named_targets[text], dtype=float)
     entries = text.split()
-    if len(entries) == 3 and all(map(_is_number, entries)):
+    if len(entries) == 3 and all(map(is_number, entries)):
         return np.array([float(entry) for entry in entries])
     raise ValueError(
         f"{words.goal} '{text}'{did_you_mean(text, named_targets)}: give {' '.join(words.axes)}, "

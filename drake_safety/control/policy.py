@@ -1,13 +1,19 @@
 """Locomotion policies as data: observation terms, actions, gait clock and command limits."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    RobotKinematics,
+)
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import (
@@ -17,8 +23,8 @@ from drake_safety.control.policy_terms import (
     observation_term,
     registered_terms,
 )
-from drake_safety.robots.model_files import required_file
-from drake_safety.robots.robot_model import JointGains, by_pattern
+from drake_safety.robots.model_files import model_file
+from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern, load_typed_file
 
 __all__ = [
     "CommandLimits",
@@ -28,10 +34,15 @@ __all__ = [
     "PolicyInput",
     "PolicyParameters",
     "WholeHistory",
+    "load_policy",
     "network_file",
     "observation_term",
+    "read_policy_file",
     "registered_terms",
+    "with_policy",
 ]
+
+_Value = TypeVar("_Value")
 
 
 @dataclass(kw_only=True)
@@ -113,11 +124,6 @@ class WholeHistory:
 class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
-    read: str = ""
-    """``deploy.yaml`` of unitree_rl_lab or ``config.yaml`` of rl_sar that has what is not stated:
-    ``package://…`` or a path relative to the YAML file."""
-    motors: list[str] = field(default_factory=list)
-    """Joints in the order of the robot's motors, for files that number them."""
     network: str = ""
     """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
     requires: str = ""
@@ -126,7 +132,7 @@ class PolicyParameters:
     """Joints in the network's order; by default those of the network's metadata."""
     default_positions: dict[str, float] = field(default_factory=dict)
     """Joint positions at zero action [rad], by regular expression over joint names; by default
-    those of the network's metadata, else 0."""
+    those of the network's metadata; 0 for joints without one."""
     action_scale: dict[str, float] = field(default_factory=dict)
     """Joint positions per unit of action [rad], by regular expression; by default those of the
     network's metadata."""
@@ -164,7 +170,8 @@ class Policy:
         folder: Folder of the YAML file.
 
     Raises:
-        ValueError: A joint or term does not exist, or the network has other widths.
+        ValueError: A value is missing, a joint or term does not exist, or the network has other
+            widths.
 
     Attributes:
         parameters: Contents of ``policy.yaml``.
@@ -185,30 +192,54 @@ class Policy:
         self.parameters = parameters
         who = f"policy '{parameters.network}' for robot '{robot}'"
         self.network: PolicyNetwork = load_network(network_file(parameters, folder))
-        names = parameters.joints or self.network.metadata.joints
+        metadata = self.network.metadata
+        names = parameters.joints or metadata.joints
         unknown = [name for name in names if name not in joint_names]
-        if unknown or not names or len(set(names)) != len(names):
+        if unknown or len(set(names)) != len(names):
             raise ValueError(
                 f"{who}: joints must be different joints of the robot; got {names}, of which it "
                 f"lacks {unknown}; it has {joint_names}"
             )
         self.joint_names = list(names)
-        self.joints = np.array([joint_names.index(name) for name in names])
-        stated = parameters.default_positions, self.network.metadata.default_positions
-        self.default_positions = np.array(
-            [self._value("default position", *stated, name, robot, 0.0) for name in joint_names]
-        )
-        scales = parameters.action_scale, self.network.metadata.action_scale
-        self.action_scale = np.array(
-            [self._value("action scale", *scales, name, robot, math.nan) for name in names]
-        )
-        missing = [n for n, x in zip(names, self.action_scale, strict=True) if math.isnan(x)]
-        if missing:
-            raise ValueError(
-                f"{who}: action_scale has no pattern for joints {missing}; it has "
-                f"{list(parameters.action_scale)}"
+        self.joints = np.array([joint_names.index(name) for name in names], dtype=int)
+
+        def by_joint(
+            key: str, of_network: Sequence[_Value], joints: list[str]
+        ) -> dict[str, _Value]:
+            """Values that are stated, else those of the network's metadata."""
+            found = dict(zip(metadata.joints, of_network, strict=False))
+            stated = getattr(parameters, key)
+            for name in joints:
+                value = by_pattern(stated, name, key, robot)
+                if value is not None:
+                    found[name] = value
+            return {name: found[name] for name in joints if name in found}
+
+        positions = by_joint("default_positions", metadata.default_positions, joint_names)
+        scales = by_joint("action_scale", metadata.action_scale, names)
+        pairs = zip(metadata.stiffness, metadata.damping, strict=True)
+        servos = [JointGains(stiffness=p, damping=d) for p, d in pairs]
+        self.gains = by_joint("gains", servos, names)
+        missing = []
+        if not names:
+            missing.append(f"'joints' in the network's order; the robot has {joint_names}")
+        if not positions:
+            missing.append("'default_positions' [rad], such as {.*: 0.0}")
+        for key, found in (("'action_scale' [rad]", scales), ("'gains' [N·m/rad]", self.gains)):
+            without = [name for name in names if name not in found]
+            if without:
+                missing.append(f"{key} of joints {without}")
+        if not parameters.observation:
+            width, _ = self.network.widths
+            entries = "" if width is None else f", {width} entries in all"
+            missing.append(
+                f"'observation', the terms of the network's input in its order{entries}; "
+                f"registered are {registered_terms()}"
             )
-        self.gains = self._gains(who, robot)
+        if missing:
+            raise ValueError(f"{who}: state in policy.yaml {'; '.join(missing)}")
+        self.default_positions = np.array([positions.get(name, 0.0) for name in joint_names])
+        self.action_scale = np.array([scales[name] for name in names])
         gait = parameters.gait
         self.initial_phases = (
             _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
@@ -217,6 +248,10 @@ class Policy:
         still = self._still()
         widths = [np.asarray(term(still)).size for term, _ in self._terms]
         for (_, spec), width in zip(self._terms, widths, strict=True):
+            if not width:
+                raise ValueError(
+                    f"{who}: term '{spec.name}' needs a clock: state 'gait: {{period_s: ...}}' [s]"
+                )
             if len(spec.scale) not in (1, width):
                 raise ValueError(
                     f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
@@ -229,42 +264,11 @@ class Policy:
         self._lay_out(widths, samples, by_time=bool(ages) and parameters.history.by == "time")
         self.network.check(who, sum(self.sizes), len(names), self._described(widths))
 
-    def _value(
-        self,
-        what: str,
-        patterns: dict[str, float],
-        values: list[float],
-        joint: str,
-        robot: str,
-        default: float,
-    ) -> float:
-        """A joint's value: stated by a pattern, else of the metadata, else the default."""
-        value = by_pattern(patterns, joint, what, robot)
-        if value is None and values and joint in self.network.metadata.joints:
-            value = values[self.network.metadata.joints.index(joint)]
-        return default if value is None else float(value)
-
-    def _gains(self, who: str, robot: str) -> dict[str, JointGains]:
-        parameters, metadata = self.parameters, self.network.metadata
-        found = {}
-        for i, name in enumerate(self.joint_names):
-            gains = by_pattern(parameters.gains, name, "gains", robot)
-            if gains is None and metadata.stiffness:
-                j = metadata.joints.index(name)
-                gains = JointGains(stiffness=metadata.stiffness[j], damping=metadata.damping[j])
-            if gains is None:
-                raise ValueError(
-                    f"{who}: joint '{self.joint_names[i]}' has no gains; gains has patterns "
-                    f"{list(parameters.gains)}, and the network no metadata of them"
-                )
-            found[name] = gains
-        return found
-
     def _registered(self, who: str) -> list[tuple[Term, ObservationTerm]]:
         unknown = [one.name for one in self.parameters.observation if one.name not in TERMS]
-        if unknown or not self.parameters.observation:
+        if unknown:
             raise ValueError(
-                f"{who}: observation must list terms; got unknown ones {unknown}; registered are "
+                f"{who}: observation has unknown terms {unknown}; registered are "
                 f"{registered_terms()}"
             )
         return [(TERMS[one.name], one) for one in self.parameters.observation]
@@ -384,11 +388,7 @@ class Policy:
 
 
 def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
-    """Returns the file of a policy's network.
-
-    Args:
-        parameters: Contents of ``policy.yaml``.
-        folder: Folder of the YAML file.
+    """Returns the file of a policy's network, named relative to the folder of the YAML file.
 
     Raises:
         MissingExtraError: The package that has it is not installed.
@@ -396,8 +396,44 @@ def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
     """
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
-    return required_file(parameters.network, folder, parameters.requires)
+    return model_file(parameters.network, folder, parameters.requires)
 
 
 def _wrapped(phases: np.ndarray) -> np.ndarray:
     return np.fmod(phases + math.pi, 2 * math.pi) - math.pi
+
+
+def read_policy_file(path: Path) -> PolicyParameters:
+    """Reads a ``policy.yaml``.
+
+    Raises:
+        ValueError: The file does not exist, is not YAML, or does not fit the schema.
+    """
+    return load_typed_file(PolicyParameters, path, f"policy file '{path}'")
+
+
+def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
+    """Loads a policy for a robot.
+
+    Raises:
+        MissingExtraError: The package that has the network is not installed.
+        ValueError: The file does not fit the schema, the robot or the network.
+    """
+    return Policy(
+        read_policy_file(path),
+        kinematics.joint_names,
+        robot=kinematics.robot.name,
+        folder=str(path.parent),
+    )
+
+
+def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:
+    """A robot, whose joints are named, with the gains, rotor inertias and posture of a policy."""
+    posture = dict(zip(joint_names, policy.default_positions.tolist(), strict=True))
+    inertia = policy.parameters.rotor_inertia
+    return replace(
+        robot,
+        posture=posture,
+        joint_gains={**policy.gains},
+        rotor_inertia=inertia or robot.rotor_inertia,
+    )

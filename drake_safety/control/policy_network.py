@@ -109,9 +109,6 @@ class PolicyNetwork:
 def load_network(path: Path) -> PolicyNetwork:
     """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file.
 
-    Args:
-        path: The file.
-
     Raises:
         MissingExtraError: The package that evaluates it is not installed.
         ValueError: The file does not exist, is of another kind, or cannot be read.

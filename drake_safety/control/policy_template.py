@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drake_safety.control.policy_files import read_foreign
+import yaml
+
+from drake_safety.control.foreign_policy import converted_policy
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import registered_terms
 
@@ -20,77 +23,66 @@ class PolicyTemplate:
 
     Attributes:
         network: The network.
-        source: File of another project that describes it; None for a network alone.
-        found: What that file says, by key of ``policy.yaml``.
-        further: Files that belong to it.
-        joints: The joints that the policy moves, in its order; empty if no file names them.
+        found: What a file of another project says, by key of ``policy.yaml``.
+        source: Name of the file that was read.
     """
 
     network: PolicyNetwork
-    source: Path | None = None
     found: dict[str, Any] = field(default_factory=dict)
-    further: list[Path] = field(default_factory=list)
-    joints: list[str] = field(default_factory=list)
+    source: str = ""
+
+    @property
+    def joints(self) -> list[str]:
+        """The joints that the policy moves, in its order; empty if no file names them."""
+        return self.found.get("joints") or self.network.metadata.joints
 
     def write(
         self, folder: Path, robot_joints: list[str], posture: dict[str, float]
     ) -> tuple[list[Path], list[str]]:
-        """Writes ``policy.yaml`` into a robot's folder, and copies the policy's files there.
-
-        Args:
-            folder: The folder.
-            robot_joints: The robot's joints.
-            posture: Its standing posture [rad].
+        """Writes ``policy.yaml`` into a robot's folder, and copies the network there.
 
         Returns:
             The files, and what the user must supply.
         """
-        written = []
-        for path in (self.network.path, *([self.source] if self.source else []), *self.further):
-            written.append(folder / path.name)
-            shutil.copyfile(path, written[-1])
+        network, path = folder / self.network.path.name, folder / "policy.yaml"
+        shutil.copyfile(self.network.path, network)
         text, asked = self.yaml(robot_joints, posture)
-        path = folder / "policy.yaml"
         path.write_text(text, encoding="utf-8")
-        return [*written, path], asked
+        return [network, path], asked
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
-        """Returns the text of ``policy.yaml``, and what the user must supply.
-
-        Args:
-            robot_joints: The robot's joints.
-            posture: Its standing posture [rad].
-        """
-        lines = [
-            "# Written from the policy's files. Commented lines marked ASK have values that these",
-            "# lack: correct them, and delete the sign. docs/walking.md has all keys.",
-        ]
-        if self.source is not None:
-            lines.append(f"read: {self.source.name}  # what is stated here wins")
-        lines.append(f"network: {self.network.path.name}")
+        """Returns the text of ``policy.yaml``, and what the user must supply."""
+        metadata = self.network.metadata
+        found = dict(self.found)
+        lines: list[str] = []
         asked: list[str] = []
 
         def ask(line: str, what: str) -> None:
             lines.append(f"# {line}  # ASK {what}")
             asked.append(f"policy.yaml: {what}")
 
+        names = f"joints: [{', '.join(robot_joints)}]"
         missing = [name for name in self.joints if name not in robot_joints]
-        names = f"[{', '.join(robot_joints)}]"
         if missing:
-            ask(
-                f"joints: {names}",
-                f"the robot's joints in the network's order; its own {missing} are none of them",
-            )
-        elif not self.joints and self.source is not None:
-            ask(f"motors: {names}", "the joints in the order of the robot's motors")
+            found.pop("joints", None)
+            ask(names, f"the robot's joints in the network's order; {missing} are none of them")
         elif not self.joints:
-            ask(f"joints: {names}", "the joints that the network moves, in its order")
-        self._ask_of_joints(ask, posture)
+            ask(names, "the joints that the network moves, in its order")
+        if not metadata.default_positions and "default_positions" not in found:
+            values = ", ".join(f"{name}: {value:g}" for name, value in posture.items() if value)
+            ask(f"default_positions: {{{values}}}", "joint positions at zero action [rad]")
+        if not metadata.action_scale and "action_scale" not in found:
+            ask("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]")
+        if not metadata.stiffness and "gains" not in found:
+            ask(
+                "gains: {.*: {stiffness: 20.0, damping: 0.5}}",
+                "the servos' gains of training [N·m/rad, N·m·s/rad]",
+            )
         lines.append("# rotor_inertia: {.*: 0.01}  # that of training, if it had any [kg·m²]")
-        if "period_s" not in self.found:
+        if "period_s" not in found:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
             asked.append("policy.yaml: the time between two actions [s]; 0.02 is assumed")
-        if "observation" not in self.found:
+        if "observation" not in found:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
             ask("observation:", f"the terms of the network's input in its order{entries}")
@@ -100,22 +92,24 @@ class PolicyTemplate:
                 "#   - {name: velocity_commands}",
                 f"# registered terms: {', '.join(registered_terms())}",
             ]
-        if "command" not in self.found:
+        stated = {term["name"] for term in found.get("observation", [])}
+        unknown = sorted(stated - set(registered_terms()))
+        if unknown:
+            asked.append(f"policy.yaml: functions of the terms {unknown}, by @observation_term")
+        if "gait" in found and "period_s" not in found["gait"]:
+            gait = {"period_s": 0.8, **found.pop("gait")}
+            ask(f"gait: {gait}".replace("'", ""), "the period of the gait's clock [s]")
+        if "command" not in found:
             lines += self._command(asked)
-        return "\n".join(lines) + "\n", asked
-
-    def _ask_of_joints(self, ask: Any, posture: dict[str, float]) -> None:
-        metadata, found = self.network.metadata, self.found
-        if not metadata.default_positions and "default_positions" not in found:
-            values = ", ".join(f"{name}: {value:g}" for name, value in posture.items() if value)
-            ask(f"default_positions: {{{values}}}", "joint positions at zero action [rad]")
-        if not metadata.action_scale and "action_scale" not in found:
-            ask("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]")
-        if not metadata.stiffness and "stiffness" not in found:
-            ask(
-                "gains: {.*: {stiffness: 20.0, damping: 0.5}}",
-                "the servos' gains of training [N·m/rad, N·m·s/rad]",
-            )
+        head = [
+            f"# Written from {self.source}. Commented lines marked ASK have values that it lacks:",
+            "# correct them, and delete the sign. docs/walking.md has all keys.",
+            f"network: {self.network.path.name}",
+        ]
+        if found:
+            text = yaml.safe_dump(found, default_flow_style=None, sort_keys=False, width=100)
+            head.append(text.rstrip())
+        return "\n".join([*head, *lines]) + "\n", asked
 
     def _command(self, asked: list[str]) -> list[str]:
         ranges = self.network.metadata.command
@@ -133,26 +127,17 @@ class PolicyTemplate:
         return [f"command:{ask}", f"  lowest: {lowest}", f"  highest: {highest}"]
 
 
-def survey_policy(path: Path) -> PolicyTemplate:
+def survey_policy(path: Path, motors: Sequence[str] = ()) -> PolicyTemplate:
     """Reads what the files of a policy tell.
 
     Args:
         path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
             ``config.yaml`` of rl_sar.
+        motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
 
     Raises:
         ValueError: The file is none of these, or one that it names cannot be read.
     """
-    path = Path(path)
-    if path.suffix in _NETWORKS:
-        network = load_network(path)
-        return PolicyTemplate(network=network, joints=network.metadata.joints)
-    found, further = read_foreign(path)
-    network = load_network(Path(found["network"]))
-    return PolicyTemplate(
-        network=network,
-        source=path,
-        found=found,
-        further=further,
-        joints=found.get("joints") or network.metadata.joints,
-    )
+    found = {} if path.suffix in _NETWORKS else converted_policy(path, motors)
+    network = load_network(Path(found.pop("network", path)))
+    return PolicyTemplate(network=network, found=found, source=path.name)

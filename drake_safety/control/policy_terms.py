@@ -41,9 +41,6 @@ TERMS: dict[str, Term] = {}
 def observation_term(name: str) -> Callable[[Term], Term]:
     """Registers a function of a :class:`PolicyInput` as an observation term.
 
-    Args:
-        name: The term's name in ``policy.yaml``.
-
     Raises:
         ValueError: Another function has this name.
     """

@@ -24,9 +24,9 @@ from drake_safety.control.safe_sets import (
 from drake_safety.control.whole_body_model import WholeBodyModel
 from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _NUM_PREVIEWED = 8  # Samples of the plan in the whole-body preview.
-_GRAVITY = 9.81
 _SOON_S = 0.1  # Horizon of the extrapolation at constant velocity.
 
 
@@ -205,7 +205,7 @@ class ReachingSafeSet:
         path = np.asarray(X_WS @ preview.T).T  # In the world.
         center_of_mass = kinematics.center_of_mass(q)  # Sets the positions.
         v_WC, v_WH = self._velocities(v)
-        rate = math.sqrt(max(center_of_mass[2], 0.1 * kinematics.standing_height) / _GRAVITY)
+        rate = math.sqrt(max(center_of_mass[2], 0.1 * kinematics.standing_height) / GRAVITY_M_S2)
         capture_point = center_of_mass[:2] + rate * v_WC[:2]
         shoulder = self._shoulder.CalcPoseInWorld(kinematics.context).translation()
         hand = model.reaching_position(q)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_GRAVITY = 9.81
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 
 @dataclass(kw_only=True)
@@ -79,7 +79,7 @@ def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
 
 def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
     """Returns the capture point of a linear inverted pendulum, p + v √(z/g), (2,) [m]."""
-    return p_WB[:2] + v_WB[:2] * math.sqrt(max(float(p_WB[2]), 0.05) / _GRAVITY)
+    return p_WB[:2] + v_WB[:2] * math.sqrt(max(float(p_WB[2]), 0.05) / GRAVITY_M_S2)
 
 
 def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.ndarray:
@@ -93,7 +93,7 @@ def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.nda
     Returns:
         The position, (3,) [m].
     """
-    time_constant_s = math.sqrt(p_WB[2] / _GRAVITY)
+    time_constant_s = math.sqrt(p_WB[2] / GRAVITY_M_S2)
     return p_WB - v_WB * time_constant_s * math.expm1(-elapsed_s / time_constant_s)
 
 

@@ -8,8 +8,8 @@ from types import MappingProxyType
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
-_GRAVITY = 9.81
 _NUM_DIRECTIONS = 8
 _ANGLES = 2 * np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
@@ -228,7 +228,7 @@ class BalanceSafeSet:
         base = R_SW @ (q[4:6] - origin)
         height = q[6]
         velocity = R_SW @ v[3:5]
-        capture_point = base + velocity * math.sqrt(max(height, 0.05) / _GRAVITY)
+        capture_point = base + velocity * math.sqrt(max(height, 0.05) / GRAVITY_M_S2)
         goal = preview[-1, :2]
         reach = (contacts[is_support] @ DIRECTIONS).max(axis=0)
         corners = convex_hull(contacts[is_support].tolist())

@@ -9,8 +9,8 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.observation import heading_velocity
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
-_GRAVITY = 9.81
 _AXES = ("forward", "left", "yaw")
 
 
@@ -172,7 +172,7 @@ class WalkingSafeSet:
         x_axis = _heading(q)
         to_heading = np.array([x_axis, [-x_axis[1], x_axis[0]]])
         center = kinematics.center_of_mass(q)
-        rate = math.sqrt(max(center[2], 0.1 * kinematics.standing_height) / _GRAVITY)
+        rate = math.sqrt(max(center[2], 0.1 * kinematics.standing_height) / GRAVITY_M_S2)
         capture = center[:2] + rate * v[3:5]
         largest = preview[np.abs(preview).argmax(axis=0), np.arange(preview.shape[1])]
         return np.concatenate(

@@ -8,7 +8,7 @@ likely. A segment is classified unsafe when its score exceeds a threshold, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +42,13 @@ class Estimate:
     @classmethod
     def from_json(cls, fields: Mapping[str, float | int | None]) -> Estimate:
         """The inverse of :meth:`to_json`."""
-        ends = (fields[name] for name in ("value", "low", "high"))
-        n = int(fields["n"] or 0)
-        return cls(*(math.nan if end is None else float(end) for end in ends), n)
+        return cls.of_row([fields[name] for name in ("value", "low", "high", "n")])
+
+    @classmethod
+    def of_row(cls, row: Sequence[float | int | None]) -> Estimate:
+        """The estimate of a stored row: value, low, high and n; None stands for NaN."""
+        value, low, high = (math.nan if end is None else float(end) for end in row[:3])
+        return cls(value, low, high, int(row[3] or 0))
 
     def to_json(self) -> dict[str, float | int | None]:
         """The estimate as JSON types; non-finite numbers become None."""

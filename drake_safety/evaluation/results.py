@@ -18,6 +18,7 @@ SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
 _NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
 _DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
+_DAMAGES = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
 _KEY = re.compile(r"[\w -]+(\.[\w -]+)*")
 
 
@@ -49,15 +50,8 @@ class Result(Estimate):
             )
         *rest, metric = _DOT.split(key)
         method = rest.pop() if len(rest) > 1 else ""
-        return cls(
-            value=estimate.value,
-            low=estimate.low,
-            high=estimate.high,
-            n=estimate.n,
-            set=".".join(rest),
-            method=method,
-            metric=metric,
-        )
+        ends = {name: getattr(estimate, name) for name in ("value", "low", "high", "n")}
+        return cls(**ends, set=".".join(rest), method=method, metric=metric)
 
 
 class Results(Mapping[str, Result]):
@@ -108,21 +102,12 @@ class Results(Mapping[str, Result]):
             found = (content["schema"], content["schema_version"])
             if found != (SCHEMA, SCHEMA_VERSION):
                 raise ValueError(f"schema and version are {found}")
-            figures = {
-                key: Estimate(*(math.nan if end is None else float(end) for end in ends), int(n))
-                for key, (*ends, n) in content["figures"].items()
-            }
+            figures = {key: Estimate.of_row(row) for key, row in content["figures"].items()}
             return cls(figures, content["entries"])
-        except (
-            KeyError,
-            TypeError,
-            ValueError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-        ) as error:
+        except _DAMAGES as error:
             raise ValueError(
-                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: {error!r}"
+                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: "
+                f"{type(error).__name__}: {str(error)[:200]}"
             ) from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -131,18 +116,13 @@ class Results(Mapping[str, Result]):
         Numbers have six significant digits; what is not finite becomes null.
         """
         figures = ",\n".join(
-            f"    {json.dumps(key)}: {json.dumps([*map(_rounded, (r.value, r.low, r.high)), r.n])}"
-            for key, r in self.items()
+            f"    {json.dumps(key)}: "
+            f"{json.dumps([*map(_rounded, (row.value, row.low, row.high)), int(row.n)])}"
+            for key, row in self.items()
         )
         entries = json.dumps(self.entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
-        text = (
-            "{\n"
-            f'  "schema": {json.dumps(SCHEMA)},\n'
-            f'  "schema_version": {SCHEMA_VERSION},\n'
-            f'  "entries": {entries},\n'
-            f'  "figures": {{\n{figures}\n  }}\n'
-            "}\n"
-        )
+        head = f'  "schema": "{SCHEMA}",\n  "schema_version": {SCHEMA_VERSION},\n'
+        text = f'{{\n{head}  "entries": {entries},\n  "figures": {{\n{figures}\n  }}\n}}\n'
         with replacing(Path(path)) as temporary:
             temporary.write_text(text, encoding="utf-8")
 

@@ -30,7 +30,7 @@ from drake_safety.evaluation.figure_style import (
     drawing_style,
     new_figure,
 )
-from drake_safety.evaluation.stills import StillCamera, scene_graph_of
+from drake_safety.evaluation.stills import StillCamera
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,7 +93,7 @@ def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
     """
     from matplotlib.colors import to_rgb
 
-    plant, scene_graph = loop.plant, scene_graph_of(loop)
+    plant, scene_graph = loop.plant, loop.GetSubsystemByName("scene_graph")
     source = plant.get_source_id()
     scene_context = scene_graph.GetMyMutableContextFromRoot(context)
     inspector = scene_graph.get_query_output_port().Eval(scene_context).inspector()

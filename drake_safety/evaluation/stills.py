@@ -7,7 +7,7 @@ its plant. The diagram is not changed: the renderer belongs to a separate Contex
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,6 @@ from pydrake.geometry import (
     RenderEngineVtkParams,
     Rgba,
     Role,
-    SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
@@ -38,8 +37,6 @@ _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
 _PBR_BRIGHTNESS = 2.2  # With a glTF mesh all shading is physically based, which is darker.
-_BEFORE_TOUCH_S, _AFTER_TOUCH_S = 0.02, 0.16  # The ball in the air, and its effect.
-_AFTER_TRIGGER_S = 0.3  # Feet in the air.
 _LEAST_GAP_S = 0.3  # Between a still at an event and others.
 
 
@@ -53,9 +50,6 @@ class StillCamera:
         width: Width of the stills [pixels].
         height: Height of the stills [pixels].
         view: View of the camera; that of the task by default.
-
-    Raises:
-        ValueError: The positions have another size, or are not finite.
     """
 
     def __init__(
@@ -97,7 +91,7 @@ class StillCamera:
             RigidTransform(),
         )
         self._camera = ColorRenderCamera(core)
-        scene_graph = scene_graph_of(loop)
+        scene_graph = loop.GetSubsystemByName("scene_graph")
         scene_graph.AddRenderer(
             scene_graph.GetMyMutableContextFromRoot(self._context),
             _RENDERER,
@@ -117,7 +111,7 @@ class StillCamera:
             RGB, (height, width, 3), uint8.
 
         Raises:
-            ValueError: The positions have another size, or are not finite.
+            ValueError: The positions are not finite.
         """
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
@@ -137,13 +131,6 @@ class StillCamera:
         return self._context
 
     def _pose(self, positions: np.ndarray) -> None:
-        positions = np.asarray(positions, dtype=float)
-        num_positions = self._plant.num_positions()
-        if positions.shape != (num_positions,):
-            raise ValueError(
-                f"stills: positions have shape {positions.shape}, expected ({num_positions},): "
-                f"{self._plant.GetPositionNames()}"
-            )
         if not np.isfinite(positions).all():
             raise ValueError("stills: the positions are not finite")
         self._plant.SetPositions(self._plant_context, positions)
@@ -190,10 +177,10 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
         Positions, (N, n_q).
 
     Raises:
-        ValueError: A model instance with positions is missing, or has another number of them.
+        ValueError: A model instance with positions is missing, or another is given.
     """
     plant = loop.plant
-    instances = [ModelInstanceIndex(i) for i in range(plant.num_model_instances())]
+    instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
     if set(states) != set(moving):
         raise ValueError(
@@ -201,40 +188,16 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
         )
     positions = np.zeros((len(next(iter(states.values()))), plant.num_positions()))
     for name, state in states.items():
-        instance = moving[name]
-        n_q, n_v = plant.num_positions(instance), plant.num_velocities(instance)
-        if state.shape[1] not in (n_q, n_q + n_v):
-            raise ValueError(
-                f"stack_positions: '{name}' has {state.shape[1]} columns, expected {n_q} positions "
-                f"or {n_q + n_v} with velocities"
+        for row, values in zip(positions, state, strict=True):
+            plant.SetPositionsInArray(
+                moving[name], values[: plant.num_positions(moving[name])], row
             )
-        for row, values in zip(positions, state[:, :n_q], strict=True):
-            plant.SetPositionsInArray(instance, values, row)
     return positions
 
 
 def still_times(
-    time_s: np.ndarray, touch_times_s: Iterable[float], trigger_times_s: Sequence[float]
+    time_s: np.ndarray, events_s: Iterable[float] = (), *, num_stills: int = 2
 ) -> list[float]:
-    """Times of stills of a run with balls: start, each impact, first recovery step, and end.
-
-    Args:
-        time_s: Instants of the log [s], (N,), increasing.
-        touch_times_s: Times of impact [s].
-        trigger_times_s: Trigger times of recovery [s].
-
-    Returns:
-        Logged instants [s], increasing.
-    """
-    wanted = [float(time_s[0]), float(time_s[-1])]
-    for touch_s in touch_times_s:
-        wanted += [touch_s - _BEFORE_TOUCH_S, touch_s + _AFTER_TOUCH_S]
-    wanted += [trigger_s + _AFTER_TRIGGER_S for trigger_s in trigger_times_s[:1]]
-    rows = {int(np.abs(time_s - instant).argmin()) for instant in wanted}
-    return [float(time_s[row]) for row in sorted(rows)]
-
-
-def spread_times(time_s: np.ndarray, events_s: Iterable[float], *, num_stills: int) -> list[float]:
     """Times of stills of a motion: those of events, and others spread between them.
 
     Args:
@@ -249,20 +212,19 @@ def spread_times(time_s: np.ndarray, events_s: Iterable[float], *, num_stills: i
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
         if all(abs(instant - event) >= _LEAST_GAP_S for event in kept):
             kept.append(instant)
-    rows = {int(np.abs(time_s - instant).argmin()) for instant in kept}
-    return [float(time_s[row]) for row in sorted(rows)]
+    return [float(time_s[row]) for row in sorted(set(_nearest_rows(time_s, kept)))]
 
 
 def render_stills(
     loop: LeggedLoop,
     time_s: np.ndarray,
     positions: np.ndarray,
-    still_times_s: Sequence[float],
+    still_times_s: Iterable[float],
     *,
     width: int = 720,
     height: int = 540,
 ) -> list[tuple[float, np.ndarray]]:
-    """Renders stills of a logged simulation at given times.
+    """Renders stills of a logged simulation.
 
     Args:
         loop: The closed loop that was simulated, or one with the same plant.
@@ -274,39 +236,14 @@ def render_stills(
 
     Returns:
         (time [s] of the logged instant, RGB image (height, width, 3)) of each still.
-
-    Raises:
-        ValueError: Times and positions have different lengths, or a still is outside the log.
     """
-    time_s, positions = np.asarray(time_s, dtype=float), np.asarray(positions, dtype=float)
-    if time_s.ndim != 1 or time_s.size == 0 or len(positions) != time_s.size:
-        raise ValueError(
-            f"render_stills: times have shape {time_s.shape} and positions {positions.shape}, "
-            "expected (N,) and (N, n_q)"
-        )
-    outside = [t for t in still_times_s if not time_s[0] - 1e-9 <= t <= time_s[-1] + 1e-9]
-    if outside:
-        raise ValueError(
-            f"render_stills: {outside} s are outside the log of {time_s[0]}..{time_s[-1]} s"
-        )
     camera = StillCamera(loop, positions[0], width=width, height=height)
-    rows = [int(np.abs(time_s - instant).argmin()) for instant in still_times_s]
+    rows = _nearest_rows(time_s, still_times_s)
     return [(float(time_s[row]), camera.render(positions[row])) for row in rows]
 
 
-def scene_graph_of(loop: LeggedLoop) -> SceneGraph:
-    """Returns the SceneGraph of a closed loop.
-
-    Raises:
-        ValueError: It has none.
-    """
-    for system in loop.GetSystems():
-        if isinstance(system, SceneGraph):
-            return system
-    raise ValueError(
-        f"stills: task '{type(loop).__name__}' has no SceneGraph; its systems are "
-        f"{[system.get_name() for system in loop.GetSystems()]}"
-    )
+def _nearest_rows(time_s: np.ndarray, instants_s: Iterable[float]) -> list[int]:
+    return [int(np.abs(np.asarray(time_s) - instant).argmin()) for instant in instants_s]
 
 
 def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:

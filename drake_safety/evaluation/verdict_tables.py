@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.tables import Column, Row, Table, rows_of
+from drake_safety.evaluation.tables import Column, Table, rows_of
 
 INPUTS = (
     "Inputs differ: sharpened and the baseline classifiers use the whole plan, through its "
@@ -117,7 +117,7 @@ _SET_TITLES = {
     "plans.other_hand": "the other hand",
     "plans.other_hand.fair": "the other hand, fair",
     "calibration.plan": "before the motion",
-    "calibration.motion": "alarm during it",
+    "calibration.motion": "during the motion",
 }
 
 
@@ -148,33 +148,20 @@ def verdict_table(results: Results, set: str, *, corner: str = "method") -> Tabl
 
 
 def verdict_tables(results: Results) -> list[Table]:
-    """The tables of all judged sets, and of outcomes and named causes of the sets of plans."""
+    """The tables of all judged sets, and of the outcomes of plans."""
     sets = dict.fromkeys(row.set for row in results.values())
     tables = [verdict_table(results, set) for set in sets if set.partition(".")[0] in _KINDS]
+    outcomes = results.select(method="outcomes")
+    names = dict.fromkeys(row.metric for row in outcomes)
+    columns = [Column(name, label_of(name), "%", digits=1) for name in names]
+    labels = {f"{row.set}.outcomes": set_title(row.set) for row in outcomes}
     tables.append(
-        _table_by_set(
-            results, "outcomes", "Outcomes of the motions", "Safe, or the violated constraint."
-        )
-    )
-    tables.append(
-        _table_by_set(
-            results,
-            "causes",
-            "Correct causes",
-            "Of the correctly refused targets with this simulated cause, the share for which it "
-            "is named.",
+        Table(
+            corner="targets",
+            columns=columns,
+            rows=rows_of(results, labels, columns),
+            title="Outcomes of the motions",
+            meaning="Safe, or the violated constraint.",
         )
     )
     return [table for table in tables if table.rows]
-
-
-def _table_by_set(results: Results, method: str, title: str, meaning: str) -> Table:
-    """A row for each set of plans, a column for each metric of a method, as shares."""
-    rows = results.select(method=method)
-    columns = [
-        Column(metric, label_of(metric), "%", digits=1)
-        for metric in dict.fromkeys(row.metric for row in rows)
-    ]
-    labels = {f"{row.set}.{method}": set_title(row.set) for row in rows}
-    table_rows: list[Row] = rows_of(results, labels, columns)
-    return Table(corner="targets", columns=columns, rows=table_rows, title=title, meaning=meaning)

@@ -163,13 +163,13 @@ class LiveGoals(LiveSession):
             told = "don't know"
         cause = describe_margin(verdict.cause, verdict.cause_margin, self.loop.angular_constraints)
         notes = [] if cause else [verdict.reason]
-        if is_thorough and self.nearest is None:
-            notes.append("nothing near is accepted")
-        elif is_thorough:
+        if self.nearest is not None:
             distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
             notes.append(f"accepted {100 * distance_m:.0f} cm away")
             self.meshcat.SetTransform(self._NEAREST, RigidTransform(self.nearest.goal))
             self.meshcat.SetProperty(self._NEAREST, "visible", True)
+        elif is_thorough:
+            notes.append("nothing near is accepted")
         note = "; ".join(filter(None, notes))
         self.panel.show(f"refused: {told}", cause=cause, note=note, tone="unsafe")
 

@@ -13,7 +13,7 @@ import numpy as np
 from drake_safety.extras import require_extra
 from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
-from drake_safety.robots.reading import reading
+from drake_safety.robots.reading import is_number, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,13 +131,5 @@ def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
             return values.astype(kind)
         except (ValueError, TypeError, OverflowError):
             continue
-    row = next(i for i, value in enumerate(values) if not _is_number(value))
+    row = next(i for i, value in enumerate(values) if not is_number(value))
     raise ValueError(f"{channel.where(row, name)}: '{values[row]}' is not a number")
-
-
-def _is_number(value: object) -> bool:
-    try:
-        float(value)  # type: ignore[arg-type]
-    except (ValueError, TypeError):
-        return False
-    return True

@@ -13,8 +13,9 @@ from pydrake.systems.framework import Context
 
 from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 
-_GRAVITY = np.array([0.0, 0.0, -9.81])
+_GRAVITY_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _MAX_STEPS = 30_000  # Of sphere tracing.
 _TOUCH_M = 1e-4  # Contact distance and shortest step.
 _BEFORE_M, _BEYOND_M = 2.0, 1.0  # Ends of the line of flight, relative to its aim.
@@ -115,11 +116,11 @@ class Ball:
         if not distance < _TOUCH_M:
             self.park(context)
             raise ValueError(f"throw: the line of flight of {throw} misses the robot")
-        velocity = throw.speed_m_s * direction - _GRAVITY * lead_s
-        start = p - velocity * lead_s - 0.5 * _GRAVITY * lead_s**2
+        velocity = throw.speed_m_s * direction - _GRAVITY_W * lead_s
+        start = p - velocity * lead_s - 0.5 * _GRAVITY_W * lead_s**2
         if start[2] < self.radius_m:
             self.park(context)
-            longest_s = math.sqrt(2 * max(p[2] - self.radius_m, 0.0) / -_GRAVITY[2])
+            longest_s = math.sqrt(2 * max(p[2] - self.radius_m, 0.0) / GRAVITY_M_S2)
             raise ValueError(
                 f"throw: a ball that arrives horizontally at {p[2]:.3f} m can fly for at most "
                 f"{longest_s:.3f} s; got lead_s = {lead_s}"

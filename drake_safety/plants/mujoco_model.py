@@ -21,7 +21,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
 from drake_safety.extras import require_extra
-from drake_safety.robots.model_files import required_file
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 
@@ -64,7 +64,7 @@ def mechanics_of_urdf(text: str) -> str:
 def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
     """The robot's bodies and joints as read by MuJoCo, with a free base."""
     mujoco = import_mujoco()
-    path = required_file(robot.urdf, robot.source_dir, robot.requires)
+    path = model_file(robot.urdf, robot.source_dir, robot.requires)
     if path.suffix != ".urdf":
         raise ValueError(
             f"robot '{robot.name}': engine 'mujoco' reads models from URDF files; got '{path}'"

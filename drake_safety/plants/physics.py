@@ -236,7 +236,7 @@ def add_physics(
         ValueError: A body, joint or file does not exist, a leg or an arm has no motors, a
             decoration has collision geometry, or the engine cannot simulate the scene.
     """
-    engine = {"drake": DrakePhysics, "mujoco": MujocoPhysics}[variation.engine]
+    engine = MujocoPhysics if variation.engine == "mujoco" else DrakePhysics
     return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
 
 

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.extras import MissingExtraError
 from drake_safety.robots.fitted_shapes import FittedShape, fitted_shape
-from drake_safety.robots.mesh_cache import mesh_points
-from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy
+from drake_safety.robots.urdf_copy import UrdfCopy
 from drake_safety.robots.urdf_survey import Limb, Survey
 
 _Floor = tuple[np.ndarray, float]
@@ -23,13 +21,6 @@ def replace_lost_meshes(
     The feet have their contact spheres. Shapes of links that are welded to a foot end above its
     spheres, which alone touch the ground. Where two links overlap in the standing posture, convex
     hulls replace primitives, which are larger.
-
-    Args:
-        copy: The URDF, to which shapes are added.
-        survey: The robot.
-        legs: Its legs.
-        posture: Its standing joint positions [rad].
-        scratch: File that the copy is written to.
 
     Returns:
         The robot with these shapes, standing.
@@ -70,36 +61,10 @@ def _floor(survey: Survey, leg: Limb, link: str) -> _Floor:
 def _fitted(
     copy: UrdfCopy, link: str, floor: _Floor | None, *, is_tight: bool
 ) -> list[FittedShape]:
-    shapes = []
-    for mesh in copy.lost_meshes[link]:
-        points = _points(copy, mesh)
-        if points is None:
-            continue
-        shape = fitted_shape(points, is_tight=is_tight, floor=floor)
-        if shape is not None:
-            shapes.append(shape)
-    return shapes
-
-
-def _points(copy: UrdfCopy, mesh: LostMesh) -> np.ndarray | None:
-    """Vertices in the link's frame, (n, 3); None, with a note, if the mesh cannot be read."""
-    if mesh.file is None:
-        return None
-    try:
-        points = mesh_points(mesh.file)
-    except MissingExtraError as error:
-        note = (
-            "no shapes are fitted to collision meshes that Drake does not read; install what does "
-            f"it by `pip install '{error.needs}'` and write the folder again"
-        )
-    except ValueError as error:
-        note = f"no shape is fitted to a collision mesh: {error}"
-    else:
-        return (mesh.X_LM @ (points * mesh.scale).T).T
-    if note not in copy.left_out:
-        copy.left_out.append(note)
-        copy.notes.append(note)
-    return None
+    shapes = (
+        fitted_shape(points, is_tight=is_tight, floor=floor) for points in copy.lost_meshes[link]
+    )
+    return [shape for shape in shapes if shape is not None]
 
 
 def _rewritten(

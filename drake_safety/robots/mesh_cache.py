@@ -41,22 +41,10 @@ def is_shown(path: Path) -> bool:
     """Whether Drake renders a mesh without conversion.
 
     OBJ files by MeshLab may declare opaque materials fully transparent, and Drake renders them so.
-
-    Args:
-        path: The mesh.
     """
     if path.suffix.lower() not in SHOWN_FORMATS:
         return False
     return path.suffix.lower() != ".obj" or not _is_transparent(path.with_suffix(".mtl"))
-
-
-def has_own_colours(path: Path) -> bool:
-    """Whether a mesh that Drake renders without conversion has materials of its own.
-
-    Args:
-        path: The mesh.
-    """
-    return is_shown(path) and path.with_suffix(".mtl").is_file()
 
 
 @lru_cache(maxsize=1024)
@@ -111,9 +99,6 @@ def _write(target: Path, content: bytes) -> None:
 
 def mesh_points(path: Path) -> np.ndarray:
     """Returns the vertices of a mesh, (n, 3), in the mesh's units.
-
-    Args:
-        path: The mesh.
 
     Raises:
         MissingExtraError: The packages that read it are not installed.

@@ -19,12 +19,7 @@ _EXTRAS = {"example-robot-data": "robots"}
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
-    """Adds ``package://drake_safety_models/…`` to a package map.
-
-    Args:
-        package_map: The package map, such as a parser's.
-        url: A ``package://NAME/…`` whose package, installed by pip, is added too.
-    """
+    """Adds ``package://drake_safety_models/…``, and a URL's package installed by pip, to a map."""
     if not package_map.Contains("drake_safety_models"):
         package_map.AddPackageXml(str(files("drake_safety.models") / "package.xml"))
     parts = urlparse(url)
@@ -38,10 +33,6 @@ def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
     """Returns a parser with the packages of :func:`add_to_package_map`.
 
     The parser renames models whose name the plant already has.
-
-    Args:
-        plant: A plant before ``Finalize``.
-        url: See :func:`add_to_package_map`.
     """
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
@@ -65,13 +56,19 @@ def _installed_folder(name: str) -> Path | None:
     return Path(next(iter(locations))) if locations else None
 
 
-def model_file(url: str, folder: str = "") -> Path:
+def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
     Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
 
+    Args:
+        url: The URL or path.
+        folder: The folder.
+        requires: Requirement by which pip installs the package without its dependencies; empty for
+            packages of an extra.
+
     Raises:
-        MissingExtraError: An extra installs the package, and it is not installed.
+        MissingExtraError: The package is not installed.
         ValueError: The package is unknown.
     """
     parts = urlparse(url)
@@ -81,40 +78,12 @@ def model_file(url: str, folder: str = "") -> Path:
     add_to_package_map(package_map, url)
     if package_map.Contains(parts.netloc):
         return Path(package_map.GetPath(parts.netloc)) / parts.path.lstrip("/")
+    if requires:
+        # Its data are read and none of its code, whatever Python that is for.
+        options = "--no-deps --ignore-requires-python "
+        raise MissingExtraError(f"'{url}': its package is not installed", requires, options)
     if parts.netloc in _EXTRAS:
         raise missing_extra(
             _EXTRAS[parts.netloc], f"'{url}': the package '{parts.netloc}' is not installed"
         )
     raise ValueError(f"'{url}': no package '{parts.netloc}'; use a path instead")
-
-
-def is_installed(url: str) -> bool:
-    """Whether the package of a ``package://…`` URL is installed; true for a path.
-
-    Args:
-        url: The URL, or a path.
-    """
-    parts = urlparse(url)
-    package_map = PackageMap()
-    add_to_package_map(package_map, url)
-    return parts.scheme != "package" or package_map.Contains(parts.netloc)
-
-
-def required_file(url: str, folder: str, requires: str) -> Path:
-    """Returns the file of :func:`model_file`, or says which package to install.
-
-    Args:
-        url: The ``package://…`` URL, or a path relative to ``folder``.
-        folder: The folder.
-        requires: Requirement by which pip installs the package without its dependencies; empty for
-            packages of an extra.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-        ValueError: The package is unknown.
-    """
-    if requires and not is_installed(url):
-        # Its data are read and none of its code, whatever Python that is for.
-        options = "--no-deps --ignore-requires-python "
-        raise MissingExtraError(f"'{url}': its package is not installed", requires, options)
-    return model_file(url, folder)

@@ -63,12 +63,17 @@ def shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE - 4]} ..."
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value or its text is a number."""
+    try:
+        float(value)
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Says for an error message which known name is like an unknown one: `` (did you mean 'x'?)``.
-
-    Args:
-        name: The unknown name.
-        known: The known ones.
 
     Returns:
         The words, with a space before them; "" if none is like it.

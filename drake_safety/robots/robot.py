@@ -281,10 +281,6 @@ def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> N
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     """Checks that every joint of legs and arms has a motor.
 
-    Args:
-        plant: The finalised plant with the robot.
-        robot: The robot.
-
     Raises:
         ValueError: A joint has no motor. Drake adds one for a transmission with an effort limit in
             the model file, and :func:`add_robot` for a joint in ``effort_limits``.
@@ -392,9 +388,6 @@ class Scratch(threading.local, Generic[_T]):
 
     Systems of one diagram share a robot's model, and Drake's users expect that a diagram can be
     simulated in several threads, each with a Context of its own.
-
-    Args:
-        make: Makes the value; called once in every thread that uses it.
     """
 
     def __init__(self, make: Callable[[], _T]):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,15 +21,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from drake_safety.extras import MissingExtraError
-from drake_safety.robots.model_files import (
-    is_installed,
-    model_file,
-    package_parser,
-    required_file,
-)
+from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
-from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
+from drake_safety.robots.urdf_copy import read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
@@ -51,7 +44,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             be converted.
     """
     parser = package_parser(plant, robot.urdf)
-    path = required_file(robot.urdf, robot.source_dir, robot.requires)
+    path = model_file(robot.urdf, robot.source_dir, robot.requires)
     urdf = None
     if path.suffix == ".urdf":
         urdf = read_urdf(path)
@@ -59,7 +52,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
         if robot.collision == "stated":
             urdf.drop_collisions()
         if plant.geometry_source_is_registered():
-            urdf = _shown(urdf, robot)
+            urdf.convert_visual_meshes()
     with _quiet_about(robot):
         if urdf is not None and urdf.is_changed:
             urdf.anchor_meshes()
@@ -70,25 +63,6 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             (instance,) = parser.AddModels(str(path))
     plant.RenameModelInstance(instance, robot.name)
     return instance
-
-
-def _shown(urdf: UrdfCopy, robot: RobotModel) -> UrdfCopy:
-    """The URDF with visual meshes that Drake renders, from ``visuals`` if they are installed.
-
-    Raises:
-        ValueError: A mesh cannot be converted, or the frames of ``visuals`` differ.
-    """
-    if robot.visuals and is_installed(robot.visuals):
-        dressed = copy.deepcopy(urdf)
-        dressed.take_visuals(read_urdf(model_file(robot.visuals, robot.source_dir)))
-        try:
-            dressed.convert_visual_meshes()
-        except MissingExtraError as error:
-            _logger.debug("%s keeps its own visuals: %s", robot.name, error)
-        else:
-            return dressed
-    urdf.convert_visual_meshes()
-    return urdf
 
 
 @contextmanager
@@ -117,11 +91,6 @@ def add_stated_shapes(
     plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes.
-
-    Args:
-        plant: A plant before ``Finalize``, with a scene graph and the robot's bodies.
-        robot: The robot.
-        instance: Its model instance.
 
     Raises:
         ValueError: A pattern of ``shapes`` matches no body, or two match one.
@@ -166,11 +135,6 @@ def ignore_neighbours(
     """Filters collisions of links connected by a joint, and of links welded to them.
 
     Drake filters the two bodies of a joint, but not bodies that are welded to them.
-
-    Args:
-        plant: A plant before ``Finalize``.
-        scene_graph: Its scene graph.
-        instance: The robot's model instance.
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     for joint in joints:

@@ -161,10 +161,6 @@ class RobotModel:
     requires: str = ""
     """Requirement by which pip installs the package of ``urdf`` without its dependencies, if no
     extra does."""
-    visuals: str = ""
-    """``package://…`` of a URDF whose visuals replace those of links with the same names, if its
-    package is installed. Its frames must equal those of ``urdf``, itself a URDF. Simulations do not
-    depend on it."""
     base: str = ""
     """Floating base body."""
     posture: dict[str, float] = field(default_factory=dict)
@@ -302,11 +298,6 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     Drake's loader assigns values to a default object, after ``__post_init__``: it is run again
     here, innermost dataclass first.
 
-    Args:
-        schema: The dataclass.
-        raw: The parsed YAML.
-        who: Prefix of error messages.
-
     Raises:
         ValueError: An unknown key, a value of a wrong type, or a failed validation.
     """
@@ -406,9 +397,6 @@ def _validate(value: Any) -> None:
 
 def load_robot_file(path: str | Path) -> RobotModel:
     """Reads a ``robot.yaml``.
-
-    Args:
-        path: The YAML file.
 
     Returns:
         The robot, its ``source_dir`` set to the file's folder.

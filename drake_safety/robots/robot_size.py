@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
+GRAVITY_M_S2 = 9.81
+"""As in Drake."""
 _DIGITS = 4  # Significant digits of scaled values.
 
 

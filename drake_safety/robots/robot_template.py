@@ -29,42 +29,46 @@ _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), (
 
 @dataclass(kw_only=True)
 class NewRobot:
-    """Result of `write_robot`.
+    """A robot found in a URDF, and the folder that `write_robot` has written.
 
     Attributes:
-        folder: The robot's folder.
-        files: The files in it.
-        asked: Values that the URDF lacks and the user must supply.
-        left_out: Visuals of the URDF that the copy lacks, with the reasons.
-        fitted: Number of shapes by kind that replace collision meshes.
-        bare: Links whose collision meshes the copy lacks, and that have no other shape.
-        sizes: Sizes of the standing robot.
-        joints: Its joints, in the order of its positions.
+        copy: Its URDF, with what was changed and left out.
+        survey: The robot, standing.
         posture: Its standing joint positions [rad].
+        asked: Values that the URDF lacks and the user must supply.
     """
 
-    folder: Path
-    files: list[Path]
-    asked: list[str]
-    left_out: list[str]
-    fitted: dict[str, int]
-    bare: list[str]
-    sizes: Sizes
-    joints: list[str]
-    posture: dict[str, float]
-
-
-@dataclass(kw_only=True)
-class _Findings:
     name: str
+    task: str
+    folder: Path
     copy: UrdfCopy
     survey: Survey
     legs: list[Limb]
     arms: list[Limb]
     posture: dict[str, float]
-    limits: dict[str, float]
     sizes: Sizes
     asked: list[str] = field(default_factory=list)
+
+    @property
+    def files(self) -> list[Path]:
+        """URDF, robot.yaml, README and scenario."""
+        names = (f"{self.name}.urdf", "robot.yaml", "README.md", f"{self.task}.yaml")
+        return [self.folder / name for name in names]
+
+    @property
+    def joints(self) -> list[str]:
+        """Its joints, in the order of its positions."""
+        return [joint.name() for joint in self.survey.joints]
+
+    @property
+    def fitted(self) -> dict[str, int]:
+        """Number of shapes by kind that replace collision meshes."""
+        return dict(Counter(one.kind for shapes in self.copy.fitted.values() for one in shapes))
+
+    @property
+    def bare(self) -> list[str]:
+        """Links whose collision meshes the copy lacks, and that have no other shape."""
+        return self.copy.bare_links()
 
 
 def write_robot(
@@ -99,28 +103,18 @@ def write_robot(
     with tempfile.TemporaryDirectory() as scratch:
         found = _survey(name, urdf, task, Path(scratch) / f"{name}.urdf", feet, moved)
         # Copied to the target only when complete.
-        staged = Path(scratch) / "robot"
-        staged.mkdir()
-        found.copy.write(staged / f"{name}.urdf")
-        (staged / "robot.yaml").write_text(_robot_yaml(found, task), encoding="utf-8")
-        load_robot_file(staged / "robot.yaml")
-        text = scenario_yaml(task, found.sizes)
-        (staged / f"{task}.yaml").write_text(text, encoding="utf-8")
-        (staged / "README.md").write_text(_readme(found), encoding="utf-8")
+        found.folder = Path(scratch) / "robot"
+        found.folder.mkdir()
+        description, robot, readme, scenario = found.files
+        found.copy.write(description)
+        robot.write_text(_robot_yaml(found), encoding="utf-8")
+        load_robot_file(robot)
+        scenario.write_text(scenario_yaml(task, found.sizes), encoding="utf-8")
+        readme.write_text(_readme(found), encoding="utf-8")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(staged, folder)
-    files = [folder / file for file in (f"{name}.urdf", "robot.yaml", "README.md", f"{task}.yaml")]
-    return NewRobot(
-        folder=folder,
-        files=files,
-        asked=found.asked,
-        left_out=found.copy.left_out,
-        fitted=dict(Counter(one.kind for shapes in found.copy.fitted.values() for one in shapes)),
-        bare=found.copy.bare_links(),
-        sizes=found.sizes,
-        joints=[joint.name() for joint in found.survey.joints],
-        posture=found.posture,
-    )
+        shutil.copytree(found.folder, folder)
+    found.folder = folder
+    return found
 
 
 def _survey(
@@ -130,10 +124,10 @@ def _survey(
     scratch: Path,
     feet: list[str] | None,
     moved: Collection[str] | None,
-) -> _Findings:
+) -> NewRobot:
     copy = simulatable_copy(urdf)
     copy.write(scratch)
-    survey = Survey(scratch, copy.lost_shapes)
+    survey = Survey(scratch, copy.lost_meshes)
     legs = survey.legs(feet)
     arms = survey.arms(legs)
     if task == "reaching" and not arms:
@@ -155,20 +149,16 @@ def _survey(
     survey = replace_lost_meshes(copy, survey, legs, posture, scratch)
     # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
-    if is_base_bare and any([copy.restore_boxes(link) for link in survey.welded(survey.base)]):
-        is_base_bare = False
-        copy.write(scratch)
-        survey = Survey(scratch)
-        survey.set_joints(posture)
     copy.ignore_collisions(survey.overlaps())
-    found = _Findings(
+    found = NewRobot(
         name=name,
+        task=task,
+        folder=scratch.parent,
         copy=copy,
         survey=survey,
         legs=legs,
         arms=arms,
         posture=posture,
-        limits=copy.effort_limits(),
         sizes=_sizes(survey, legs, arms, copy),
     )
     found.asked += [
@@ -214,9 +204,8 @@ def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -
     )
 
 
-def _robot_yaml(found: _Findings, task: str) -> str:
-    survey, sizes = found.survey, found.sizes
-    names = [joint.name() for joint in survey.joints]
+def _robot_yaml(found: NewRobot) -> str:
+    survey, sizes, names = found.survey, found.sizes, found.joints
     unit = sizes.mass_kg * sizes.height_m
     lines = [
         f"# {found.name}: written from {found.copy.source.name}. Lines marked ASK have values that",
@@ -265,7 +254,7 @@ def _robot_yaml(found: _Findings, task: str) -> str:
     mirror = _mirror(names)
     if mirror:
         lines += ["mirror:", *(f"  {one}: {other}" for one, other in mirror.items())]
-    bare = found.copy.bare_links()
+    bare = found.bare
     if bare:
         lines += [
             "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
@@ -275,23 +264,24 @@ def _robot_yaml(found: _Findings, task: str) -> str:
             f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]"
         )
     lines += ["whole_body:", f"  orientation: {{{survey.base}: {{weight: 20.0}}}}"]
-    if task == "balancing" and len(found.legs) > 2:
+    if found.task == "balancing" and len(found.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
     return "\n".join(lines) + "\n"
 
 
-def _effort_lines(found: _Findings, names: list[str], unit: float) -> list[str]:
+def _effort_lines(found: NewRobot, names: list[str], unit: float) -> list[str]:
     plant = found.survey.plant
     motors = {
         plant.get_joint_actuator(index).joint().name()
         for index in plant.GetJointActuatorIndices(found.survey.instance)
         if math.isfinite(plant.get_joint_actuator(index).effort_limit())
     }
+    limits = found.copy.effort_limits()
     lines = []
     for name in names:
         if name in motors:
             continue
-        effort = found.limits[name]
+        effort = limits[name]
         if effort > 0 and math.isfinite(effort):
             lines.append(f"  {name}: {effort:g}")
         else:
@@ -318,7 +308,7 @@ def _mirror(names: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _readme(found: _Findings) -> str:
+def _readme(found: NewRobot) -> str:
     sizes = found.sizes
     notes = (
         "\n".join(f"- {note[0].upper()}{note[1:]}." for note in found.copy.notes) or "- Nothing."

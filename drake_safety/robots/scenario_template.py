@@ -28,12 +28,7 @@ class Sizes(RobotSize):
 
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
-    """Writes the scenario of a task as commented YAML.
-
-    Args:
-        task: One of `TASKS`.
-        sizes: Sizes of the robot.
-    """
+    """Writes the scenario of a task as commented YAML."""
     return TASKS[task](sizes)
 
 
@@ -65,50 +60,24 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
 
 
 def _balancing(sizes: Sizes) -> str:
-    h = sizes.height_m
-    # Every value scales as with `scale_to_robot`, so that both give the same scenario.
     scale = sizes.factors(BALANCING_REFERENCE)
-    tall, length, width = scale["height"], scale["length"], scale["width"]
-    slow, heavy, sideways = scale["duration"], scale["mass"], scale["speed_y"]
-    return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {h:.3f} m high.
+    heavy, sideways = scale["mass"], scale["speed_y"]
+    return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {sizes.height_m:.3f} m high.
 task: drake_safety.diagrams.balancing:Balancing
 robot: robot.yaml
 {_variations(sizes, 0.8, 0.004, 0.016)}parameters:
-  safe_set:
-    height_m: {_numbers([0.71 * h, 1.18 * h])}  # ASK lowest and highest safe height of the base [m]
-    fall_height_m: {0.47 * h:.3g}  # below it, it has fallen [m]
-    support_clearance_m: {0.03 * tall:.3g}  # a foot lower than this carries [m]
-  start:  # where episodes begin, and where their plans lead; widen for more unsafe ones
-    foot_offset_m: {0.02 * width:.3g}
-    base_offset_m: {_numbers([0.08 * length, 0.05 * width])}  # x, y [m]
-    base_height_m: {_numbers([0.85 * h, 1.06 * h])}  # [m]
-    velocity_std_m_s: {_numbers([0.5 * length / slow, 0.35 * sideways, 0.1 * tall / slow])}
-    angular_velocity_std_rad_s: {0.4 / slow:.3g}
-    target_offset_m: {_numbers([0.2 * length, 0.11 * width])}  # x, y [m]
-    target_height_m: {_numbers([0.8 * h, 1.08 * h])}  # [m]
-    plan_duration_s: {_numbers([0.8 * slow, 1.6 * slow])}  # [s]
-  push:  # ASK the balls that are thrown at it
-    share: 0.35
-    mass_kg: {_numbers([2 * heavy, 4 * heavy])}  # [kg]
-    speed_m_s: {_numbers([2 * sideways, 11 * sideways])}  # [m/s]
-    height_m: {0.03 * tall:.3g}
-    target_offset_m: {_numbers([0.05 * length, 0.03 * width])}
-  demonstration:  # the balls of `run --push ball`: a weak one and a strong one, towards [rad]
+  # Safe heights, starts, plans, balls and steps are the task's defaults, scaled to the robot; what
+  # is stated here replaces them, such as safe_set: {{height_m: [lowest, highest]}}.
+  scale_to_robot: true
+  push: {{share: 0.35}}  # of episodes that begin with the impact of a ball
+  demonstration:  # ASK the balls of `run --push ball`: a weak one and a strong one, towards [rad]
     - {_ball(0.6, 2.0 * heavy, 3.5 * sideways, 1.5708)}
     - {_ball(1.68, 3.0 * heavy, 9.0 * sideways, -1.2)}
   recovery:
     threshold: 0.4  # of the probability, not tuned to this robot
     step:
-      step_duration_s: {0.09 * slow:.3g}  # [s]
-      lift_m: {0.06 * tall:.3g}
-      velocity_gain_s: {0.07 * slow:.3g}
       max_twist_rad: 0  # holds no heading; 0.3 does, if the feet do not slip under it [rad]
-      yaw_damping_s: {0.1 * slow:.3g}
-      max_reach_m: {0.18 * tall:.3g}  # of a foothold from its hip [m]
       min_lateral_m: {0.85 * sizes.lateral_m:.3g}  # of a foothold from the midline [m]
-      settle_margin_m: {0.08 * width:.3g}
-      resume_margin_m: {0.02 * width:.3g}
-      return_duration_s: {0.5 * slow:.3g}  # [s]
 """
 
 

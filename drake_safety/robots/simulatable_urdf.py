@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import LostMesh, UrdfCopy, number, origin_of, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
 
 _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
@@ -27,9 +27,6 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     :func:`~drake_safety.robots.mesh_cache.shown_mesh`, or left out if that fails. Collision meshes
     that Drake does not read are left out.
 
-    Args:
-        path: The URDF.
-
     Raises:
         ValueError: The file does not exist or is not a URDF.
     """
@@ -42,7 +39,7 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     copy.free_fixed_joints()
     _drop_transmissions(copy)
     _drop_friction(copy)
-    _mend_inertias(copy)
+    _fix_inertias(copy)
     _tell_materials_apart(copy)
     _gather_visual_meshes(copy)
     _gather_collision_meshes(copy)
@@ -86,7 +83,7 @@ def _drop_friction(copy: UrdfCopy) -> None:
         )
 
 
-def _mend_inertias(copy: UrdfCopy) -> None:
+def _fix_inertias(copy: UrdfCopy) -> None:
     """Removes impossible products of inertia, and inertias of bodies without mass."""
     for link in copy.root.iter("link"):
         inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
@@ -154,42 +151,36 @@ def _plain(value: str) -> str:
 
 
 def _gather_visual_meshes(copy: UrdfCopy) -> None:
-    missing: list[str] = []
-    wanting: list[str] = []  # Meshes whose converter is not installed.
-    unreadable: list[str] = []  # Error messages.
     converted: list[str] = []
+    lost: dict[str, list[str]] = {}  # By the reason.
 
     def shown(url: str, rgba: str) -> str:
         file = _mesh_file(url, copy.source)
         if file is None:
-            missing.append(url)
+            lost.setdefault(
+                "visual meshes that are not where the URDF says are left out: {}", []
+            ).append(url)
             return ""
         try:
             mesh = shown_mesh(file, rgba)
         except MissingExtraError:
-            wanting.append(file.name)
+            lost.setdefault(
+                "visual meshes that Drake does not render are left out: {}; install their "
+                "converter by `pip install 'drake_safety[robots]'` and write the folder again",
+                [],
+            ).append(file.name)
             return ""
         except ValueError as error:
-            unreadable.append(str(error))
+            lost.setdefault("a visual is left out: {}", []).append(str(error))
             return ""
         if mesh != file:
             converted.append(file.name)
-            return _gather(copy, mesh, f"{file.stem}.gltf")
-        return _gather(copy, mesh, file.name)
+        return _gather(copy, mesh, file.name if mesh == file else f"{file.stem}.gltf")
 
     copy.replace_visual_meshes(shown)
     if converted:
         copy.notes.append(f"visual meshes are converted to glTF: {_listed(converted)}")
-    if missing:
-        copy.left_out.append(
-            f"visual meshes that are not where the URDF says are left out: {_listed(missing)}"
-        )
-    if wanting:
-        copy.left_out.append(
-            f"visual meshes that Drake does not render are left out: {_listed(wanting)}; install "
-            "their converter by `pip install 'drake_safety[robots]'` and write the folder again"
-        )
-    copy.left_out += [f"a visual is left out: {why}" for why in dict.fromkeys(unreadable)]
+    copy.left_out += [reason.format(_listed(names)) for reason, names in lost.items()]
     copy.notes += copy.left_out
 
 
@@ -207,9 +198,9 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
                 continue
             link.remove(shape)
             lost.append(url if file is None else file.name)
-            copy.lost_meshes.setdefault(link.get("name", ""), []).append(
-                _lost_mesh(file, shape, mesh)
-            )
+            points = copy.lost_meshes.setdefault(link.get("name", ""), [])
+            if file is not None:
+                points += _points(copy, file, shape, mesh)
     if lost:
         copy.notes.append(
             f"collision meshes that Drake cannot read, or that do not exist, are left out: "
@@ -231,15 +222,26 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _lost_mesh(file: Path | None, shape: ET.Element, mesh: ET.Element) -> LostMesh:
-    scale = np.array([float(value) for value in mesh.get("scale", "1 1 1").split()])
-    origin = origin_of(shape)
-    X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
-    box = None if file is None else _box(file)
-    if box is not None:
-        corners = X_LM @ np.array(np.meshgrid(*(box * scale).T)).reshape(3, -1)
-        box = np.array([corners.min(axis=1), corners.max(axis=1)])
-    return LostMesh(file=file, scale=scale, X_LM=X_LM, box=box)
+def _points(copy: UrdfCopy, file: Path, shape: ET.Element, mesh: ET.Element) -> list[np.ndarray]:
+    """Vertices in the link's frame; none, with a note, if the mesh cannot be read."""
+    try:
+        points = mesh_points(file)
+    except MissingExtraError as error:
+        note = (
+            "no shapes are fitted to collision meshes that Drake does not read; install what does "
+            f"it by `pip install '{error.needs}'` and write the folder again"
+        )
+    except ValueError as error:
+        note = f"no shape is fitted to a collision mesh: {error}"
+    else:
+        scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
+        origin = origin_of(shape)
+        X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
+        return [(X_LM @ (points * scale).T).T]
+    if note not in copy.left_out:
+        copy.left_out.append(note)
+        copy.notes.append(note)
+    return []
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
@@ -260,26 +262,3 @@ def _mesh_file(url: str, source: Path) -> Path | None:
             with contextlib.suppress(ValueError):
                 candidates.append(model_file(url))
     return next((file for file in candidates if file.is_file()), None)
-
-
-def _box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a mesh, (2, 3); binary STL is read without trimesh."""
-    box = _stl_box(file)
-    if box is None:
-        with contextlib.suppress(ValueError):
-            points = mesh_points(file)
-            box = np.array([points.min(axis=0), points.max(axis=0)])
-    return box
-
-
-def _stl_box(file: Path) -> np.ndarray | None:
-    """Lowest and highest corner of a binary STL, (2, 3)."""
-    if file.suffix.lower() != ".stl":
-        return None
-    content = file.read_bytes()
-    count = int.from_bytes(content[80:84], "little")
-    if count == 0 or len(content) < 84 + 50 * count:
-        return None
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    corners = np.frombuffer(content, kind, count, 84)["corners"].reshape(-1, 3)
-    return np.array([corners.min(axis=0), corners.max(axis=0)], dtype=float)

@@ -29,10 +29,6 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used. If the
     centre of mass is then not amid the feet, all feet are moved under it.
 
-    Args:
-        survey: The robot.
-        legs: Its legs.
-
     Returns:
         Positions of all joints by name [rad]; those of no leg are as near to zero as their stops
         allow.
@@ -136,7 +132,7 @@ class _Leg:
             found = least_squares(residual, guess, bounds=(low, high), max_nfev=40)
             if np.abs(errors(found.x)).max() > _TOLERANCE_M:
                 continue
-            score = self._oddness(found.x)
+            score = self._penalty(found.x)
             if best is None or score < best[0]:
                 best = (score, found.x)
             num_found += 1
@@ -144,7 +140,7 @@ class _Leg:
                 break
         return None if best is None else best[1]
 
-    def _oddness(self, angles: np.ndarray) -> float:
+    def _penalty(self, angles: np.ndarray) -> float:
         self._set(angles)
         knee = self._survey.joint_origin(self.limb.joints[self._knee_index])
         bend = (knee - self._survey.joint_origin(self.limb.joints[self._hip_index])) / self.length

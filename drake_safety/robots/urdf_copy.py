@@ -14,28 +14,10 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.fitted_shapes import FittedShape
-from drake_safety.robots.mesh_cache import has_own_colours, is_shown, shown_mesh
+from drake_safety.robots.mesh_cache import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
 _DRAKE = "http://drake.mit.edu"
-
-
-@dataclass(frozen=True, kw_only=True)
-class LostMesh:
-    """A removed collision mesh.
-
-    Attributes:
-        file: The mesh; None if it does not exist.
-        scale: Factors on its coordinates, (3,).
-        X_LM: Its pose in the link's frame.
-        box: Box around it: lowest and highest corner in the link's frame, (2, 3) [m]; None if it
-            is not known.
-    """
-
-    file: Path | None
-    scale: np.ndarray
-    X_LM: RigidTransform
-    box: np.ndarray | None = None
 
 
 @dataclass(kw_only=True)
@@ -47,7 +29,8 @@ class UrdfCopy:
         root: The root element, which is edited.
         notes: Descriptions of the changes, one sentence each.
         left_out: Notes about visuals that were removed.
-        lost_meshes: Removed collision meshes by link.
+        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each;
+            none of those that cannot be read.
         fitted: Shapes in place of these meshes, by link.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
@@ -58,7 +41,7 @@ class UrdfCopy:
     root: ET.Element
     notes: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_meshes: dict[str, list[LostMesh]] = field(default_factory=dict)
+    lost_meshes: dict[str, list[np.ndarray]] = field(default_factory=dict)
     fitted: dict[str, list[FittedShape]] = field(default_factory=dict)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
@@ -79,14 +62,6 @@ class UrdfCopy:
     def link(self, name: str) -> ET.Element:
         """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
-
-    @property
-    def lost_shapes(self) -> dict[str, list[np.ndarray]]:
-        """Boxes around removed collision meshes by link, (2, 3) [m] each."""
-        return {
-            link: [mesh.box for mesh in meshes if mesh.box is not None]
-            for link, meshes in self.lost_meshes.items()
-        }
 
     def bare_links(self) -> list[str]:
         """Returns the links whose collision meshes were removed and that have no other shape."""
@@ -140,52 +115,6 @@ class UrdfCopy:
                 if material is not None and is_converted:
                     visual.remove(material)
 
-    def take_visuals(self, other: UrdfCopy) -> None:
-        """Replaces the visuals of links by those of another URDF's links of the same name.
-
-        Links without visuals in the other URDF keep their own.
-
-        Args:
-            other: The other URDF, with the same frames.
-
-        Raises:
-            ValueError: The origins of a replaced link's joint differ.
-        """
-        own_joints, their_joints = (
-            {
-                child.get("link"): origin_of(joint)
-                for joint in urdf.root.findall("joint")
-                if (child := joint.find("child")) is not None
-            }
-            for urdf in (self, other)
-        )
-        for colour in other.root.iter("material"):
-            # Both URDFs may use one name for different colours.
-            if colour.get("name"):
-                colour.set("name", f"visuals_{colour.get('name')}")
-        self.root.extend(other.root.findall("material"))
-        links = {link.get("name", ""): link for link in self.root.findall("link")}
-        for theirs in other.root.findall("link"):
-            name, visuals = theirs.get("name", ""), theirs.findall("visual")
-            if name not in links or not visuals:
-                continue
-            here, there = own_joints.get(name), their_joints.get(name)
-            if here is not None and there is not None and not np.allclose(here, there, atol=1e-6):
-                raise ValueError(
-                    f"the visuals of link '{name}' in '{other.source}' do not fit '{self.source}': "
-                    f"its joint's origin is {there}, expected {here}"
-                )
-            _remove(links[name], "visual")
-            for visual in visuals:
-                mesh, material = visual.find("geometry/mesh"), visual.find("material")
-                if mesh is not None:
-                    path = model_file(mesh.get("filename", ""), str(other.source.parent))
-                    mesh.set("filename", str(path.resolve()))
-                    # Drake warns of a second material.
-                    if material is not None and has_own_colours(path):
-                        visual.remove(material)
-                links[name].append(visual)
-
     def convert_visual_meshes(self) -> None:
         """Replaces visual meshes that Drake does not render by glTF files in the user's cache.
 
@@ -208,11 +137,7 @@ class UrdfCopy:
                 mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
     def fix_joints(self, names: Iterable[str]) -> None:
-        """Fixes joints at zero.
-
-        Args:
-            names: Names of the joints.
-        """
+        """Fixes joints at zero."""
         fixed = set(names)
         for joint in self.root.findall("joint"):
             if joint.get("name") in fixed:
@@ -245,33 +170,8 @@ class UrdfCopy:
             "the ground"
         )
 
-    def restore_boxes(self, link_name: str) -> bool:
-        """Adds boxes in place of a link's removed collision meshes.
-
-        Args:
-            link_name: The link.
-
-        Returns:
-            Whether the link had any.
-        """
-        boxes = self.lost_shapes.get(link_name, [])
-        link = self.link(link_name)
-        for index, (low, high) in enumerate(boxes):
-            name = f"{link_name}_box_{index}"
-            _add_collision(link, name, (low + high) / 2, "box", size=_numbers(high - low))
-        if boxes:
-            self.notes.append(
-                f"the collision meshes of link '{link_name}' are replaced by their bounding boxes"
-            )
-        return bool(boxes)
-
     def set_fitted(self, link_name: str, shapes: list[FittedShape]) -> None:
-        """Sets the shapes that replace a link's removed collision meshes; earlier ones are removed.
-
-        Args:
-            link_name: The link.
-            shapes: The shapes.
-        """
+        """Sets the shapes in place of a link's removed collision meshes; earlier ones go."""
         self.fitted[link_name] = shapes
         link = self.link(link_name)
         for collision in link.findall("collision"):
@@ -291,11 +191,7 @@ class UrdfCopy:
             ET.SubElement(geometry, tag, sizes)
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
-        """Filters collisions between pairs of links.
-
-        Args:
-            pairs: Names of links.
-        """
+        """Filters collisions between pairs of links."""
         for index, (one, other) in enumerate(sorted(pairs)):
             group = ET.SubElement(
                 self.root, f"{{{_DRAKE}}}collision_filter_group", name=f"overlap_{index}"
@@ -308,11 +204,7 @@ class UrdfCopy:
             self.notes.append(f"collisions of the overlapping links '{one}' and '{other}' are off")
 
     def write(self, path: Path) -> None:
-        """Writes the copy and its meshes.
-
-        Args:
-            path: The URDF to write.
-        """
+        """Writes the copy and its meshes."""
         tree = ET.ElementTree(self.root)
         ET.indent(tree)
         tree.write(path, encoding="utf-8", xml_declaration=True)
@@ -331,9 +223,6 @@ class UrdfCopy:
 
 def read_urdf(path: Path) -> UrdfCopy:
     """Reads a URDF as an editable copy.
-
-    Args:
-        path: The file.
 
     Raises:
         ValueError: The file does not exist, is not a URDF, or has a negative mass.

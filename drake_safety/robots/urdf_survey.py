@@ -49,14 +49,14 @@ class Survey:
 
     Args:
         path: The URDF.
-        lost_shapes: Boxes around removed collision meshes by link.
+        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each.
 
     Raises:
         ValueError: Drake cannot read the URDF, it has no floating base, or a joint has more than
             one degree of freedom.
     """
 
-    def __init__(self, path: Path, lost_shapes: dict[str, list[np.ndarray]] | None = None):
+    def __init__(self, path: Path, lost_meshes: dict[str, list[np.ndarray]] | None = None):
         builder = DiagramBuilder()
         plant: MultibodyPlant
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -69,7 +69,7 @@ class Survey:
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = plant.GetMyMutableContextFromRoot(self._root)
-        self._lost = lost_shapes or {}
+        self._lost = lost_meshes or {}
         floating = [
             plant.get_body(i).name()
             for i in plant.GetBodyIndices(self.instance)
@@ -207,11 +207,7 @@ class Survey:
         return limbs
 
     def arms(self, legs: list[Limb]) -> list[Limb]:
-        """Returns other limbs of four joints or more; a hand's fingers are no limbs.
-
-        Args:
-            legs: The legs.
-        """
+        """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
         feet = {limb.body for limb in legs}
         chains = [
             (self.chain(group[0]), group)
@@ -319,7 +315,8 @@ class Survey:
                     if box is not None:
                         X_WO = X_WG @ box.pose()
                         found.append((name, *_corners(X_WO, np.array(box.half_width())), False))
-            for low, high in self._lost.get(name, []):
+            for vertices in self._lost.get(name, []):
+                low, high = vertices.min(axis=0), vertices.max(axis=0)
                 X_WO = X_WB @ RigidTransform((low + high) / 2)
                 found.append((name, *_corners(X_WO, (high - low) / 2), False))
         return found

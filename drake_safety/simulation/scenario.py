@@ -5,7 +5,6 @@ import hashlib
 import importlib
 import inspect
 import math
-import re
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -189,12 +188,8 @@ class Scenario:
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
-            digest.update(_LOOKS.sub(b"", Path(path).read_bytes()))
+            digest.update(Path(path).read_bytes())
         return digest.hexdigest()
-
-
-_LOOKS = re.compile(rb"^visuals:.*\n", re.MULTILINE)
-"""Lines of a robot.yaml that do not affect a simulation."""
 
 
 def _takes(task: type[ClosedLoop], name: str) -> bool:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Generator, Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydrake.geometry import Sphere
@@ -22,32 +24,18 @@ from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.remedies import (
-    LEVEL_M,
-    effort_limits,
-    feet_below,
-    level_feet,
-    scaled_gains,
-    scaled_start,
-    within_stops,
-)
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
+_Result = TypeVar("_Result")
+
+_Check = Generator[Finding, None, None]
 _STANDS = "stands for 1 s"
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
+_LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
-
-
-@dataclass
-class _State:
-    """Results of checks that later ones need."""
-
-    scenario: Scenario | None = None
-    robot: RobotModel | None = None
-    kinematics: RobotKinematics | None = None
-    loop: ClosedLoop | None = None
+_EFFORT_REMEDY = "state their largest torques under 'effort_limits' in robot.yaml [N·m]"
 
 
 def check_scenario(
@@ -74,184 +62,194 @@ def check_scenario(
     Yields:
         The findings.
     """
-    state = _State()
     report: StageProgress = progress or (lambda stage, done, total: None)
-    if is_imported:
-        yield from _guarded("scenario", lambda: _scenario(state, name))
-    else:
-        yield from _guarded("scenario", lambda: _unimported_scenario(state, name))
-    if (scenario := state.scenario) is None:
+    scenario = yield from _guarded("scenario", _scenario(name, is_imported))
+    if scenario is None:
         return
+    kinematics = None
     if scenario.robot:
-        yield from _guarded("robot.yaml", lambda: _robot(state, scenario))
-        if (robot := state.robot) is None:
+        robot = yield from _guarded("robot.yaml", _robot(scenario))
+        if robot is None:
             return
-        yield from _guarded("bodies and joints", lambda: _kinematics(state, robot))
-        if (kinematics := state.kinematics) is None:
+        kinematics = yield from _guarded("bodies and joints", _kinematics(robot))
+        if kinematics is None:
             return
-        yield from _guarded("standing posture", lambda: _posture(kinematics))
-        yield from _guarded("motors", lambda: _motors(kinematics))
-        yield from _guarded("collision shapes", lambda: _collisions(robot))
+        yield from _guarded("standing posture", _posture(kinematics))
+        yield from _guarded("motors", _motors(kinematics))
+        yield from _guarded("collision shapes", _collisions(robot))
     if not is_imported:
         return
-    own = list(_guarded("files of the task", lambda: _own(state, scenario)))
+    own = list(_guarded("files of the task", _own(scenario, kinematics)))
     yield from own
     if not all(finding.is_ok for finding in own):
         return
-    yield from _guarded("diagram", lambda: _diagram(state, scenario))
-    if (loop := state.loop) is None:
+    loop = yield from _guarded("diagram", _diagram(scenario))
+    if loop is None:
         return
     if isinstance(loop, LeggedLoop):
-        yield from _guarded("contact spheres", lambda: _contacts(loop))
-        yield from _guarded("shape of the base", lambda: _target(loop))
+        yield from _guarded("contact spheres", _contacts(loop))
+        yield from _guarded("shape of the base", _target(loop))
         report(_STANDS, 0, 1)
-        yield from _guarded(_STANDS, lambda: _stands(loop))
+        yield from _guarded(_STANDS, _stands(loop))
         report(_STANDS, 1, 1)
-    yield from _guarded("contract", lambda: iter(check_contract(loop, seed=seed)))
+    yield from _guarded("contract", _contract(loop, seed))
     if num_episodes:
-        yield from _guarded("episodes", lambda: _episodes(loop, num_episodes, seed, report))
+        yield from _guarded("episodes", _episodes(loop, num_episodes, seed, report))
 
 
-def _guarded(item: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def _guarded(
+    item: str, check: Generator[Finding, None, _Result]
+) -> Generator[Finding, None, _Result | None]:
+    """A check's findings and result; an exception is a finding, and the result None."""
     try:
-        yield from check()
+        return (yield from check)
     # A user's task may raise anything, and so may Drake's parser.
     except Exception as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         yield failed(item, f"{kind}{error}", "correct what the message names")
+        return None
 
 
-def _scenario(state: _State, name: str | Path) -> Iterator[Finding]:
-    scenario = load_scenario(name)
-    task = scenario.task_class()
-    yield passed("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
-    file = getattr(sys.modules[task.__module__], "__file__", None)
-    yield passed("code", f"the scenario runs {scenario.task}, {file}")
-    yield from _plants(state, scenario)
+def _judged(item: str, is_ok: bool, message: str, problem: str, remedy: str) -> Finding:
+    return passed(item, message) if is_ok else failed(item, problem, remedy)
 
 
-def _unimported_scenario(state: _State, name: str | Path) -> Iterator[Finding]:
-    scenario, _ = read_scenario(name)
-    yield passed("scenario", f"'{scenario.name}' fits the schema, but for its parameters")
-    yield passed(
-        "code", f"the scenario runs {scenario.task}, which was not imported; read it before you do"
-    )
-    yield from _plants(state, scenario)
-
-
-def _plants(state: _State, scenario: Scenario) -> Iterator[Finding]:
-    state.scenario = scenario
+def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, Scenario | None]:
+    scenario: Scenario
+    if is_imported:
+        scenario = load_scenario(name)
+        task = scenario.task_class()
+        yield passed("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
+        file = getattr(sys.modules[task.__module__], "__file__", None)
+        yield passed("code", f"the scenario runs {scenario.task}, {file}")
+    else:
+        scenario, _ = read_scenario(name)
+        yield passed("scenario", f"'{scenario.name}' fits the schema, but for its parameters")
+        yield passed(
+            "code",
+            f"the scenario runs {scenario.task}, which was not imported; read it before you do",
+        )
     if "nominal" not in scenario.variations:
         yield failed(
             "plants",
             f"no variation 'nominal'; it has {list(scenario.variations)}",
             "add `nominal: {}` under 'variations': the plant of the training episodes",
         )
-        state.scenario = None
-    elif "actual" not in scenario.variations:
-        yield failed(
-            "plants",
-            "no variation 'actual', which `run` and throws simulate",
-            "add `actual: {}` under 'variations', with the differences of the real robot",
-        )
-    else:
-        yield passed("plants", ", ".join(scenario.variations))
+        return None
+    yield _judged(
+        "plants",
+        "actual" in scenario.variations,
+        ", ".join(scenario.variations),
+        "no variation 'actual', which `run` and throws simulate",
+        "add `actual: {}` under 'variations', with the differences of the real robot",
+    )
+    return scenario
 
 
-def _robot(state: _State, scenario: Scenario) -> Iterator[Finding]:
+def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
     robot = load_robot(scenario.robot)
     yield passed("robot.yaml", f"'{robot.name}' fits the schema")
     missing = [str(path) for path in robot_files(scenario.robot) if not path.is_file()]
     if missing:
         yield failed("files", f"not found: {missing}", "set 'urdf' to a path beside robot.yaml")
-        return
+        return None
     yield passed("files", "found")
-    state.robot = robot
+    return robot
 
 
-def _kinematics(state: _State, robot: RobotModel) -> Iterator[Finding]:
-    kinematics = state.kinematics = RobotKinematics(robot)
+def _kinematics(robot: RobotModel) -> Generator[Finding, None, RobotKinematics]:
+    kinematics = RobotKinematics(robot)
     yield passed(
         "bodies and joints",
         f"{len(kinematics.foot_names)} feet, {kinematics.num_joints} joints, "
         f"{kinematics.total_mass:.1f} kg",
     )
+    return kinematics
 
 
-def _posture(kinematics: RobotKinematics) -> Iterator[Finding]:
+def _posture(kinematics: RobotKinematics) -> _Check:
     q = kinematics.standing_positions()
-    low, high = kinematics.position_limits.T
-    beyond = (kinematics.posture < low) | (kinematics.posture > high)
-    if beyond.any():
-        names = [name for name, wrong in zip(kinematics.joint_names, beyond, strict=True) if wrong]
+    beyond = [
+        f"{name} at {value:g}, between {low:g} and {high:g}"
+        for name, value, (low, high) in zip(
+            kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True
+        )
+        if not low <= value <= high
+    ]
+    if beyond:
         yield failed(
             "joint stops",
-            f"the posture is beyond those of {names}",
-            within_stops(kinematics, names),
+            f"the posture is beyond them [rad]: {'; '.join(beyond)}",
+            "correct 'posture' in robot.yaml [rad], or the joints' <limit> in the URDF",
         )
     p_WC = kinematics.contact_positions(q)
     heights = p_WC[:, 2] - kinematics.foot_radii
-    if np.ptp(heights) > LEVEL_M:
-        high_feet = [
-            name
-            for name, points in zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
-            if heights[points].max() > LEVEL_M
-        ]
-        yield failed(
-            "feet level",
-            f"feet {high_feet} hang up to {100 * np.ptp(heights):.1f} cm over the ground",
-            level_feet(kinematics),
-        )
-    else:
-        yield passed(
-            "feet level",
-            f"within {1000 * np.ptp(heights):.1f} mm, base {kinematics.standing_height:.3f} m high",
-        )
+    high_feet = [
+        name
+        for name, points in zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
+        if heights[points].max() > _LEVEL_M
+    ]
+    spread = np.ptp(heights)
+    yield _judged(
+        "feet level",
+        spread <= _LEVEL_M,
+        f"within {1000 * spread:.1f} mm, base {kinematics.standing_height:.3f} m high",
+        f"feet {high_feet} hang up to {100 * spread:.1f} cm over the ground, expected at most "
+        f"{100 * _LEVEL_M:g}",
+        "change their joints under 'posture' in robot.yaml [rad], or 'contact_points' and "
+        "'radius_m' under 'feet' [m]",
+    )
     corners = convex_hull(p_WC[:, :2].tolist())
     for item, point in (
         ("centre of mass over the feet", kinematics.center_of_mass(q)),
         ("base over the feet", q[4:7]),
     ):
         distance = signed_distance_to_polygon(point[:2], corners)
-        if distance > 0:
-            yield passed(item, f"{100 * distance:.1f} cm inside their polygon")
-        else:
-            yield failed(
-                item,
-                f"{-100 * distance:.1f} cm outside their polygon",
-                feet_below(kinematics, point),
-            )
+        x, y = point[:2] - np.mean(corners, axis=0)
+        yield _judged(
+            item,
+            distance > 0,
+            f"{100 * distance:.1f} cm inside their polygon",
+            f"{-100 * distance:.1f} cm outside their polygon, at ({x:+.3f}, {y:+.3f}) m in x and y "
+            "from its centre",
+            "change 'posture' [rad] or 'contact_points' under 'feet' [m] in robot.yaml, so that "
+            "the feet surround it, or correct the masses in the URDF [kg]",
+        )
 
 
-def _own(state: _State, scenario: Scenario) -> Iterator[Finding]:
-    if state.kinematics is not None:
-        yield from scenario.task_class().check_files(scenario, state.kinematics)
+def _own(scenario: Scenario, kinematics: RobotKinematics | None) -> _Check:
+    if kinematics is not None:
+        yield from scenario.task_class().check_files(scenario, kinematics)
 
 
-def _diagram(state: _State, scenario: Scenario) -> Iterator[Finding]:
-    state.loop = scenario.make_loop()
-    yield passed("diagram", f"{type(state.loop).__name__} is built")
+def _diagram(scenario: Scenario) -> Generator[Finding, None, ClosedLoop]:
+    loop = scenario.make_loop()
+    yield passed("diagram", f"{type(loop).__name__} is built")
+    return loop
 
 
-def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
+def _contract(loop: ClosedLoop, seed: int) -> _Check:
+    yield from check_contract(loop, seed=seed)
+
+
+def _motors(kinematics: RobotKinematics) -> _Check:
     plant, robot = kinematics.plant, kinematics.robot
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
     limits = {actuator.joint().name(): actuator.effort_limit() for actuator in actuators}
     without = [name for name in kinematics.joint_names if name not in limits]
-    if without:
-        yield failed(
-            "motors",
-            f"joints {without} have none",
-            effort_limits(kinematics, without),
-        )
-    else:
-        yield passed("motors", f"one on each of {len(limits)} joints")
+    yield _judged(
+        "motors",
+        not without,
+        f"one on each of {len(limits)} joints",
+        f"joints {without} have none",
+        _EFFORT_REMEDY,
+    )
     unlimited = [name for name, limit in limits.items() if not np.isfinite(limit)]
     if unlimited:
         yield failed(
             "effort limits",
             f"the motors of joints {unlimited} have none, so that no load is too heavy",
-            effort_limits(kinematics, unlimited),
+            _EFFORT_REMEDY,
         )
     if robot.joint_gains:
         loose = [
@@ -265,27 +263,27 @@ def _motors(kinematics: RobotKinematics) -> Iterator[Finding]:
             )
     q = kinematics.standing_positions()
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
-    weak = [
-        f"{name} needs {abs(torque):.1f} of {limits[name]:.1f} N·m"
+    needs = {
+        name: abs(torque)
         for name, torque in zip(kinematics.joint_names, torques, strict=True)
-        if name in limits and abs(torque) > limits[name]
+        if name in limits
+    }
+    shares = [torque / limits[name] for name, torque in needs.items()]
+    weak = [
+        f"{name} needs {torque:.1f} of {limits[name]:.1f} N·m"
+        for name, torque in needs.items()
+        if torque > limits[name]
     ]
-    if weak:
-        yield failed(
-            "effort against gravity",
-            "; ".join(weak),
-            "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
-        )
-    else:
-        shares = [
-            abs(torque) / limits[name]
-            for name, torque in zip(kinematics.joint_names, torques, strict=True)
-            if name in limits
-        ]
-        yield passed("effort against gravity", f"{100 * max(shares, default=0):.0f} % at most")
+    yield _judged(
+        "effort against gravity",
+        not weak,
+        f"{100 * max(shares, default=0):.0f} % at most",
+        "; ".join(weak),
+        "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
+    )
 
 
-def _collisions(robot: RobotModel) -> Iterator[Finding]:
+def _collisions(robot: RobotModel) -> _Check:
     """Checks whether links that lost their collision meshes have got a shape since."""
     if not robot.without_collision:
         return
@@ -308,7 +306,7 @@ def _collisions(robot: RobotModel) -> Iterator[Finding]:
     )
 
 
-def _target(loop: LeggedLoop) -> Iterator[Finding]:
+def _target(loop: LeggedLoop) -> _Check:
     """Checks that a thrown ball can hit the base."""
     if not isinstance(loop, HasBall):
         return
@@ -316,19 +314,17 @@ def _target(loop: LeggedLoop) -> Iterator[Finding]:
     base = plant.GetBodyByName(robot.base, loop.robot_instance)
     bodies = plant.GetBodiesWeldedTo(base)
     count = sum(len(plant.GetCollisionGeometriesForBody(body)) for body in bodies)
-    if count:
-        yield passed("shape of the base", f"{count} collision shapes for balls to hit")
-    else:
-        yield failed(
-            "shape of the base",
-            f"base '{robot.base}' has no collision geometry, so balls fly through it",
-            f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
-            f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in "
-            "robot.yaml",
-        )
+    yield _judged(
+        "shape of the base",
+        count > 0,
+        f"{count} collision shapes for balls to hit",
+        f"base '{robot.base}' has no collision geometry, so balls fly through it",
+        f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
+        f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in robot.yaml",
+    )
 
 
-def _contacts(loop: LeggedLoop) -> Iterator[Finding]:
+def _contacts(loop: LeggedLoop) -> _Check:
     plant, robot = loop.plant, loop.robot
     inspector = loop.GetSubsystemByName("scene_graph").model_inspector()
     missing = []
@@ -346,42 +342,36 @@ def _contacts(loop: LeggedLoop) -> Iterator[Finding]:
             ):
                 found = [f"{np.round(c, 4).tolist()} r {r:.4f}" for c, r in spheres]
                 missing.append(f"{name} at {point} r {foot.radius_m}; it has {found or 'none'}")
-    if missing:
-        yield failed(
-            "contact spheres",
-            "the model file has no such sphere: " + "; ".join(missing),
-            "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
-        )
-    else:
-        yield passed("contact spheres", f"{loop.kinematics.num_contacts} in the model file")
+    yield _judged(
+        "contact spheres",
+        not missing,
+        f"{loop.kinematics.num_contacts} in the model file",
+        "the model file has no such sphere: " + "; ".join(missing),
+        "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
+    )
 
 
-def _stands(loop: LeggedLoop) -> Iterator[Finding]:
-    kinematics = loop.kinematics
+def _stands(loop: LeggedLoop) -> _Check:
+    kinematics, height = loop.kinematics, loop.kinematics.standing_height
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    start = loop.standing_start()
-    loop.reset_to(context, None, start)
+    loop.reset_to(context, None, loop.standing_start())
     simulator.Initialize()
-    margins = loop.GetOutputPort("margins")
-    found = margins.Eval(context)
-    names = loop.constraint_names
-    if found.min() < 0:
-        wrong = [name for name, margin in zip(names, found, strict=True) if margin < 0]
-        yield failed(
-            "safe while it stands",
-            f"the standing posture violates {wrong}",
-            "for 'height' widen 'height_m' under 'safe_set', such as "
-            f"[{0.71 * kinematics.standing_height:.3g}, {1.18 * kinematics.standing_height:.3g}] "
-            f"[m], which must include the standing height {kinematics.standing_height:.3f}; for "
-            "others change 'posture'",
-        )
-    else:
-        yield passed("safe while it stands", "the posture is in the safe set")
+    margins = loop.GetOutputPort("margins").Eval(context)
+    wrong = [one for one, margin in zip(loop.constraint_names, margins, strict=True) if margin < 0]
+    yield _judged(
+        "safe while it stands",
+        not wrong,
+        "the posture is in the safe set",
+        f"the standing posture violates {wrong}",
+        f"for 'height' widen 'height_m' under 'safe_set', such as [{0.71 * height:.3g}, "
+        f"{1.18 * height:.3g}] [m], which must include the standing height {height:.3f}; for "
+        "others change 'posture'",
+    )
     simulator.AdvanceTo(1.0)
     state_now = loop.GetOutputPort("plant_state").Eval(context)
     q, v = np.split(state_now, [kinematics.num_positions])
-    sunk = kinematics.standing_height - q[6]
+    sunk = height - q[6]
     speed = float(np.abs(v[NUM_BASE_VELOCITIES:]).max(initial=0.0))
     clearance = kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii
     touching = int(np.sum(clearance < 5e-3))
@@ -389,55 +379,47 @@ def _stands(loop: LeggedLoop) -> Iterator[Finding]:
         f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
-    if abs(sunk) > _SINK_SHARE * kinematics.standing_height or speed > 1.0 or not touching:
-        yield failed(
-            _STANDS,
-            message,
-            f"if it sinks, raise {scaled_gains(loop.robot.joint_gains, 2.0)}; if it trembles, "
-            "halve them; look for shapes that overlap by `check --picture FILE`",
-        )
-    else:
-        yield passed(_STANDS, message)
+    yield _judged(
+        _STANDS,
+        abs(sunk) <= _SINK_SHARE * height and speed <= 1.0 and touching > 0,
+        message,
+        message,
+        "if it sinks, raise 'joint_gains' in robot.yaml, such as twofold [N·m/rad, N·m·s/rad]; if "
+        "it trembles, halve them; look for shapes that overlap by `check --picture FILE`",
+    )
 
 
-def _episodes(
-    loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress
-) -> Iterator[Finding]:
-    episodes, parameters = [], loop.scenario.parameters
+def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress) -> _Check:
+    episodes = []
     for index in range(num_episodes):
         report("episodes", index, num_episodes)
         episodes.append(run_episode(loop, index, seed=seed))
     report("episodes", num_episodes, num_episodes)
-    causes: dict[str, int] = {}
-    for episode in episodes:
-        if not episode.is_safe:
-            causes[episode.cause] = causes.get(episode.cause, 0) + 1
+    causes = Counter(episode.cause for episode in episodes if not episode.is_safe)
     yield passed("starts can be sampled", f"{num_episodes} episodes simulated")
     lost = sum(episode.num_steps == 0 for episode in episodes)
     if lost > num_episodes / 4:
         yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
-            "narrow the starts, or widen the safe set" + scaled_start(parameters, 0.5),
+            "narrow the ranges under 'start' in the scenario, or widen 'safe_set'",
         )
     if causes.pop(DIVERGED, 0):
         yield failed(
             "simulation", "an episode diverged", "lower time_step_s [s], or the gains; see masses"
         )
     share = sum(causes.values()) / num_episodes
+    low, high = _UNSAFE_SHARES
     message = f"{100 * share:.0f} % of {num_episodes} episodes: " + (
         ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
     )
-    low, high = _UNSAFE_SHARES
-    if low <= share <= high:
-        yield passed("share of unsafe episodes", message)
-    else:
-        yield failed(
-            "share of unsafe episodes",
-            message,
-            "widen the starts and plans, or narrow the safe set: Γ learns from both kinds"
-            + scaled_start(parameters, 1.5)
-            if share < low
-            else "narrow the starts and plans, or widen the safe set: Γ learns from both kinds"
-            + scaled_start(parameters, 0.5),
-        )
+    start = getattr(loop.scenario.parameters, "start", None)
+    present = f"; 'start' is {vars(start)}" if is_dataclass(start) else ""
+    change, other = ("widen", "narrow") if share < low else ("narrow", "widen")
+    yield _judged(
+        "share of unsafe episodes",
+        low <= share <= high,
+        message,
+        f"{message}; expected {100 * low:.0f} to {100 * high:.0f} %: Γ learns from both",
+        f"{change} the ranges of starts and plans in the scenario, or {other} 'safe_set'{present}",
+    )

@@ -1,4 +1,4 @@
-"""Policies described in the forms of other projects: read, overridden, or refused with a reason."""
+"""Policies described in the forms of other projects: converted, or refused with a reason."""
 
 import copy
 import math
@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_safety.control.policy import Policy
-from drake_safety.control.policy_files import load_policy, read_policy_file
+from drake_safety.control.foreign_policy import converted_policy
+from drake_safety.control.policy import load_policy, read_policy_file
+from drake_safety.control.policy_template import survey_policy
 from policy_networks import save_network
 
 pytestmark = pytest.mark.train
 
 JOINTS = ["tail", "hip", "knee"]  # The robot's.
+MOTORS = ["knee", "tail", "hip"]
 
-# The network's joints are hip and knee; the robot's motors are knee, tail, hip.
+# The network's joints are hip and knee.
 DEPLOY = {
     "joint_ids_map": [2, 0],
     "step_dt": 0.02,
@@ -87,16 +89,14 @@ def dump(path, content):
     return path
 
 
-def deploy(folder, change=None, **stated):
-    """A policy.yaml that reads a deploy.yaml, in which ``change`` edits a copy of the example."""
+def deploy(folder, change=None):
+    """A deploy.yaml with its network; ``change`` edits a copy of the example."""
     content = copy.deepcopy(DEPLOY)
     if change is not None:
         change(content)
-    dump(folder / "params" / "deploy.yaml", content)
     (folder / "exported").mkdir(exist_ok=True)
     save_network(folder / "exported" / "policy.pt", 10, 2)
-    stated = {"read": "params/deploy.yaml", "motors": ["knee", "tail", "hip"]} | stated
-    return dump(folder / "policy.yaml", stated)
+    return dump(folder / "params" / "deploy.yaml", content)
 
 
 def rl_sar(folder, change=None, lab="lab"):
@@ -110,9 +110,12 @@ def rl_sar(folder, change=None, lab="lab"):
     return config
 
 
-def loaded(path):
+def loaded(path, motors=()):
+    """The policy of what `new` writes."""
     robot = SimpleNamespace(joint_names=JOINTS, robot=SimpleNamespace(name="beast"))
-    return load_policy(path, robot)
+    (path.parent / "robot").mkdir(exist_ok=True)
+    (_, file), _ = survey_policy(path, motors).write(path.parent / "robot", JOINTS, {})
+    return load_policy(file, robot)
 
 
 def inputs(policy, action=(0.0, 0.0)):
@@ -124,8 +127,7 @@ def inputs(policy, action=(0.0, 0.0)):
 
 
 def test_a_deploy_yaml_says_all_but_the_names_of_the_motors(tmp_path):
-    policy = loaded(deploy(tmp_path))
-    assert isinstance(policy, Policy)
+    policy = loaded(deploy(tmp_path), MOTORS)
     assert policy.joint_names == ["hip", "knee"]
     gains = [(policy.gains[name].stiffness, policy.gains[name].damping) for name in ("hip", "knee")]
     assert gains == [(20.0, 2.0), (30.0, 3.0)]  # In the motors' order, unlike the rest.
@@ -137,26 +139,6 @@ def test_a_deploy_yaml_says_all_but_the_names_of_the_motors(tmp_path):
     assert policy.parameters.command.lowest == [-0.5, -0.3, -0.2]
     assert policy.parameters.command.highest == [1.0, 0.3, 0.2]
     assert policy.parameters.action_clip == math.inf
-
-
-def test_what_policy_yaml_states_wins(tmp_path):
-    stated = {
-        "gains": {".*": {"stiffness": 7.0, "damping": 0.7}},
-        "period_s": 0.01,
-        "command": {"change": [0.1, 0.1, 0.1]},
-        "default_positions": {"hip": 1.0},
-    }
-    policy = loaded(deploy(tmp_path, lambda content: content.pop("stiffness"), **stated))
-    assert {gains.stiffness for gains in policy.gains.values()} == {7.0}
-    assert policy.parameters.period_s == 0.01
-    assert policy.parameters.command.change == [0.1, 0.1, 0.1]
-    assert policy.parameters.command.highest == [1.0, 0.3, 0.2]
-    np.testing.assert_allclose(policy.default_positions, [0.0, 1.0, 0.0])
-
-
-def test_names_may_be_those_of_the_network_in_its_order(tmp_path):
-    policy = loaded(deploy(tmp_path, motors=[], joints=["hip", "knee"]))
-    assert policy.gains["knee"].stiffness == 30.0
 
 
 def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
@@ -172,7 +154,7 @@ def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
 
     path = deploy(tmp_path, change)
     save_network(tmp_path / "exported" / "policy.pt", 12, 2)
-    policy = loaded(path)
+    policy = loaded(path, MOTORS)
     assert policy.parameters.history.ages == [1, 0]
     assert policy.parameters.gait.period_s == 0.8
     sample = [0.3, 0.5, 5.0, 6.0, 0.0, 1.0]
@@ -182,7 +164,6 @@ def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c["observations"].update(lidar={}), "unknown observation 'lidar'; registered"),
         (lambda c: c.update(stiffness=[1.0]), "'stiffness' must have an entry for each motor, up"),
         (lambda c: c.update(default_joint_pos=[0.0] * 3), "must have 2 entries; got 3"),
         (lambda c: c.update(camera={}), r"unknown keys \['camera'\]; known are"),
@@ -218,47 +199,55 @@ def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
 def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, change, message):
     path = deploy(tmp_path, change)
     with pytest.raises(ValueError, match=message) as error:
-        read_policy_file(path)
+        converted_policy(path, MOTORS)
     assert "deploy.yaml" in str(error.value)
 
 
-def test_joints_without_names_are_asked_for_with_those_of_the_robot(tmp_path):
-    path = deploy(tmp_path, motors=[])
-    with pytest.raises(ValueError, match=r"State in policy.yaml 'motors'.*the robot has \['tail'"):
-        loaded(path)
-    # Named directly, the file has no policy.yaml that could state them.
-    with pytest.raises(ValueError, match="does not name its joints"):
-        loaded(tmp_path / "params" / "deploy.yaml")
+@pytest.mark.parametrize(
+    ("motors", "message"),
+    [
+        ([], "has 2 joints; got 0 names.*name their joints in that order by --motors"),
+        (["knee", "tail"], "'names of motors' must have an entry for each motor, up to 2"),
+    ],
+)
+def test_joints_without_names_are_asked_for(tmp_path, motors, message):
+    with pytest.raises(ValueError, match=message):
+        converted_policy(deploy(tmp_path), motors)
 
 
 def test_slices_that_an_exporter_writes_are_read(tmp_path):
-    path = deploy(tmp_path)
-    file = tmp_path / "params" / "deploy.yaml"
+    file = deploy(tmp_path)
     text = file.read_text()
-    for ends, is_all in (("[null, null, null]", True), ("[0, 1, null]", False)):
-        tag = "joint_ids: !!python/object/apply:builtins.slice"
-        file.write_text(text.replace("joint_ids: null", f"{tag} {ends}"))
-        if is_all:
-            assert loaded(path).joint_names == ["hip", "knee"]
-        else:
-            with pytest.raises(ValueError, match="joint_ids must be all 2 joints"):
-                loaded(path)
-    file.write_text(text.replace("joint_ids: null", "joint_ids: !!python/name:os.system ''"))
-    with pytest.raises(ValueError, match="is not YAML"):
-        loaded(path)
+    tag = "joint_ids: !!python/object/apply:builtins.slice"
+    file.write_text(text.replace("joint_ids: null", f"{tag} [null, null, null]"))
+    assert converted_policy(file, MOTORS)["joints"] == ["hip", "knee"]
+    for other, message in (
+        (f"{tag} [0, 1, null]", "joint_ids must be all 2 joints"),
+        ("joint_ids: !!python/name:os.system ''", "is not YAML"),
+    ):
+        file.write_text(text.replace("joint_ids: null", other))
+        with pytest.raises(ValueError, match=message):
+            converted_policy(file, MOTORS)
 
 
 def test_a_network_is_looked_for_beside_the_file(tmp_path):
     path = deploy(tmp_path)
     (tmp_path / "exported" / "policy.pt").unlink()
     with pytest.raises(ValueError, match="no network beside it, expected one of"):
-        read_policy_file(path)
-    assert read_policy_file(deploy(tmp_path)).network.name == "policy.pt"
+        converted_policy(path, MOTORS)
 
 
-def test_a_config_of_rl_sar_needs_no_policy_yaml(tmp_path):
-    config = rl_sar(tmp_path)
-    policy = loaded(config)
+def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
+    path = deploy(tmp_path, lambda c: c["observations"].update(lidar={}))
+    text, asked = survey_policy(path, MOTORS).yaml(JOINTS, {})
+    assert "name: lidar" in text
+    assert any("functions of the terms ['lidar']" in what for what in asked)
+    with pytest.raises(ValueError, match=r"unknown terms \['lidar'\]; registered are"):
+        loaded(path, MOTORS)
+
+
+def test_a_config_of_rl_sar_says_all_but_the_commands(tmp_path):
+    policy = loaded(rl_sar(tmp_path))
     assert policy.joint_names == ["hip", "knee"]
     assert policy.gains["knee"].stiffness == 30.0
     np.testing.assert_allclose(policy.action_scale, [0.125, 0.25])
@@ -269,8 +258,6 @@ def test_a_config_of_rl_sar_needs_no_policy_yaml(tmp_path):
     sample = [1.0, 0.2, 0.05, 0.3, 0.5, 0.0, 0.0, -1.0]
     np.testing.assert_allclose(inputs(policy), 2 * sample)
     assert policy.parameters.history.ages == [0, 1]
-    files = read_policy_file(config).files
-    assert [path.name for path in files] == ["config.yaml", "base.yaml"]
 
 
 def test_the_robots_file_may_be_two_folders_up(tmp_path):
@@ -287,38 +274,36 @@ def test_history_by_term_is_read_too(tmp_path):
     ("change", "message"),
     [
         (lambda c: c.update(num_observations=45), "num_observations is 45, but its .* 8 entries"),
-        (lambda c: c["observations"].append("phase"), "unknown observation 'phase'; known are"),
         (lambda c: c.update(wheel_indices=[1]), r"wheels are not supported; got .*\[1\]"),
         (lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
-        (lambda c: c.update(clip_actions_upper=[8, 9]), "State action_clip in policy.yaml"),
+        (
+            lambda c: c.update(clip_actions_upper=[8, 9]),
+            "between joints .* Write one for all",
+        ),
         (lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
         (lambda c: c.update(terrain=1), r"unknown keys \['terrain'\]"),
         (lambda c: c.update(rows=1, framework="isaacsim"), "rows and cols of old files"),
         (lambda c: c.update(model_name="gone.pt"), r"no network beside it.*\['gone.pt'\]"),
-        (
-            lambda c: (
-                c.update(observations=["commands", "dof_pos", "beast_phase"])
-                or c.update(num_observations=7)
-            ),
-            "a gait clock without a period",
-        ),
     ],
 )
 def test_what_a_config_of_rl_sar_cannot_say_here_is_refused(tmp_path, change, message):
     config = rl_sar(tmp_path, change)
     with pytest.raises(ValueError, match=message) as error:
-        read_policy_file(config)
+        converted_policy(config)
     assert "config.yaml" in str(error.value)
 
 
-def test_a_phase_whose_period_policy_yaml_states_is_a_clock(tmp_path):
+def test_a_phase_has_a_clock_whose_period_is_asked_for(tmp_path):
     def change(content):
         content.update(observations=["commands", "dof_pos", "beast_phase"], num_observations=7)
 
     config = rl_sar(tmp_path, change)
     save_network(config.parent / "walk.pt", 14, 2)
-    path = dump(tmp_path / "policy.yaml", {"read": str(config), "gait": {"period_s": 0.8}})
-    policy = loaded(path)
+    with pytest.raises(ValueError, match="term 'gait_phase' needs a clock: state 'gait"):
+        loaded(config)
+    file = config.parent / "robot" / "policy.yaml"
+    file.write_text(file.read_text().replace("# gait", "gait"))
+    policy = load_policy(file, SimpleNamespace(joint_names=JOINTS, robot=SimpleNamespace(name="")))
     np.testing.assert_allclose(inputs(policy)[5:7], [0.0, 1.0])
     # It runs while the robot stands, too.
     assert policy.next_phases(policy.initial_phases, np.zeros(3))[0] == pytest.approx(
@@ -326,15 +311,32 @@ def test_a_phase_whose_period_policy_yaml_states_is_a_clock(tmp_path):
     )
 
 
-def test_files_of_other_forms_are_told_apart(tmp_path):
-    dump(tmp_path / "odd.yaml", {"a": 1})
-    path = dump(tmp_path / "policy.yaml", {"read": "odd.yaml"})
-    with pytest.raises(ValueError, match=r"odd.yaml' is neither a deploy.yaml .*keys are \['a'\]"):
-        read_policy_file(path)
-    with pytest.raises(ValueError, match="unknown key 'a'"):
-        read_policy_file(tmp_path / "odd.yaml")
-    with pytest.raises(ValueError, match="does not exist"):
-        read_policy_file(dump(tmp_path / "policy.yaml", {"read": "gone.yaml"}))
-    two = dump(tmp_path / "two.yaml", {"a": CONFIG["beast/lab"], "b": CONFIG["beast/lab"]})
-    with pytest.raises(ValueError, match=r"one policy in a file is expected; got \['a', 'b'\]"):
-        read_policy_file(two)
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"a": 1}, r"odd.yaml' is neither a deploy.yaml .*keys are \['a'\]"),
+        (
+            {"a": CONFIG["beast/lab"], "b": CONFIG["beast/lab"]},
+            r"one policy in a file is expected; got \['a', 'b'\]",
+        ),
+    ],
+)
+def test_files_of_other_forms_are_told_apart(tmp_path, content, message):
+    with pytest.raises(ValueError, match=message):
+        converted_policy(dump(tmp_path / "odd.yaml", content))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "does not exist"),
+        ("a: 1", "unknown key 'a'"),
+        ("read: deploy.yaml", "unknown key 'read'"),
+        ("a: [", "is not YAML"),
+    ],
+)
+def test_a_policy_yaml_that_is_none_is_refused(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "policy.yaml").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_policy_file(tmp_path / "policy.yaml")

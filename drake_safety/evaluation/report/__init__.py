@@ -1,1 +1,0 @@
-"""The report of a run: an HTML page, and tables as CSV, JSON and Markdown."""
