@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import DiagramBuilder, EventStatus
 
 from drake_safety.cli.console import ScenarioArgument, console, open_stages, print_path
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _BETWEEN_S, _LEAD_S = (3.0, 7.0), 0.1  # Between throws; from release to impact.
 _WARM_UP_S = 600.0
+_FALLEN = SimulatorStatus.ReturnReason.kReachedTerminationCondition
 
 
 def soak(
@@ -55,16 +56,12 @@ def soak(
     thrower, fall_name = require(loop, HasBall), require(loop, CanFall).fall_name
     fall_column = loop.constraint_names.index(fall_name)
     margins, own = loop.GetOutputPort("margins"), loop.GetMyContextFromRoot(root)
-    num_updates = num_falls = num_throws = 0
+    num_falls = num_throws = 0
 
     def watch(context: object) -> EventStatus:
-        nonlocal num_updates
-        before = adaptation.adapted[-1:]
-        status = adaptation(context)
-        num_updates += adaptation.adapted[-1:] != before
         if margins.Eval(own)[fall_column] < 0.0:
             return EventStatus.ReachedTermination(loop, "fallen")
-        return status
+        return EventStatus.DidNothing()
 
     simulator.set_monitor(watch)
     rng = np.random.default_rng(seed)
@@ -77,7 +74,8 @@ def soak(
             has_fallen = False
             while not has_fallen and done_s + root.get_time() < wanted_s:
                 until_s = root.get_time() + rng.uniform(*_BETWEEN_S)
-                has_fallen = _fell(simulator, until_s)
+                status = adaptation.advance(simulator, until_s)
+                has_fallen = status.reason() == _FALLEN
                 if not has_fallen:
                     throw = thrower.sample_throw(rng, root.get_time() + _LEAD_S)
                     thrower.throw_ball(root, throw, _LEAD_S)
@@ -95,14 +93,15 @@ def soak(
         "simulated_s": done_s,
         "throws": num_throws,
         "falls": num_falls,
-        "updates": num_updates,
+        "updates": adaptation.num_updates,
         "growth": growth,
         "memory_mb": samples,
     }
     (out / "soak.json").write_text(json.dumps(report) + "\n", encoding="utf-8")
     console.print(
-        f"{done_s / 3600:.2f} h: {num_throws} throws, {num_falls} falls, {num_updates} updates; "
-        f"memory {samples[-1][1]:.0f} MB, {100 * growth:+.1f} % since the tenth minute"
+        f"{done_s / 3600:.2f} h: {num_throws} throws, {num_falls} falls, "
+        f"{adaptation.num_updates} updates; memory {samples[-1][1]:.0f} MB, "
+        f"{100 * growth:+.1f} % since the tenth minute"
     )
     print_path("figures", out / "soak.json")
     for picture in save(_figure(np.array(samples)), out / "soak"):
@@ -117,11 +116,6 @@ def share_grown(samples: np.ndarray) -> float:
     """
     late = samples[samples[:, 0] >= min(_WARM_UP_S, 0.5 * samples[-1, 0]), 1]
     return float(np.median(late[-10:]) / np.median(late[:10]) - 1.0)
-
-
-def _fell(simulator: Simulator, until_s: float) -> bool:
-    status = simulator.AdvanceTo(until_s)
-    return status.reason() == status.ReturnReason.kReachedTerminationCondition
 
 
 def _memory_mb() -> float:
