@@ -20,9 +20,8 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
-from studies.cards import CARD_FILE, card_text
-from studies.shipping import NUM_EPISODES, check_shipped
-from studies.stored_results import EVALUATION_FILE
+from studies.documents import CARD_FILE, EVALUATION_FILE, card_text
+from studies.publish import NUM_EPISODES, check_shipped
 
 NAME = "shuttling"
 MEGABYTE = 1e6

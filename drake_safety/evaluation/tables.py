@@ -16,7 +16,7 @@ from drake_safety.evaluation.results import Results
 OURS = "sharpened"
 """The method that baselines are compared with."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
-_SCALES = {"%": 100.0, "=%": 100.0, "ms": 1000.0}
+_SCALES = {"%": 100.0, "points": 100.0, "=%": 100.0, "ms": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Column:
     Attributes:
         key: The metric.
         title: Its heading.
-        unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
-            rate, or "=" and "=%" for values without interval.
+        unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "n" for a number
+            of trials, "/h" for a rate, or "=" and "=%" for values without interval.
         better: 1 if larger is better, -1 if smaller is, 0 otherwise.
         digits: Digits after the decimal point.
     """
@@ -50,12 +50,12 @@ class Column:
         if self.unit == "n":
             return f"{estimate.value:.0f}"
         unit = self.unit.removeprefix("=")
-        space = "" if unit in ("", "/h") else f" {unit}"
+        space = "" if unit in ("", "/h", "points") else f" {unit}"
         return f"{_SCALES.get(self.unit, 1.0) * estimate.value:.{self.digits}f}{space}"
 
     def interval_text(self, estimate: Estimate | None) -> str:
         """The interval of an estimate in brackets, if any."""
-        if estimate is None or self.unit not in ("", "%", "/h"):
+        if estimate is None or self.unit not in ("", "%", "points", "/h"):
             return ""
         if not all(map(math.isfinite, (estimate.value, estimate.low, estimate.high))):
             return ""
