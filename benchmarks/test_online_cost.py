@@ -21,11 +21,11 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import SafetyAssessment, Scenario
-from drake_safety.evaluation.baselines import DirectClassifier
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.novelty_monitor import NoveltyMonitor
+from studies.baselines import DirectClassifier
 
 INPUT_NAMES = ("state", "desired_preview", "features")
 PERIOD_S = 0.01

@@ -11,8 +11,11 @@ from studies.ablation import ablate
 from studies.adaptation import adaptation
 from studies.animation import animation
 from studies.bench import bench
+from studies.compare import compare
 from studies.converged import converged
+from studies.evaluate import evaluate
 from studies.planning import plan_study
+from studies.promises import promises
 from studies.publish import readme, ship, store
 from studies.readings import readings
 from studies.scale import scale
@@ -27,6 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
+    *(evaluate, compare, promises),
     *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
     *(animation, bench, store, readme, ship),
 )

@@ -20,7 +20,6 @@ from drake_safety.evaluation.metrics import (
     Bootstrap,
     Estimate,
     auc,
-    auc_difference,
     segment_estimates,
     threshold_at,
 )
@@ -29,6 +28,7 @@ from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
+from studies.baselines import auc_difference
 from studies.harness import (
     Arrays,
     CalibrationOption,

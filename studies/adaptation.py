@@ -20,7 +20,6 @@ from drake_safety.cli.console import (
     print_shipped,
 )
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
-from drake_safety.evaluation.baselines import DirectClassifier
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.files.progress import StageProgress
@@ -33,6 +32,7 @@ from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import parallel_map
 from studies.adaptation_figure import adaptation_figure
+from studies.baselines import DirectClassifier
 from studies.harness import open_study
 
 SIZES = (40, 80, 120, 160, 400)

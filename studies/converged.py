@@ -11,8 +11,8 @@ import typer
 
 from drake_safety.cli.adapt import paired_episodes
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
-from drake_safety.evaluation.plan_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
@@ -64,7 +64,7 @@ def converged(
                 study.scenario, pairs, "actual", ADAPTATION.first, assessment, workers, stages
             )
             literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
-            thrown = evaluate_throws(
+            thrown, _ = evaluate_throws(
                 study.scenario,
                 [
                     TriggerRule(
@@ -75,13 +75,11 @@ def converged(
                     for name, one in literal.items()
                 ],
                 num_throws=throws,
-                num_calibration=0,
                 seed=study.seeds["disturbances"],
-                calibration_seed=study.seeds["disturbance thresholds"],
                 num_workers=workers,
                 progress=stages,
             )
-            study.add("converged", thrown.estimates)
+            study.add("converged", thrown)
 
 
 def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[FeedbackSet]:

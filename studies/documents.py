@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from jinja2 import Environment, FileSystemLoader
 
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.plan_study import SAFE_RECALL, UNSAFE_RECALL
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.evaluation.tables import Column, Row, Table
@@ -26,6 +26,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA_VERSION
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
+from studies.plans import SAFE_RECALL, UNSAFE_RECALL
 
 RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
@@ -58,6 +59,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
     )
     environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
     environment.filters["gain"] = _gain
+    environment.filters["today"] = partial(today, results)
     environment.globals |= {
         "r": results,
         "entries": results.entries,
@@ -71,6 +73,13 @@ def render(kind: str, results: Results, **more: Any) -> str:
     }
     text = environment.get_template(f"{kind}.md").render(**more)
     return re.sub(r"\n{3,}", "\n\n", text).strip()
+
+
+def today(results: Results, command: str) -> str:
+    """A stored command by its present name: the studies evaluate beside baselines."""
+    is_beside = any(row.method == "gradient_boosting" for row in results.values())
+    old = "drake-safety evaluate "
+    return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
 
 def _column(key: str, title: str, format: str = "share") -> Column:
@@ -204,4 +213,5 @@ def _commands(results: Results, assessments: Mapping[str, SafetyAssessment]) -> 
                 f"--episodes {one.num_unsafe + one.num_safe} --seed {one.seed}"
             )
     commands += [evaluate, *([entries["shifts"]["command"]] if "shifts" in entries else [])]
-    return [*dict.fromkeys(commands), f"python -m studies ship --assessment {folder}"]
+    commands = [today(results, command) for command in dict.fromkeys(commands)]
+    return [*commands, f"python -m studies ship --assessment {folder}"]

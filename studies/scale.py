@@ -15,13 +15,14 @@ import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, versions
 from drake_safety.cli.training_folder import MODES, episodes_folder
-from drake_safety.evaluation.metrics import Estimate, auc, auc_difference
+from drake_safety.evaluation.metrics import Estimate, auc
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.learning.training import segments_for
 from drake_safety.simulation.dataset import load_episodes
+from studies.baselines import auc_difference
 from studies.harness import (
     Arrays,
     EpisodesOption,

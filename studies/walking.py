@@ -15,16 +15,22 @@ import typer
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.diagrams.walking_parameters import BRANCHES
-from drake_safety.evaluation.alarms import Alarm, scorer_alarm, threshold_alarms
-from drake_safety.evaluation.metrics import Estimate, median, proportion
-from drake_safety.evaluation.monitoring_study import first_alarm, lowest_value, rate_per_hour
-from drake_safety.evaluation.scorers import Scorer, assessment_scorer, classifier_scorers
+from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import WatchedMotion
+from studies.alarms import (
+    Alarm,
+    WatchedMotion,
+    first_alarm,
+    lowest_value,
+    scorer_alarm,
+    threshold_alarms,
+)
+from studies.baselines import classifier_scorers
 from studies.harness import open_study
 from studies.walking_motions import WalkedMotion, run_motions
 

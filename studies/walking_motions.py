@@ -11,13 +11,14 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.walking_parameters import profile
+from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 from drake_safety.simulation.worker_processes import Progress
+from studies.alarms import WatchedMotion
 from studies.harness import Arrays, kept
 
 ROW_S = 0.02

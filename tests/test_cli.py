@@ -52,7 +52,6 @@ def test_every_command_says_in_a_sentence_what_it_does():
         "run",
         "play",
         "evaluate",
-        "compare",
         "adapt",
         "export",
         "report",
@@ -198,7 +197,7 @@ def test_a_shell_completes_commands_and_scenarios_without_drake():
     ("arguments", "what"),
     [
         (["train", "pendulum", "--out"], "file"),
-        (["compare", "pendulum", "--out"], "file/inside"),
+        (["train", "pendulum", "--out"], "file/inside"),
         (["evaluate", "pendulum", "--assessment", ".", "--out"], "file"),
     ],
 )

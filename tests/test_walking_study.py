@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
+from studies.alarms import Alarm
 from studies.documents import render
 from studies.walking import (
     alarm_estimates,

@@ -19,7 +19,6 @@ from drake_safety.cli import (
     adapt,
     ask,
     calibrate,
-    compare,
     evaluate,
     export,
     play,
@@ -43,7 +42,6 @@ _COMMANDS = (
     run.run,
     play.play,
     evaluate.evaluate,
-    compare.compare,
     adapt.adapt,
     export.export,
     report.report,
@@ -54,13 +52,12 @@ _NEEDS = {
     "train": "train",
     "calibrate": "train",
     "evaluate": "train",
-    "compare": "train",
     "adapt": "train",
     "report": "report",
     "play": "live",
 }
 # What continues a stopped command that keeps finished episodes: the same line with this option.
-_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "compare": "", "adapt": ""}
+_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "adapt": ""}
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 

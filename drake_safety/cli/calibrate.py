@@ -13,7 +13,6 @@ from drake_safety.cli.console import (
     ScenarioArgument,
     WorkersOption,
     console,
-    interval,
     new_table,
     open_stages,
     print_path,
@@ -33,7 +32,6 @@ from drake_safety.learning.seeds import CALIBRATION
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from drake_safety.evaluation.calibration_study import PromiseKept
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.calibration import Calibration
 
@@ -53,9 +51,6 @@ def calibrate(
         typer.Option(help="Confidence of the promise, such as 0.95; on average by default."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Fresh episodes.", min=2)] = 1000,
-    splits: Annotated[
-        int, typer.Option(help="Number of splits that check the promises; 0 for none.", min=0)
-    ] = 200,
     variation: Annotated[
         str | None,
         typer.Option(
@@ -74,7 +69,6 @@ def calibrate(
     continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
     copy is written to runs/SCENARIO-shipped.
     """
-    from drake_safety.evaluation.calibration_study import repeated_splits
     from drake_safety.evaluation.scorers import assessment_scorer
     from drake_safety.learning.calibration import KINDS, episode_scores
     from drake_safety.learning.calibration import calibrate as choose
@@ -109,7 +103,6 @@ def calibrate(
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}
-    kept: dict[str, list[PromiseKept]] = {}
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
         for kind in KINDS:
@@ -126,16 +119,10 @@ def calibrate(
                 variation=plant,
             )
             found.setdefault(mode, []).append(one)
-            if splits and mode == MODES[0]:
-                kept[kind] = repeated_splits(
-                    of_episodes, is_unsafe, confidence=confidence, num_splits=splits, seed=seed
-                )
     for mode, gamma in learned.items():
         gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
         gamma.save(assessment_file(folder.out, mode))
     console.print(_table(found))
-    for kind, promises in kept.items():
-        console.print(_splits_table(kind, promises, splits))
     for mode in learned:
         print_path("calibrated", assessment_file(folder.out, mode))
 
@@ -165,28 +152,4 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
                 f"{calibration.num_missed} of {calibration.num_unsafe}",
                 f"{calibration.num_accepted} of {calibration.num_safe}",
             )
-    return table
-
-
-def _splits_table(kind: str, promises: list[PromiseKept], num_splits: int) -> Table:
-    table = new_table(
-        "promised miss rate [%]",
-        "observed [%]",
-        "splits above it [%]",
-        "safe recall [%]",
-        title=f"{MODES[0]}, {kind}: calibrated on one half and tested on the other, "
-        f"{num_splits} splits",
-    )
-    for one in promises:
-        promised = f"{100 * one.miss_rate:g}"
-        if one.observed.n == 0:
-            missing = f"needs {one.num_needed} unsafe episodes in each half; there are "
-            table.add_row(promised, f"{missing}{one.num_calibration}", "-", "-")
-            continue
-        table.add_row(
-            promised,
-            interval(one.observed, 100, 2),
-            f"{100 * one.share_broken:.0f}",
-            interval(one.safe_recall, 100, 1),
-        )
     return table

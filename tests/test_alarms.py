@@ -4,22 +4,21 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import poisson
 
-from drake_safety.evaluation.alarms import Alarm, threshold_alarms, tilt
-from drake_safety.evaluation.monitoring_figure import monitoring_figure
-from drake_safety.evaluation.monitoring_study import (
-    begun,
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.verdict_tables import verdict_table
+from studies.alarms import (
+    Alarm,
+    WatchedMotion,
+    accepted,
     equal_share_threshold,
     evaluate_alarms,
     first_alarm,
     lowest_value,
-    rate_per_hour,
+    threshold_alarms,
+    tilt,
 )
-from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.verdict_tables import verdict_table
-from drake_safety.simulation.watched_motion import WatchedMotion
 
 PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
 
@@ -65,15 +64,13 @@ TEST = [
 
 
 def figures_of(alarm, **options):
-    return evaluate_alarms([alarm], CALM, TEST, **options)
+    return evaluate_alarms([alarm], CALM, TEST, num_rows=1, **options)
 
 
 def test_what_is_noticed_is_noticed_between_push_and_leaving():
-    study = figures_of(seen())
-    estimates = study.estimates
+    estimates = figures_of(seen())
     # The first two in time, the third too late but before the fall, the fourth only too early.
     assert estimates["monitoring.sharpened.detected"].value == 2 / 4
-    assert study.lead_s["sharpened"] == pytest.approx([0.3, 0.1, -0.1, -math.inf])
     assert estimates["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
     assert estimates["monitoring.sharpened.falls_detected"].value == 2 / 2
     assert estimates["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
@@ -82,8 +79,8 @@ def test_what_is_noticed_is_noticed_between_push_and_leaving():
 
 
 def test_who_sees_the_same_later_has_that_much_less_time():
-    late = figures_of(seen(delay_rows=2)).estimates
-    prompt = figures_of(seen()).estimates
+    late = figures_of(seen(delay_rows=2))
+    prompt = figures_of(seen())
     lead = [f["monitoring.sharpened.lead_to_fall_s"].value for f in (prompt, late)]
     assert lead[0] - lead[1] == pytest.approx(0.2)
     assert late["monitoring.sharpened.detected"].value == 1 / 4
@@ -91,9 +88,7 @@ def test_who_sees_the_same_later_has_that_much_less_time():
 
 def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
     blow = [motion_of(0, {1.0: np.nan, 1.1: 1.0})]
-    one, two = (
-        evaluate_alarms([seen()], CALM, [*TEST, *blow], num_rows=n).estimates for n in (1, 2)
-    )
+    one, two = (evaluate_alarms([seen()], CALM, [*TEST, *blow], num_rows=n) for n in (1, 2))
     leads = [found["monitoring.sharpened.lead_to_fall_s"].value for found in (one, two)]
     assert leads[0] - leads[1] == pytest.approx(0.1)
     false = [found["monitoring.sharpened.false_alarm_share"].value for found in (one, two)]
@@ -101,7 +96,7 @@ def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
 
 
 def test_false_alarms_are_counted_once_a_motion_over_all_hours():
-    estimates = figures_of(seen()).estimates
+    estimates = figures_of(seen())
     assert estimates["monitoring.sharpened.false_alarm_share"].value == 1 / 2
     # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
     assert estimates["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
@@ -114,7 +109,8 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
     for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
         for scale in (1.0, -3.0 + 4.0):
             alarm = Alarm(name="one", value=lambda m, scale=scale: scale * m.state[:, 0] - 5.0)
-            threshold = figures_of(alarm, false_alarm_share=share).thresholds["one"]
+            found = figures_of(alarm, false_alarm_share=share)
+            threshold = found["monitoring.one.threshold"].value
             cries = [math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM]
             assert sum(cries) == count
             # No higher threshold would do.
@@ -123,10 +119,8 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
 
 
 def test_an_alarm_is_the_same_in_whatever_unit_it_is_measured():
-    metres = figures_of(seen()).estimates
-    inches = figures_of(
-        Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0)
-    ).estimates
+    metres = figures_of(seen())
+    inches = figures_of(Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0))
     for key in metres.keys() - {"monitoring.sharpened.threshold"}:
         np.testing.assert_equal(metres[key], inches[key])
 
@@ -150,30 +144,14 @@ def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
 def test_motions_that_leave_before_the_push_are_left_out():
     early = motion_of(6, {}, leaves=True, push_time_s=2.0)
     unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
-    study = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
-    assert study.estimates["monitoring.motions.left_out"].value == 2 / 8
-    assert len(study.is_unsafe) == 6
+    found = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
+    assert found["monitoring.motions.left_out"].value == 2 / 8
+    assert found["monitoring.sharpened.auc"].n == 6
 
 
-def test_rates_have_the_exact_interval_of_a_poisson_process():
-    estimate = rate_per_hour(5, 7200.0, 100)
-    assert estimate.value == 2.5
-    assert poisson.sf(4, 2 * estimate.low) == pytest.approx(0.025)
-    assert poisson.cdf(5, 2 * estimate.high) == pytest.approx(0.025)
-    assert rate_per_hour(0, 3600.0, 1).low == 0.0
-    assert math.isnan(rate_per_hour(0, 0.0, 0).value)
-
-
-@pytest.mark.parametrize(
-    ("lowest", "share", "message"),
-    [
-        ([], 0.1, "no calibration motion stays in the safe set"),
-        ([1.0], 1.0, r"must be in \[0, 1\); got 1.0"),
-    ],
-)
-def test_a_threshold_that_cannot_be_chosen_is_refused(lowest, share, message):
-    with pytest.raises(ValueError, match=message):
-        equal_share_threshold(np.array(lowest), share)
+def test_a_threshold_that_cannot_be_chosen_is_refused():
+    with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
+        equal_share_threshold(np.array([]), 0.1)
 
 
 def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
@@ -201,30 +179,14 @@ def test_what_an_engineer_would_watch_is_found_by_name():
         {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
     )
     assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
-    with pytest.raises(ValueError, match=r"no features \['rim'\]; the features are \['edge'"):
-        threshold_alarms([], names, {"support_margin": "rim"})
 
 
 def test_the_table_says_where_another_alarm_is_ahead():
-    study = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST)
-    table = verdict_table(Results(study.estimates), "monitoring")
+    found = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST, num_rows=1)
+    table = verdict_table(Results(found), "monitoring")
     assert [row.key for row in table.rows] == ["sharpened", "tilt"]
     (first, *_) = table.better_baselines()
     assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
-
-
-def test_the_figure_marks_the_threshold_on_its_own_curve():
-    study = evaluate_alarms([seen(), seen("tilt", 1)], CALM, TEST)
-    roc, lead = monitoring_figure(study).axes
-    for i, name in enumerate(study.thresholds):
-        curve, dot = roc.lines[2 * i], roc.lines[2 * i + 1]
-        estimate = study.estimates[f"monitoring.{name}.detected"]
-        assert dot.get_ydata()[0] == estimate.value
-        points = set(zip(*(np.round(xy, 9) for xy in curve.get_data()), strict=True))
-        assert (round(dot.get_xdata()[0], 9), round(dot.get_ydata()[0], 9)) in points
-    # At zero the right panel says what is noticed in time.
-    times, noticed = lead.lines[0].get_data()
-    assert noticed[times >= 1e-9].max() == 2 / 4
 
 
 def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():
@@ -235,5 +197,5 @@ def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():
         motion_of(2, {0.0: 0.49, 0.1: 1.0}),
         motion_of(3, {0.0: math.nan, 0.1: 1.0}),
     ]
-    assert [motion.index for motion in begun(motions, scorer, 0.5)] == [0, 1]
-    assert begun([], scorer, 0.5) == []
+    assert [motion.index for motion in accepted(motions, scorer, 0.5)] == [0, 1]
+    assert accepted([], scorer, 0.5) == []

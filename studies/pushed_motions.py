@@ -1,28 +1,24 @@
-"""Pushed motions: safe motions, simulated undisturbed and with a push."""
+"""Pushed motions: safe motions to random goals, simulated undisturbed and with a push."""
 
 from __future__ import annotations
 
-from contextlib import closing
 from functools import partial
-from os import PathLike
 
-from drake_safety.simulation.capabilities import (
-    CanBePushed,
-    HasGoals,
-    require,
-)
+from drake_safety.evaluation.shift_study import SEEN
+from drake_safety.simulation.capabilities import CanBePushed, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import run_to_goal
-from drake_safety.simulation.motion_files import MotionFolder, Pair
-from drake_safety.simulation.rollouts import episode_rng, episodes_info, worker_loop
+from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
 from drake_safety.simulation.worker_processes import Progress, run_batches
+from studies.alarms import WatchedMotion
 
 _MAX_TRIES = 50
 
 
-def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> Pair:
+def run_pushed_motion(
+    loop: ClosedLoop, index: int, *, seed: int
+) -> tuple[WatchedMotion, WatchedMotion]:
     """Simulates a random motion that is safe undisturbed, and once more with a random push.
 
     Goals are drawn until the undisturbed motion is safe.
@@ -69,8 +65,7 @@ def run_pushed_motions(
     seed: int,
     variation: str = "actual",
     num_workers: int | None = None,
-    path: str | PathLike[str] | None = None,
-    progress: Progress | bool | None = None,
+    progress: Progress | None = None,
 ) -> list[WatchedMotion]:
     """Simulates random safe motions, each undisturbed and pushed, in worker processes.
 
@@ -80,38 +75,20 @@ def run_pushed_motions(
         seed: Seed of the set.
         variation: The plant.
         num_workers: Number of processes; that of cores by default.
-        path: Folder for the pairs; pairs of the same set that it already holds are not simulated
-            again.
-        progress: Called with the number done and in all; True shows it.
-
-    Raises:
-        ValueError: The folder holds another set or a damaged pair, the task has no goals or
-            pushes, or hardly any goal is safe.
+        progress: Called with the number done and in all.
     """
-    pairs: dict[int, Pair] = {}
-    folder = None
-    if path is not None:
-        options = scenario.task_class().judging_options
-        loop = scenario.make_loop(variation, **options)
-        folder = MotionFolder(path, episodes_info(loop, seed, {**options, "motions": "pushed"}))
-        pairs |= {i: folder.load(i) for i in sorted(folder.completed()) if i < num_motions}
-    remaining = [index for index in range(num_motions) if index not in pairs]
-    results = run_batches(
+    pairs = run_batches(
         partial(_motion_batch, scenario, variation, seed),
-        remaining,
+        list(range(num_motions)),
         num_workers=num_workers,
         progress=progress,
-        num_done=len(pairs),
         stage="pushed motions",
     )
-    with closing(results):
-        for pair in results:
-            pairs[pair[0].index] = pair
-            if folder is not None:
-                folder.save(pair)
-    return [motion for index in sorted(pairs) for motion in pairs[index]]
+    return [motion for pair in sorted(pairs, key=lambda p: p[0].index) for motion in pair]
 
 
-def _motion_batch(scenario: Scenario, variation: str, seed: int, indices: list[int]) -> list[Pair]:
+def _motion_batch(
+    scenario: Scenario, variation: str, seed: int, indices: list[int]
+) -> list[tuple[WatchedMotion, WatchedMotion]]:
     loop = worker_loop(scenario, variation, scenario.task_class().judging_options)
     return [run_pushed_motion(loop, index, seed=seed) for index in indices]

@@ -1,57 +1,150 @@
-"""Detection rate, lead time and false-alarm rate of alarms on pushed motions.
+"""Alarms on pushed motions: detection rate, lead time and false alarms.
 
-In a motion that stays in the safe set every alarm is false, and so is any alarm before the push. A
-detection is an alarm between the push and the instant at which the robot leaves the safe set.
+An alarm is a monitored value, larger where the robot is safer, that falls below a threshold. In a
+motion that stays in the safe set every alarm is false, and so is any before the push. A detection
+is an alarm between the push and the instant at which the robot leaves the safe set.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.alarms import Alarm
-from drake_safety.evaluation.metrics import Estimate, auc, median, proportion
+from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
+from drake_safety.evaluation.shift_study import SEEN
+from drake_safety.simulation.goal_motion import GoalMotion, Mishap
+from drake_safety.simulation.throws import ThrowLog
 
 FALSE_ALARM_SHARE = 0.05
 """Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
+NUM_ROWS = 2
+"""Successive rows that give an alarm: a blow itself can make one row "don't know"."""
+_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+_TRACKING = "tracking_error_"
 _SLACK_S = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MonitoringStudy:
-    """The result of :func:`evaluate_alarms`.
+@dataclass(kw_only=True, eq=False)
+class WatchedMotion(Mishap):
+    """One motion, pushed or not: the monitor's inputs and the outcome.
 
     Attributes:
-        estimates: By dotted key.
-        thresholds: By alarm, the value below which it is raised.
-        unsafe_score: By alarm, minus the lowest value of each motion, (N,).
-        is_unsafe: Whether each motion leaves the safe set, (N,).
-        lead_s: By alarm, the lead time of each motion that leaves the safe set [s]; negative for a
-            late alarm, minus infinity for none.
+        index: Number of the motion in its set; an undisturbed and a pushed one share it.
+        push_time_s: Start of the push [s]; infinite without one.
+        time_s: [s], (N,).
+        state: (N, n_s), the assessor's input.
+        desired_preview: (N, H n_z).
+        features: (N, n_f).
+        margins: (N, n_c), of the true state.
     """
 
-    estimates: dict[str, Estimate]
-    thresholds: dict[str, float]
-    unsafe_score: dict[str, np.ndarray]
-    is_unsafe: np.ndarray
-    lead_s: dict[str, np.ndarray]
+    index: int
+    push_time_s: float
+    time_s: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    margins: np.ndarray
+
+    @classmethod
+    def of_throw(cls, log: ThrowLog) -> WatchedMotion:
+        """Makes a motion of a throw without recovery; the push is the ball's impact."""
+        names = ("index", "time_s", *SEEN, "margins", "leave_time_s", "fall_time_s")
+        values = {name: getattr(log, name) for name in names}
+        return cls(push_time_s=log.throw.time_s, **values)
+
+    @classmethod
+    def of_goal_motion(cls, index: int, motion: GoalMotion) -> WatchedMotion:
+        """Makes a motion of a motion to a goal that was logged with the ports ``SEEN``."""
+        return cls(
+            index=index,
+            push_time_s=math.inf if motion.push is None else motion.push.time_s,
+            time_s=motion.time_s,
+            margins=motion.margins,
+            leave_time_s=motion.leave_time_s,
+            fall_time_s=motion.fall_time_s,
+            **{name: motion.extra[name] for name in SEEN},
+        )
 
 
-def begun(
-    motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
-) -> list[WatchedMotion]:
-    """The motions whose plan is accepted at their first row, so that the robot begins them.
+@dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """A monitored value.
+
+    Attributes:
+        name: Its key in tables.
+        value: Maps a motion to the value of each row, (N,); NaN means "don't know", an alarm.
+    """
+
+    name: str
+    value: Callable[[WatchedMotion], np.ndarray]
+
+
+def scorer_alarm(scorer: Scorer) -> Alarm:
+    """An alarm on the safety probability of a scorer."""
+    return Alarm(
+        name=scorer.name,
+        value=lambda one: scorer.probability(one.state, one.desired_preview, one.features),
+    )
+
+
+def threshold_alarms(
+    state_names: Sequence[str], feature_names: Sequence[str], watched: Mapping[str, str]
+) -> list[Alarm]:
+    """Baseline alarms on recorded quantities.
+
+    They are the features that the task names, such as the margins of base and capture point to the
+    edge of the support polygon; the tracking error; the base's tilt; and the smallest margin of the
+    safe set. The last uses the true state, which cannot be measured, and so has an advantage.
 
     Args:
-        motions: Motions, pushed or not.
-        scorer: Scorer of the plans.
-        threshold: Lowest safety probability of an accepted plan.
+        state_names: Columns of the state.
+        feature_names: Columns of the features.
+        watched: Monitored features, by the name of the alarm.
     """
+    features, states = list(feature_names), list(state_names)
+
+    def of_feature(column: int) -> Callable[[WatchedMotion], np.ndarray]:
+        return lambda motion: motion.features[:, column]
+
+    alarms = [
+        Alarm(name=name, value=of_feature(features.index(feature)))
+        for name, feature in watched.items()
+    ]
+    tracking = [i for i, name in enumerate(features) if name.startswith(_TRACKING)]
+    if tracking:
+        alarms.append(
+            Alarm(
+                name="tracking_error",
+                value=lambda motion: -np.linalg.norm(motion.features[:, tracking], axis=1),
+            )
+        )
+    if set(_ROTATION) <= set(states):
+        rotation = [states.index(name) for name in _ROTATION]
+        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion.state[:, rotation])))
+    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion.margins.min(axis=1)))
+    return alarms
+
+
+def tilt(rotation: np.ndarray) -> np.ndarray:
+    """Angle between a body's z axis and the vertical [rad], (N,), of rotation vectors (N, 3)."""
+    angle = np.linalg.norm(rotation, axis=1)
+    share = np.divide(
+        rotation[:, 2], angle, out=np.ones_like(angle), where=(angle > 0) | np.isnan(angle)
+    )
+    # R_zz of Rodrigues' formula.
+    cosine = np.cos(angle)
+    return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))
+
+
+def accepted(
+    motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
+) -> list[WatchedMotion]:
+    """The motions whose first row has at least this probability, so that the robot begins them."""
     if not motions:
         return []
     first_rows = (np.stack([getattr(motion, name)[0] for motion in motions]) for name in SEEN)
@@ -75,12 +168,7 @@ def first_alarm(
 
 
 def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
-    """The lowest value of a motion; if it leaves the safe set, from the push until then.
-
-    Args:
-        motion: The motion.
-        value: Value of each row, (N,); NaN is minus infinity.
-    """
+    """The lowest value (N,) of a motion; if it leaves the safe set, from the push until then."""
     value = np.where(np.isnan(value), -math.inf, value)
     if motion.has_left:
         time = motion.time_s
@@ -91,12 +179,7 @@ def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
 
 
 def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
-    """The largest of each value and those before it, (N,); NaN is minus infinity.
-
-    Args:
-        value: Value of each row, (N,).
-        num_rows: Number of values, of which those before the first are infinite.
-    """
+    """The largest of each value and those before it, `num_rows` in all, (N,)."""
     value = np.where(np.isnan(value), -math.inf, value)
     padded = np.concatenate([np.full(num_rows - 1, math.inf), value])
     return np.lib.stride_tricks.sliding_window_view(padded, num_rows).max(axis=1)
@@ -110,33 +193,11 @@ def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
         share: The share, in [0, 1).
 
     Raises:
-        ValueError: There is no motion, or the share is out of range.
+        ValueError: There is no motion.
     """
-    if not 0 <= share < 1:
-        raise ValueError(f"monitoring: the share of false alarms must be in [0, 1); got {share}")
     if len(lowest) == 0:
-        raise ValueError("monitoring: no calibration motion stays in the safe set")
+        raise ValueError("alarms: no calibration motion stays in the safe set")
     return float(np.sort(lowest)[math.floor(share * len(lowest))])
-
-
-def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
-    """Events per hour, with the exact interval of a Poisson process.
-
-    Args:
-        count: Number of events.
-        duration_s: Observed time [s].
-        n: Number of observed motions.
-        confidence: Confidence of the interval.
-    """
-    from scipy.stats import chi2
-
-    if not duration_s > 0:
-        return Estimate.exact(math.nan, n)
-    tail = 0.5 * (1.0 - confidence)
-    hours = duration_s / 3600.0
-    low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
-    high = 0.5 * chi2.ppf(1.0 - tail, 2 * count + 2)
-    return Estimate(count / hours, float(low / hours), float(high / hours), n)
 
 
 def evaluate_alarms(
@@ -145,8 +206,8 @@ def evaluate_alarms(
     test: Sequence[WatchedMotion],
     *,
     false_alarm_share: float = FALSE_ALARM_SHARE,
-    num_rows: int = 1,
-) -> MonitoringStudy:
+    num_rows: int = NUM_ROWS,
+) -> dict[str, Estimate]:
     """Compares alarms at the same share of false alarms on calibration motions.
 
     Motions that leave the safe set before the push are left out.
@@ -157,39 +218,25 @@ def evaluate_alarms(
         test: Fresh motions.
         false_alarm_share: Allowed share of safe calibration motions with a false alarm.
         num_rows: Successive rows below the threshold that give an alarm.
-
-    Raises:
-        ValueError: No calibration motion stays safe, or the share is out of range.
     """
     calm = [motion for motion in calibration if not motion.has_left]
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
     estimates = _motion_estimates(judged, len(test))
-    thresholds, scores, leads = {}, {}, {}
     for alarm in alarms:
-        lowest = np.array(
-            [lowest_value(one, persisting(alarm.value(one), num_rows)) for one in calm]
-        )
+        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
         threshold = equal_share_threshold(lowest, false_alarm_share)
         values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
-        found, lead_s = _alarm_estimates(judged, values, threshold)
+        found = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
         found["threshold"] = Estimate.exact(threshold, len(calm))
         estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
-        thresholds[alarm.name], scores[alarm.name], leads[alarm.name] = threshold, score, lead_s
-    return MonitoringStudy(
-        estimates=estimates,
-        thresholds=thresholds,
-        unsafe_score=scores,
-        is_unsafe=is_unsafe,
-        lead_s=leads,
-    )
+    return estimates
 
 
 def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Estimate]:
-    """Estimates of the motions themselves, the same for all alarms."""
     left = [motion for motion in judged if motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
     return {
@@ -205,14 +252,7 @@ def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[st
 
 def _alarm_estimates(
     judged: Sequence[WatchedMotion], values: Sequence[np.ndarray], threshold: float
-) -> tuple[dict[str, Estimate], np.ndarray]:
-    """Estimates of one alarm, and its lead times.
-
-    Args:
-        judged: The N motions.
-        values: Values of the alarm at each row of the motions.
-        threshold: Threshold of the alarm.
-    """
+) -> dict[str, Estimate]:
     watched = list(zip(judged, values, strict=True))
     safe = [(motion, value) for motion, value in watched if not motion.has_left]
     left = [(motion, value) for motion, value in watched if motion.has_left]
@@ -223,17 +263,14 @@ def _alarm_estimates(
     )
     safe_s = sum(float(motion.time_s[-1]) for motion, _ in safe)
     undisturbed_s = sum(min(motion.push_time_s, float(motion.time_s[-1])) for motion in judged)
-    alarm_s = np.array(
-        [first_alarm(motion, v, threshold, since_s=motion.push_time_s) for motion, v in left]
-    )
+    alarm_s = np.array([first_alarm(m, v, threshold, since_s=m.push_time_s) for m, v in left])
     leave = np.array([motion.leave_time_s for motion, _ in left])
     pushed = np.array([motion.push_time_s for motion, _ in left])
     fall = np.array([motion.fall_time_s for motion, _ in left])
     has_fallen = np.isfinite(fall)
-    lead_s = leave - alarm_s
     return {
         "detected": proportion(int(np.sum(alarm_s < leave - _SLACK_S)), len(left)),
-        "lead_to_leaving_s": median(lead_s),
+        "lead_to_leaving_s": median(leave - alarm_s),
         "falls_detected": proportion(
             int(np.sum(alarm_s[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
         ),
@@ -242,4 +279,4 @@ def _alarm_estimates(
         "false_alarm_share": proportion(false, len(safe)),
         "false_alarms_per_hour": rate_per_hour(false, safe_s, len(safe)),
         "undisturbed_false_alarms_per_hour": rate_per_hour(early, undisturbed_s, len(judged)),
-    }, lead_s
+    }

@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.extras import require_extra
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import Episodes, Segments, split
 
 KINDS = ("gradient_boosting", "mlp")
@@ -28,9 +31,6 @@ class DirectClassifier:
         uses_features: Whether x includes the features, as in the sharpened mode of the assessment.
         seed: Seed of the held-out episodes and of the training.
         shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
-
-    Raises:
-        ValueError: Unknown kind.
     """
 
     def __init__(
@@ -41,29 +41,18 @@ class DirectClassifier:
         seed: int = 0,
         shortest: int | None = None,
     ):
-        if kind not in KINDS:
-            raise ValueError(
-                f"DirectClassifier: unknown kind '{kind}'; the kinds are {list(KINDS)}"
-            )
         self.kind = kind
         self.uses_features = uses_features
         self.seed = seed
         self.shortest = shortest
 
     def fit(self, episodes: Episodes) -> DirectClassifier:
-        """Fits the classifier to episodes and returns it.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: There are fewer than two safe or two unsafe episodes.
-        """
-        require_extra("train", f"DirectClassifier '{self.kind}'", "sklearn")
+        """Fits the classifier to episodes, at least two of either kind, and returns it."""
         from threadpoolctl import threadpool_limits
 
         segments = split(episodes, stride=1, discount=1.0, shortest=self.shortest)
         x = self._inputs(segments.state, segments.desired_preview, segments.features)
         is_held_out = self._held_out(segments)
-        self.num_inputs_ = x.shape[1]
         with threadpool_limits(1):
             train = self._boost if self.kind == "gradient_boosting" else self._train_mlp
             train(
@@ -89,20 +78,10 @@ class DirectClassifier:
 
         Returns:
             The probabilities, (N,); NaN for an input that is not finite.
-
-        Raises:
-            ValueError: It has not been fitted, or the inputs have another width.
         """
         from threadpoolctl import threadpool_limits
 
-        if not hasattr(self, "model_"):
-            raise ValueError(f"DirectClassifier '{self.kind}': it has not been fitted yet")
         x = self._inputs(state, desired_preview, features)
-        if x.shape[1] != self.num_inputs_:
-            raise ValueError(
-                f"DirectClassifier '{self.kind}': the input has {x.shape[1]} columns, it was "
-                f"fitted to {self.num_inputs_}"
-            )
         probability = np.full(len(x), np.nan)
         is_finite = np.isfinite(x).all(axis=1)
         if is_finite.any():
@@ -125,13 +104,8 @@ class DirectClassifier:
         """Mask of the segments of held-out episodes, (N,)."""
         rng = np.random.default_rng(self.seed)
         chosen = []
-        for name, is_class in (("safe", ~segments.is_unsafe), ("unsafe", segments.is_unsafe)):
+        for is_class in (~segments.is_unsafe, segments.is_unsafe):
             members = np.unique(segments.episode[is_class])
-            if len(members) < 2:
-                raise ValueError(
-                    f"DirectClassifier '{self.kind}': {len(members)} {name} episodes, expected at "
-                    "least 2"
-                )
             count = max(1, round(_VALIDATION_SHARE * len(members)))
             chosen.append(rng.choice(members, size=count, replace=False))
         return np.isin(segments.episode, np.concatenate(chosen))
@@ -189,3 +163,55 @@ class DirectClassifier:
     def _standardised(self, x: np.ndarray) -> np.ndarray:
         # Double precision: the penalty drives unused weights into slow subnormal float32.
         return (x - self.mean_) / self.scale_
+
+
+def classifier_scorers(
+    episodes: Episodes, progress: StageProgress, *, shortest: int | None = None
+) -> list[Scorer]:
+    """The baseline classifiers, trained on the training episodes of the assessment.
+
+    Args:
+        episodes: Training episodes.
+        progress: Called with a stage, the number done and the number wanted.
+        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
+    """
+    scorers = []
+    for i, kind in enumerate(KINDS):
+        progress("baseline classifiers", i, len(KINDS))
+        classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
+
+        def probability(
+            *inputs: np.ndarray, predict_unsafe: Any = classifier.predict_unsafe
+        ) -> np.ndarray:
+            return 1.0 - predict_unsafe(*inputs)
+
+        used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
+        scorers.append(Scorer(name=kind, probability=probability, used=used))
+    progress("baseline classifiers", len(KINDS), len(KINDS))
+    return scorers
+
+
+def auc_difference(
+    unsafe_score: np.ndarray,
+    other_score: np.ndarray,
+    is_unsafe: np.ndarray,
+    episode: np.ndarray,
+    *,
+    bootstrap: Bootstrap | None = None,
+) -> Estimate:
+    """The AUC of one scorer minus that of another on the same samples, from paired resamples.
+
+    Args:
+        unsafe_score: Unsafe scores of the first, (N,).
+        other_score: Unsafe scores of the second, (N,).
+        is_unsafe: Labels, (N,).
+        episode: Index of each sample's episode, (N,).
+        bootstrap: Settings of the interval.
+    """
+
+    def difference(weight: np.ndarray) -> float:
+        return area_under_curve(unsafe_score, is_unsafe, weight) - area_under_curve(
+            other_score, is_unsafe, weight
+        )
+
+    return (bootstrap or Bootstrap()).over_episodes(difference, episode)

@@ -25,9 +25,6 @@ class Reachability:
         robot: The robot, which stands at the world's origin.
         hand: Name of the reaching frame.
         is_base_free: Whether the base moves.
-
-    Raises:
-        ValueError: There is no such frame.
     """
 
     def __init__(self, robot: RobotModel, hand: str, *, is_base_free: bool = False):
@@ -69,17 +66,7 @@ class Reachability:
                 ]
 
     def miss(self, p_WH: np.ndarray) -> float:
-        """Distance between a point and the closest position of the hand [m].
-
-        Args:
-            p_WH: The point in the world, (3,) [m].
-
-        Raises:
-            ValueError: The point is not three finite numbers.
-        """
-        p_WH = np.asarray(p_WH, dtype=float)
-        if p_WH.shape != (3,) or not np.isfinite(p_WH).all():
-            raise ValueError(f"reachability: a point is three finite numbers [m]; got {p_WH}")
+        """Distance between a point in the world, (3,), and the closest position of the hand [m]."""
         search = InverseKinematics(self._plant, self._context)
         search.AddPositionCost(
             self._plant.world_frame(), p_WH, self._body.body_frame(), self._point, np.eye(3)
@@ -105,9 +92,5 @@ class Reachability:
         return best
 
     def is_reachable(self, p_WH: np.ndarray) -> np.ndarray:
-        """Whether the hand reaches each of the points, (N,).
-
-        Args:
-            p_WH: Points in the world, (N, 3) [m].
-        """
+        """Whether the hand reaches each of the points (N, 3) in the world [m], (N,)."""
         return np.array([self.miss(point) < _TOLERANCE_M for point in p_WH], dtype=bool)
