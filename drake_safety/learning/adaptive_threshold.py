@@ -25,9 +25,6 @@ class AdaptiveThreshold:
 
     Attributes:
         threshold: Present lower bound of the probability for "safe"; above 1 if none is.
-
-    Raises:
-        ValueError: The step is not positive.
     """
 
     def __init__(self, calibration: Calibration, step: float = 1.0):
@@ -52,7 +49,6 @@ class AdaptiveThreshold:
 
         Args:
             safety_probability: Probability of the first row, or the least of a motion.
-            is_unsafe: Whether it ended unsafely.
         """
         if is_unsafe:
             missed = self.is_safe(safety_probability)

@@ -118,11 +118,7 @@ class PaperReading:
         self.check()
 
     def check(self) -> None:
-        """Checks all values, which may have been set since the construction.
-
-        Raises:
-            ValueError: A value is not an expected one.
-        """
+        """Checks all values, which may have been set since the construction."""
         _expect(self, "stride", self.stride >= 0, ">= 0")
         _expect(self, "loss", self.loss in LOSSES, f"one of {list(LOSSES)}")
         _expect_sizes(self)
@@ -239,11 +235,7 @@ class AssessmentParameters:
         self.check()
 
     def check(self) -> None:
-        """Checks all values, which may have been set since the construction.
-
-        Raises:
-            ValueError: A value is not an expected one.
-        """
+        """Checks all values, which may have been set since the construction."""
         if self.mode not in MODES:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"

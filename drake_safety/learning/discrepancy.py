@@ -24,12 +24,6 @@ class DiscrepancyFunction:
         Args:
             points: Psi(x) of the feedback, (N, 2), in grid units.
             difference: |lambda actual - lambda nominal|, (N,).
-
-        Returns:
-            Itself.
-
-        Raises:
-            ValueError: No point is finite.
         """
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF
@@ -48,10 +42,7 @@ class DiscrepancyFunction:
         return self
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predicts the mean m, clipped to [0, 1], and the standard deviation sigma without noise.
-
-        Args:
-            points: (M, 2).
+        """Predicts the mean m, clipped to [0, 1], and sigma without noise at points (M, 2).
 
         Returns:
             m and sigma, (M,) each; the prior's 0 and 1 where a point is not finite.

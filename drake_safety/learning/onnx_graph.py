@@ -59,13 +59,6 @@ def write(path: Path, assessment: SafetyAssessment) -> None:
     """Writes `SafetyAssessment.predict` as one ONNX file, atomically.
 
     The same assessment gives the same bytes.
-
-    Args:
-        path: The file.
-        assessment: A fitted assessment, adapted or not.
-
-    Raises:
-        MissingExtraError: The extra `onnx` is not installed.
     """
     require_extra("onnx", f"export to '{path}'")
     import onnx

@@ -34,11 +34,7 @@ _logger = logging.getLogger("drake_safety")
 
 
 def check_preview(info: EpisodesInfo, parameters: AssessmentParameters) -> None:
-    """Checks that episodes have the preview of an assessment's parameters.
-
-    Raises:
-        ValueError: They have another one.
-    """
+    """Checks that episodes have the preview of an assessment's parameters."""
     for name in ("horizon", "preview_stride"):
         here, there = getattr(parameters, name), getattr(info, name)
         if here != there:
@@ -55,9 +51,6 @@ def segments_for(
 
     Returns:
         The segments, and whether each is embedded by t-SNE, (N,).
-
-    Raises:
-        ValueError: The episodes give too few segments for t-SNE.
     """
     is_sharpened, horizon = parameters.is_sharpened, parameters.horizon
     segments = split(
@@ -98,11 +91,9 @@ def learned_maps(
     """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
-        segments: The training segments.
         has_target: Whether each is embedded by t-SNE, (N,).
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
-        parameters: The assessment's parameters.
         progress: Called with "distances", "t-SNE", "training", the percentage done and 100.
 
     Returns:
@@ -176,9 +167,6 @@ def known_range(x: np.ndarray) -> np.ndarray:
 
     Departure: a map of rectifiers extrapolates linearly, off the grid or into cells of others; of a
     clipped input it knows at least the other columns, as a decision tree does.
-
-    Args:
-        x: Training inputs, (N, n_x).
     """
     return np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
 
@@ -193,10 +181,6 @@ def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> n
 
     They are held out for the base logit, a function of the ensemble's mean, so all maps hold out
     the same episodes; in the paper's mode for early stopping.
-
-    Args:
-        segments: The training segments.
-        parameters: The assessment's parameters.
     """
     episodes = np.unique(segments.episode)
     share = parameters.held_out if parameters.is_sharpened else parameters.paper.held_out
@@ -268,8 +252,6 @@ def fitted_base_logit(
     Args:
         output: The maps' outputs for held-out segments; on training segments they are
             overconfident.
-        segments: The held-out segments.
-        parameters: The assessment's parameters.
     """
     logit = BaseLogit(
         margin_unit=parameters.margin_unit,
