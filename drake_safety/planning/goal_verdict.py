@@ -29,7 +29,6 @@ class GoalVerdict:
             goal is outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
         constraint_names: The n_c constraints, the possible causes.
-        cause_probability: b_unsafe split by the violated constraint, (n_c,).
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
             where none is predicted.
         margin_unit: Scale by which margins are compared [m, rad].
@@ -99,8 +98,6 @@ def assess_goal(
     instant.
 
     Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
             region sampled in training, is "don't know".
         threshold: Lowest probability of a safe goal.
@@ -145,13 +142,6 @@ def assess_goals(
 
     The verdict is "don't know" where the input is novel, or half of the belief or more comes from
     cells without training data.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: The assessment learned from its episodes.
-        goals: In the world, (N, 3) [m].
-        threshold: See :func:`assess_goal`.
-        unsafe_below: See :func:`assess_goal`.
     """
     if len(goals) == 0:
         return []
@@ -199,11 +189,7 @@ def assess_goals(
 
 
 def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The assessment's inputs at the first instant of the motion from standing to each goal.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        goals: In the world, (N, 3) [m], N ≥ 1.
+    """The assessment's inputs at the first instant of motions from standing to goals (N, 3) [m].
 
     Returns:
         State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
@@ -219,11 +205,7 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def checked_goal(goal: np.ndarray) -> np.ndarray:
-    """Returns a goal as an array, (3,) [m]; it need not be finite.
-
-    Raises:
-        ValueError: The goal is not three numbers.
-    """
+    """Returns a goal as an array, (3,) [m]; it need not be finite."""
     goal = np.asarray(goal, dtype=float)
     if goal.shape != (3,):
         raise ValueError(f"a goal is three numbers; got {goal.tolist()}")

@@ -53,7 +53,6 @@ class BeliefEvaluator(LeafSystem):
     assessment, between simulations and during them. The embedding is immutable.
 
     Args:
-        assessment: A fitted assessment.
         period_s: Time between two evaluations [s].
         checks_margins: Whether no belief is safe outside the safe set.
         heeds_alarm: Whether every belief is unknown during an alarm.
@@ -120,15 +119,7 @@ class BeliefEvaluator(LeafSystem):
         return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
 
     def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
-        """Replaces the beliefs of every cell.
-
-        Args:
-            context: This system's Context.
-            beliefs: Shaped as the assessment's ``beliefs_``.
-
-        Raises:
-            ValueError: The beliefs have another shape.
-        """
+        """Replaces the beliefs of every cell."""
         beliefs = np.asarray(beliefs, dtype=float)
         if beliefs.shape != self._shape:
             raise ValueError(
@@ -138,10 +129,6 @@ class BeliefEvaluator(LeafSystem):
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned.
-
-        Args:
-            context: This system's Context.
-            adapted: The result of ``adapt``.
 
         Raises:
             ValueError: The adapted assessment has other maps.
