@@ -30,7 +30,6 @@ class Recorder:
     """Records output ports of a diagram, row by row.
 
     Args:
-        diagram: The diagram.
         names: Ports to record; a mapping from recorded names to those of ports renames them.
     """
 
@@ -41,12 +40,7 @@ class Recorder:
         self._times: list[float] = []
 
     def record(self, context: Context, time_s: float | None = None) -> None:
-        """Appends a row, unless a port raises.
-
-        Args:
-            context: The diagram's Context.
-            time_s: Time of the row without rounding errors [s]; the Context's by default.
-        """
+        """Appends a row, unless a port raises; a given time is without rounding errors [s]."""
         self._rows.append(
             {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
         )
@@ -68,10 +62,6 @@ def advance_to(simulator: Simulator, time_s: float) -> None:
     The state of a discrete plant is then that of the given time. The update due then already
     computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
     upwards) would not belong to its time.
-
-    Args:
-        simulator: The simulator.
-        time_s: The time [s]; nothing happens if it is not later than the present.
     """
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
@@ -123,9 +113,7 @@ def record_episode(
             defaults to no margin being negative, ``true_state`` to ``state``, ``desired_output``
             to the preview's first sample, and ``features`` to none.
         timing: Sampling times.
-        constraint_names: The n_c constraints.
         who: The episode, for messages.
-        index: Number of the episode in its set.
         first_step: First row whose future is undisturbed.
 
     Returns:

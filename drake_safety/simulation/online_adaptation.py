@@ -35,7 +35,6 @@ class OnlineAdaptation:
     ```
 
     Args:
-        scenario: The scenario.
         prior: The assessment before feedback.
         recorder: The recorder, a system of the diagram.
         assessor: The assessor, a system of the diagram.
@@ -46,7 +45,6 @@ class OnlineAdaptation:
     Attributes:
         feedback: All feedback so far, up to the capacity.
         adapted: The assessments after the newest eight updates.
-        num_updates: The number of all updates.
     """
 
     def __init__(
@@ -77,11 +75,7 @@ class OnlineAdaptation:
         and monitors of a simulation must not change its Context.
 
         Args:
-            simulator: The simulator of the diagram.
             until_s: The time until which to simulate [s].
-
-        Returns:
-            The status of the last `AdvanceTo`, which may have ended early.
         """
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:

@@ -58,8 +58,6 @@ class PostureSampling:
         """Samples positions in the safe set with the feet of the standing posture, (n_q,).
 
         Args:
-            safe_set: The safe set, with robot and obstacles.
-            rng: Random generator.
             mirror: If given, the posture is mirrored: that of the other hand's episode.
 
         Raises:

@@ -99,11 +99,7 @@ class Scenario:
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name.
-
-        Raises:
-            ValueError: No such variation.
-        """
+        """A plant variation by name."""
         if name not in self.variations:
             raise ValueError(
                 f"scenario '{self.name}' has no variation '{name}'"
@@ -134,13 +130,9 @@ class Scenario:
         """Builds the task's diagram.
 
         Args:
-            variation: The plant.
             assessment: Adds an assessor and, for example, recovery.
             meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
             **options: Options of the task, such as ``recovery=False``.
-
-        Raises:
-            ValueError: Unknown variation or option, or an assessment of another diagram.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
@@ -165,9 +157,6 @@ class Scenario:
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
-
-        Raises:
-            ValueError: No such variation.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -310,9 +299,6 @@ def load_scenario(name: str | Path) -> Scenario:
     not. The task's module may stand in the scenario file's folder, where modules are searched last,
     while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
 
-    Args:
-        name: Name of a scenario of the package, or a path.
-
     Raises:
         ValueError: No such scenario, unknown or ill-typed keys, or no such task.
     """
@@ -325,9 +311,6 @@ def load_scenario(name: str | Path) -> Scenario:
 
 def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
     """Reads a scenario's file without importing its task, so that no code of a stranger runs.
-
-    Args:
-        name: See :func:`load_scenario`.
 
     Returns:
         The scenario without parameters, and the task's parameters as they stand in the file.
@@ -359,7 +342,6 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
 
     Args:
         text: The YAML.
-        name: The scenario's name.
         folder: Folder of relative robot paths.
         task_folder: Folder in which the task's module may stand; "" for none.
 
