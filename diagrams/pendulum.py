@@ -65,7 +65,6 @@ class PendulumSafeSet:
     torque that holds the pendulum horizontally.
 
     Args:
-        parameters: The task's parameters.
         preview_step_s: Time between two samples of the outlook [s].
     """
 
@@ -184,10 +183,7 @@ class Pendulum(PlannedLoop):
     The output is the bob's position relative to the hinge, which follows a plan of points.
 
     Args:
-        scenario: The scenario.
         variation: Name of the plant variation; mass and damping can vary.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
     """
 
     Parameters = PendulumParameters

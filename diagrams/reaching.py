@@ -39,10 +39,7 @@ class Reaching(LeggedLoop):
     image, so that one assessment applies to both hands. All other ports are not mirrored.
 
     Args:
-        scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
         hand: The hand that reaches; the scenario's by default.
         exploring: Whether episodes with random goals have the scenario's random detours and pushes;
             otherwise every plan is straight and undisturbed.
@@ -218,10 +215,6 @@ class Reaching(LeggedLoop):
 
         Returns:
             The first step after the initial push; 0 without one.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-            RuntimeError: No sampled posture is in the safe set.
         """
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
@@ -266,11 +259,7 @@ class Reaching(LeggedLoop):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts in the standing posture with a plan to a target; without initial noise.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-        """
+        """Starts in the standing posture with a plan to a target; without initial noise."""
         self._set(context, self.kinematics.standing_positions(), goal)
         self._observers.reseed(context, rng)
         self._observers.silence(context)

@@ -46,10 +46,7 @@ class Walking(LeggedLoop):
     the measured velocity, and a goal is a constant command.
 
     Args:
-        scenario: The scenario.
         variation: Name of the plant variation.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
         disturbed: Whether some episodes begin with an offset of the state.
         command_s: Duration of a goal's command [s], after which the command is zero; that of the
             episode by default.
@@ -240,11 +237,7 @@ class Walking(LeggedLoop):
         return episode.desired_output[0]
 
     def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
-        """The plan of a constant command (3,) [m/s, rad/s].
-
-        Raises:
-            ValueError: The command is not three finite numbers.
-        """
+        """The plan of a constant command (3,) [m/s, rad/s]."""
         command = np.asarray(command, dtype=float)
         if command.shape != (3,) or not np.isfinite(command).all():
             raise ValueError(
@@ -291,21 +284,12 @@ class Walking(LeggedLoop):
         """Sets a constant command from now on.
 
         Args:
-            context: The root Context.
             command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
         """
         self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether the guard acts.
-
-        Args:
-            context: The root Context.
-            is_guarded: Whether it does.
-
-        Raises:
-            ValueError: The diagram was built without a guard.
-        """
+        """Sets whether the guard acts."""
         if self._guard is None:
             raise ValueError("walking: the diagram was built without a guard: pass guard=True")
         self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)

@@ -45,8 +45,6 @@ class CommandSampling:
         """Samples a command, (3,) [m/s, rad/s].
 
         Args:
-            limits: The policy's ranges.
-            rng: Random generator.
             reach: Factor on the ranges.
         """
         low, high = reach * np.array(limits.lowest), reach * np.array(limits.highest)
@@ -59,8 +57,6 @@ class CommandSampling:
         """Samples a profile of constant commands with short ramps between them.
 
         Args:
-            limits: The policy's ranges.
-            rng: Random generator.
             duration_s: Of the profile [s].
         """
         reach = 1.0 if rng.random() < self.inside_share else self.reach
@@ -73,13 +69,7 @@ class CommandSampling:
 def profile(
     commands: list[np.ndarray], changes_s: list[float], duration_s: float
 ) -> PiecewisePolynomial:
-    """A profile of constant commands.
-
-    Args:
-        commands: (v_x, v_y, ω_z) each, (3,) [m/s, rad/s].
-        changes_s: Ascending times at which the next command begins [s].
-        duration_s: Of the profile [s].
-    """
+    """A profile of constant commands (3,) [m/s, rad/s] that change at ascending times."""
     times, values = [0.0], [commands[0]]
     for change_s, before, after in zip(changes_s, commands[:-1], commands[1:], strict=True):
         begins = max(change_s, times[-1] + 1e-3)
@@ -118,12 +108,7 @@ class WalkingStart:
             raise ValueError(f"start: walked_s must be [least, largest]; got {[low, high]}")
 
     def offset_velocities(self, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Samples an offset of the base's velocities, and returns the sum.
-
-        Args:
-            v: Velocities, angular first, in the world, (n_v,) [rad/s, m/s].
-            rng: Random generator.
-        """
+        """Returns velocities, of the base in the world and angular first, with a sampled offset."""
         v = v.copy()
         speed, direction = rng.uniform(0, self.velocity_m_s), rng.uniform(-math.pi, math.pi)
         v[:3] += rng.uniform(-1, 1, 3) * self.angular_velocity_rad_s
@@ -131,12 +116,7 @@ class WalkingStart:
         return v
 
     def offset_positions(self, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Samples an offset of tilt and joints, and returns the sum.
-
-        Args:
-            q: Positions: quaternion, base position, joints, (n_q,).
-            rng: Random generator.
-        """
+        """Samples an offset of tilt and joints, and returns the sum."""
         q = q.copy()
         half = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
         w, x, y, z = q[:4]
