@@ -59,10 +59,7 @@ class TrainingScores:
 
     @classmethod
     def of(
-        cls,
-        segments: Segments,
-        output: EmbeddingOutput,
-        base_logit: BaseLogit | None,
+        cls, segments: Segments, output: EmbeddingOutput, base_logit: BaseLogit | None
     ) -> TrainingScores:
         """Those of training segments, in the precision in which files store them."""
         heads = nearest = None
@@ -198,8 +195,7 @@ def paper_beliefs(
     return np.stack(
         [
             combined(
-                member_prior,
-                feedback_beliefs(certain, grid.locate(member_points), grid, settings),
+                member_prior, feedback_beliefs(certain, grid.locate(member_points), grid, settings)
             )
             for member_prior, member_points in zip(prior, points, strict=True)
         ]
@@ -207,10 +203,7 @@ def paper_beliefs(
 
 
 def feedback_beliefs(
-    certain: np.ndarray,
-    cells: np.ndarray,
-    grid: Grid,
-    settings: AdaptationParameters,
+    certain: np.ndarray, cells: np.ndarray, grid: Grid, settings: AdaptationParameters
 ) -> np.ndarray:
     """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 

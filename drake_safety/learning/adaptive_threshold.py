@@ -45,11 +45,7 @@ class AdaptiveThreshold:
         return _logit(safety_probability) >= self._logit
 
     def update(self, safety_probability: float, is_unsafe: bool) -> None:
-        """Takes in the outcome of an episode; a safe one changes nothing.
-
-        Args:
-            safety_probability: Probability of the first row, or the least of a motion.
-        """
+        """Takes in the outcome of an episode; a safe one changes nothing."""
         if is_unsafe:
             missed = self.is_safe(safety_probability)
             self._logit += self._step * (missed - self._miss_rate)

@@ -377,10 +377,7 @@ class SafetyAssessment:
         return self._predict(x[None], beliefs, correction, novelty).one(0)
 
     def strangest_input(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
         """Returns the entry of x that contradicts the others most, and by how much.
 
@@ -396,10 +393,7 @@ class SafetyAssessment:
         return input_names(self.info_, self.parameters)[column], float(found[column])
 
     def unsafe_logits(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mean logit of an unsafe end and its gradient with respect to x.
 
@@ -408,9 +402,6 @@ class SafetyAssessment:
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).
-
-        Raises:
-            ValueError: The maps have no safety head, as in the paper's mode.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)

@@ -43,7 +43,6 @@ def from_scores(
         score: Unsafety scores lambda in [0, 1], (N,).
         uncertainty: mu in [0, 1], scalar or (N,).
         cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
-        num_causes: n_c.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -77,9 +76,6 @@ def fuse(beliefs: np.ndarray) -> np.ndarray:
 
     Departure: the printed products of uncertainties underflow from about 600 beliefs on. Divided
     by their common product they become the weights w = (1 - mu) / mu, which give the same value.
-
-    Args:
-        beliefs: A set of beliefs, (k, 3 + n_c).
 
     Returns:
         The fused belief, (3 + n_c,); empty if the set is empty or all beliefs are vacuous.

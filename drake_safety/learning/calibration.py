@@ -57,8 +57,6 @@ class Calibration:
             over calibration sets.
         threshold: Lower bound of the probability for "safe".
         unsafe_below: Upper bound of the probability for "unsafe"; at most `threshold`.
-        num_missed: Number of unsafe calibration episodes with the verdict "safe".
-        num_accepted: Number of safe calibration episodes with the verdict "safe".
         variation: The plant of the episodes, for which alone the rates are promised.
     """
 
@@ -247,7 +245,6 @@ def episode_scores(
     Args:
         segments: The N segments of some episodes, from every row.
         unsafe_score: Unsafe score of each, (N,); NaN counts as most unsafe.
-        kind: "plan" or "motion".
 
     Returns:
         Score and label of each episode that has segments, (M,) each.

@@ -57,7 +57,6 @@ def describe_margin(name: str, margin: float, angular_constraints: Collection[st
 
     Args:
         margin: Its margin [m, rad]; the text is the name alone if it is not finite.
-        angular_constraints: Names of the constraints whose margins are angles.
     """
     if not math.isfinite(margin):
         return name

@@ -226,10 +226,7 @@ def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _max_dtw(
-    series: list[np.ndarray],
-    held: np.ndarray,
-    dtw: Callable[..., np.ndarray],
-    looseness: float,
+    series: list[np.ndarray], held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float
 ) -> float:
     """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
     held = held - held.mean(axis=0)

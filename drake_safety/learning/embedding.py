@@ -35,7 +35,6 @@ def tsne(
     Args:
         perplexity: Effective number of neighbours.
         exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
-        initialization: "spectral" or "random".
     """
     num_neighbours = graph.indices.shape[1]
     if num_neighbours < int(3 * perplexity):
@@ -141,8 +140,6 @@ def train_map(
     Args:
         data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
             nearly constant columns are not amplified.
-        parameters: The assessment's parameters. A head whose weight is 0 is omitted.
-        seed: Seed of the initial weights, the batches and the dropout.
         held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
             these inputs are kept instead of the last epoch's.
 

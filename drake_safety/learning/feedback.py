@@ -25,9 +25,6 @@ class FeedbackSet:
     twin's first row, and the end of both.
 
     Attributes:
-        info: The `EpisodesInfo` of the actual episodes.
-        nominal_hash: Scenario hash of the twin.
-        twin_seed: Seed of the twin's set.
         state: Measured state, (N, n_s).
         true_state: State without observation noise, (N, n_s).
         desired_preview: Desired outputs over the horizon, (N, H*n_z).
@@ -220,9 +217,7 @@ def segments_of(
     A twin that has left the safe set before a segment starts scores 1 there.
 
     Args:
-        stride: Rows between two starts.
         shortest: Least number of samples of a safe episode's segment.
-        discount: gamma of the unsafety score.
         plain: Whether to use the state without noise for "actual" episodes of the nominal plant, as
             in training in the paper's mode.
     """

@@ -90,7 +90,6 @@ class Innovation:
 
         Args:
             x: Inputs of each motion in the order of time, (K + 1, n_x); the state is first.
-            num_states: n_s.
         """
         x = [one for one in x if len(one) > 1]
         if not x:
@@ -138,11 +137,7 @@ class Innovation:
         )
 
     def with_feedback(self, x: Sequence[np.ndarray], novelty: Novelty) -> Innovation:
-        """Returns the innovation of an actual robot: corrected prediction, no lower limits.
-
-        Args:
-            x: Inputs of each motion of the robot, (K + 1, n_x).
-        """
+        """Returns the innovation of an actual robot: corrected prediction, no lower limits."""
         x = [one for one in x if len(one) > 1]
         if not x:
             return self
@@ -289,10 +284,9 @@ class Innovation:
         return found[last]
 
     def deviations(self, kind: str, average: np.ndarray) -> np.ndarray:
-        """Returns the mean error of each state, in its standard deviations on the nominal plant.
+        """Mean error of each state, (n_s,), in its standard deviations on the nominal plant.
 
-        Returns:
-            (n_s,), positive where the state grows more than predicted.
+        It is positive where the state grows more than predicted.
         """
         chart_whitening = self.chart_whitenings[("fast", "slow").index(kind)]
         unwhitening = np.linalg.inv(self.whitening)

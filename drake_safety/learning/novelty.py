@@ -134,12 +134,7 @@ class Novelty:
     """
 
     def __init__(
-        self,
-        *,
-        training: Moments,
-        limits: np.ndarray,
-        plan: slice,
-        feedback: Moments | None = None,
+        self, *, training: Moments, limits: np.ndarray, plan: slice, feedback: Moments | None = None
     ):
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         self.plan = plan
@@ -154,13 +149,7 @@ class Novelty:
 
     @classmethod
     def fit(
-        cls,
-        x: np.ndarray,
-        episode: np.ndarray,
-        is_unsafe: np.ndarray,
-        rate: float,
-        *,
-        plan: slice,
+        cls, x: np.ndarray, episode: np.ndarray, is_unsafe: np.ndarray, rate: float, *, plan: slice
     ) -> Novelty:
         """Computes the moments of training inputs and chooses the limits.
 
@@ -170,8 +159,6 @@ class Novelty:
         known.
 
         Args:
-            x: Inputs, those of an episode in the order of time, (N, n_x).
-            episode: Episode of each, (N,).
             is_unsafe: Whether it ended unsafely, (N,).
             rate: Share of episodes with a novel input, in (0, 1).
         """

@@ -290,9 +290,7 @@ def _cell_weights(nodes: _Nodes, y: str, grid: Grid, is_sharpened: bool) -> tupl
     position = nodes("Div", nodes("Add", y, grid.half_width), grid.cell_length)
     # False for NaN.
     is_within = nodes(
-        "And",
-        nodes("GreaterOrEqual", position, 0.0),
-        nodes("Less", position, float(resolution)),
+        "And", nodes("GreaterOrEqual", position, 0.0), nodes("Less", position, float(resolution))
     )
     inside = nodes("ReduceMin", nodes.double(is_within), axes=[2], keepdims=1)
     position = nodes("Where", nodes("Greater", inside, 0.0), position, 0.0)

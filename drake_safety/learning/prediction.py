@@ -108,8 +108,7 @@ class BaseLogit:
     def heads(self, output: EmbeddingOutput, margins: np.ndarray | None = None) -> np.ndarray:
         """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head.
 
-        Args:
-            margins: The mean of their margins, (N, n_c), if known.
+        The mean of the maps' margins, (N, n_c), is computed if it is not given.
         """
         found = np.zeros((output.embedding.shape[1], 2))
         logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
@@ -238,7 +237,6 @@ def predict(
     """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
     Args:
-        x: Inputs, (N, n_x).
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
         initial_uncertainty: mu_ini, the uncertainty of a filled cell.
         is_sharpened: Whether beliefs are interpolated between cell centres.

@@ -80,20 +80,16 @@ class EpisodesInfo:
     preview_stride: int = 1
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(
-                f"episodes of '{self.scenario}': horizon is {self.horizon}, expected >= 1"
-            )
-        if not self.step_s > 0.0:
-            raise ValueError(
-                f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0"
-            )
-
-        if self.preview_stride < 1:
-            raise ValueError(
-                f"episodes of '{self.scenario}': preview_stride is {self.preview_stride}, "
-                "expected >= 1"
-            )
+        for name, is_valid, expected in (
+            ("horizon", self.horizon >= 1, ">= 1"),
+            ("step_s", self.step_s > 0.0, "> 0"),
+            ("preview_stride", self.preview_stride >= 1, ">= 1"),
+        ):
+            if not is_valid:
+                raise ValueError(
+                    f"episodes of '{self.scenario}': {name} is {getattr(self, name)}, expected "
+                    f"{expected}"
+                )
 
     @property
     def preview_step_s(self) -> float:
@@ -101,18 +97,23 @@ class EpisodesInfo:
         return self.preview_stride * self.step_s
 
     @property
+    def columns(self) -> dict[str, list[str]]:
+        """Names of the columns of each recorded array."""
+        preview = [f"{name}[{k}]" for k in range(self.horizon) for name in self.output_names]
+        return {
+            "state": self.state_names,
+            "true_state": self.state_names,
+            "output": self.output_names,
+            "desired_output": self.output_names,
+            "desired_preview": preview,
+            "features": self.feature_names,
+            "margins": self.constraint_names,
+        }
+
+    @property
     def widths(self) -> dict[str, int]:
         """Number of columns of each recorded array by name."""
-        num_states, num_outputs = len(self.state_names), len(self.output_names)
-        return {
-            "state": num_states,
-            "true_state": num_states,
-            "output": num_outputs,
-            "desired_output": num_outputs,
-            "desired_preview": self.horizon * num_outputs,
-            "features": len(self.feature_names),
-            "margins": len(self.constraint_names),
-        }
+        return {name: len(names) for name, names in self.columns.items()}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -198,22 +199,11 @@ class Episodes(Sequence[Episode]):
             "row": np.concatenate([np.arange(0), *map(np.arange, counts)]),
             "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
         }
-        names = {
-            "state": info.state_names,
-            "true_state": info.state_names,
-            "output": info.output_names,
-            "desired_output": info.output_names,
-            "desired_preview": [
-                f"{name}[{k}]" for k in range(info.horizon) for name in info.output_names
-            ],
-            "features": info.feature_names,
-            "margins": info.constraint_names,
-        }
-        for array in RECORDED:
+        for array, names in info.columns.items():
             table = np.concatenate(
-                [np.empty((0, len(names[array]))), *(getattr(one, array) for one in episodes)]
+                [np.empty((0, len(names))), *(getattr(one, array) for one in episodes)]
             )
-            for name, column in zip(names[array], table.T, strict=True):
+            for name, column in zip(names, table.T, strict=True):
                 columns[f"{array}.{name}"] = column
         columns["is_safe"] = repeated([episode.is_safe for episode in episodes])
         columns["cause"] = repeated([episode.cause for episode in episodes])

@@ -11,12 +11,7 @@ import numpy as np
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
-from drake_safety.learning.embedding import (
-    MapData,
-    stack_members,
-    train_map,
-    tsne,
-)
+from drake_safety.learning.embedding import MapData, stack_members, train_map, tsne
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
 from drake_safety.learning.segments import Episodes, EpisodesInfo, Segments, split
@@ -29,8 +24,6 @@ _INSIDE_SHARE = 0.995
 _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _logger = logging.getLogger("drake_safety")
-
-"""Called with a stage and the fraction done."""
 
 
 def check_preview(info: EpisodesInfo, parameters: AssessmentParameters) -> None:
