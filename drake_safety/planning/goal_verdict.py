@@ -13,7 +13,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
+from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, is_in_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -28,7 +28,6 @@ class GoalVerdict:
         probability: The probability of staying safe; NaN where it was not evaluated, because the
             goal is outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
-        constraint_names: The n_c constraints, the possible causes.
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
             where none is predicted.
         margin_unit: Scale by which margins are compared [m, rad].
@@ -55,10 +54,7 @@ class GoalVerdict:
     def cause(self) -> str:
         """The constraint most likely to be violated; "" if there is no evidence for any."""
         return likely_cause(
-            self.constraint_names,
-            self.cause_probability,
-            self.predicted_margins,
-            self.margin_unit,
+            self.constraint_names, self.cause_probability, self.predicted_margins, self.margin_unit
         )
 
     @property
@@ -110,7 +106,7 @@ def assess_goal(
     goal = checked_goal(goal)
     with_goals = require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
-    if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
+    if is_in_box(goal, box):
         (verdict,) = assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
         )

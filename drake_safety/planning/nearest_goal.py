@@ -10,12 +10,7 @@ import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
-from drake_safety.planning.goal_verdict import (
-    GoalVerdict,
-    assess_goals,
-    checked_goal,
-    goal_inputs,
-)
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checked_goal, goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 

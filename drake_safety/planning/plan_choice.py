@@ -22,7 +22,6 @@ class PlanChoice:
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        probability: Probability of each candidate, (M,).
         threshold: Lowest probability of an accepted plan.
     """
 

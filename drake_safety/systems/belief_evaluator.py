@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
@@ -128,11 +123,7 @@ class BeliefEvaluator(LeafSystem):
         context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over what an assessment adapted from this system's own has learned.
-
-        Raises:
-            ValueError: The adapted assessment has other maps.
-        """
+        """Takes over what an assessment adapted from this system's own has learned."""
         if adapted.embedding_ is not self._assessment.embedding_ and not (
             adapted.embedding_.is_same(self._assessment.embedding_)
         ):

@@ -116,12 +116,7 @@ class CommandGuard(LeafSystem):
         return commands[np.argsort(distance, kind="stable")]
 
     def decide(
-        self,
-        asked: np.ndarray,
-        state: np.ndarray,
-        features: np.ndarray,
-        *,
-        is_acting: bool = True,
+        self, asked: np.ndarray, state: np.ndarray, features: np.ndarray, *, is_acting: bool = True
     ) -> tuple[np.ndarray, float]:
         """Returns the command to pass on, (3,), and the probability of the asked one."""
         asked_probability = float(self.probabilities(state, features, asked[None])[0])

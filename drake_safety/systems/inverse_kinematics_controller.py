@@ -36,7 +36,6 @@ class InverseKinematicsController(LeafSystem):
     respect the joint limits, and set points move at most at 0.7 of the joints' speed limits.
 
     Args:
-        kinematics: The controller's model of the robot.
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
@@ -82,11 +81,7 @@ class InverseKinematicsController(LeafSystem):
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
-        """Sets the foot positions used while ``desired_foot_positions`` is not connected.
-
-        Args:
-            p_WC: Centres of the contact spheres, (n_c, 3) [m].
-        """
+        """Sets the feet, (n_c, 3) [m], used while ``desired_foot_positions`` is not connected."""
         context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
 
     def foot_positions(self, context: Context) -> np.ndarray:

@@ -45,13 +45,7 @@ class PushSource(LeafSystem):
         )
 
     def set_push(
-        self,
-        context: Context,
-        body: str,
-        force_n: np.ndarray,
-        *,
-        start_s: float,
-        duration_s: float,
+        self, context: Context, body: str, force_n: np.ndarray, *, start_s: float, duration_s: float
     ) -> None:
         """Sets the push; it replaces an earlier one."""
         if body not in self._bodies:

@@ -61,7 +61,6 @@ class RecoveryStepPlanner(LeafSystem):
     set points. No output has direct feedthrough.
 
     Args:
-        kinematics: The controller's model of the robot.
         period_s: Planning period [s].
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.

@@ -38,7 +38,6 @@ class RecoverySwitch(Diagram):
     ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
 
     Args:
-        kinematics: The controller's model of the robot.
         threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after the assessor, and of the step planner after the

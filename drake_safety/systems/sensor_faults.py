@@ -33,7 +33,6 @@ class SensorFaults(LeafSystem):
 
     Args:
         period_s: Sampling period of noise and of faults that hold samples [s].
-        offset_s: Time of the first sample [s].
 
     Raises:
         ValueError: No entry has a fault's name, a swap is not of two entries, or a delay is not a

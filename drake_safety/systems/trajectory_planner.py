@@ -46,15 +46,12 @@ def interpolate(
 
 
 def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
-    """Start, goal and detour of a plan of :func:`interpolate`, from its first samples.
+    """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its samples [m].
 
     Args:
         preview: Samples from the plan's start; they may end before the plan, (M, n_z) [m].
         step_s: Time between them [s].
         duration_s: Duration of the whole plan [s].
-
-    Returns:
-        Start, goal and detour, (3, n_z) [m].
     """
     seen_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
@@ -151,10 +148,7 @@ class TrajectoryPlanner(LeafSystem):
             )
 
     def set_plan(
-        self,
-        context: Context,
-        plan: PiecewisePolynomial,
-        stance_pose: np.ndarray | None = None,
+        self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None
     ) -> None:
         """Sets the plan and, for an unconnected input, the stance pose.
 

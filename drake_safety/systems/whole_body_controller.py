@@ -10,11 +10,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.whole_body_model import (
-    PointReference,
-    WholeBodyModel,
-    WholeBodyReference,
-)
+from drake_safety.control.whole_body_model import PointReference, WholeBodyModel, WholeBodyReference
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
 
 NOT_FINITE = 1
@@ -46,7 +42,6 @@ class WholeBodyController(LeafSystem):
     ``num_failures`` counts the updates since the initialisation whose status was not 0.
 
     Args:
-        kinematics: The controller's model of the robot.
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
         actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
             :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
