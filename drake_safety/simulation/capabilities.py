@@ -110,22 +110,12 @@ class HasBall(Protocol):
         """Samples a ball with a given time of impact [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets a ball in flight towards the robot.
-
-        It hits a robot at rest after ``lead_s`` [s].
-
-        Returns:
-            The time of impact, simulation time [s].
-        """
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns the time."""
 
 
 @runtime_checkable
 class CanBePushed(Protocol):
-    """Forces can act on the robot's bodies.
-
-    Attributes:
-        pushes: Named pushes for single runs.
-    """
+    """Forces can act on the robot's bodies."""
 
     pushes: Mapping[str, Push]
 
@@ -194,11 +184,7 @@ _DESCRIPTIONS: dict[type, str] = {
 
 
 def require(loop: object, capability: type[_Capability], who: str = "") -> _Capability:
-    """Returns the loop if it has a capability.
-
-    Raises:
-        ValueError: The task lacks the capability.
-    """
+    """Returns the loop if it has a capability."""
     if isinstance(loop, capability):
         return loop
     present = [text for protocol, text in _DESCRIPTIONS.items() if isinstance(loop, protocol)]

@@ -243,11 +243,7 @@ def _told_from(value: Any, other: Any) -> str:
 
 
 def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None:
-    """Checks that a loop has output ports.
-
-    Raises:
-        ValueError: A port is missing.
-    """
+    """Checks that a loop has output ports."""
     missing = [name for name in names if not loop.HasOutputPort(name)]
     if missing:
         ports = [loop.get_output_port(i).get_name() for i in range(loop.num_output_ports())]
@@ -256,11 +252,7 @@ def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None
 
 
 def check_ports(loop: ClosedLoop) -> None:
-    """Checks that the required ports exist; those with names must have as many entries.
-
-    Raises:
-        ValueError: A port is missing, or has another size.
-    """
+    """Checks that the required ports exist; those with names must have as many entries."""
     who = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
     ports = {

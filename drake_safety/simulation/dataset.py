@@ -139,15 +139,9 @@ class EpisodeWriter:
 
 
 def open_folder(
-    path: str | os.PathLike[str],
-    info: EpisodesInfo,
-    extra: Mapping[str, Any] | None = None,
+    path: str | os.PathLike[str], info: EpisodesInfo, extra: Mapping[str, Any] | None = None
 ) -> None:
-    """Makes the folder of a set, or checks that an existing folder holds the same set.
-
-    Raises:
-        ValueError: The folder holds another set, or something else.
-    """
+    """Makes the folder of a set, or checks that an existing folder holds the same set."""
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if (path / _INFO_NAME).exists():

@@ -84,11 +84,7 @@ class EpisodeTiming:
     monitor_period_s: float
 
     def monitor_times(self, step: int) -> list[float]:
-        """Times at which the safe set is sampled during a step, its end included [s].
-
-        Args:
-            step: 1 for the step that leads to row 1.
-        """
+        """Times at which the safe set is sampled in a step, from 1, its end included [s]."""
         count = max(math.ceil(self.step_s / self.monitor_period_s - 1e-6), 1)
         begin_s = (step - 1) * self.step_s
         within = [begin_s + i * self.monitor_period_s for i in range(1, count)]
@@ -108,13 +104,9 @@ def record_episode(
     """Simulates an episode, which ends when it leaves the safe set or its time is over.
 
     Args:
-        simulator: Simulator of the diagram, with its Context set to the start.
         ports: The diagram's port for each of the names in ``RECORDED``, and for ``safe``. ``safe``
             defaults to no margin being negative, ``true_state`` to ``state``, ``desired_output``
             to the preview's first sample, and ``features`` to none.
-        timing: Sampling times.
-        who: The episode, for messages.
-        first_step: First row whose future is undisturbed.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that

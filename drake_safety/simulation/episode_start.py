@@ -91,11 +91,7 @@ class StatePlane:
     start: Callable[[np.ndarray], EpisodeStart]
 
     def points(self, resolution: int) -> np.ndarray:
-        """A grid with its border, (resolution, resolution, 2); the first variable varies first.
-
-        Raises:
-            ValueError: There are fewer than two of them.
-        """
+        """A grid with its border, (resolution, resolution, 2); the first variable varies first."""
         if resolution < 2:
             raise ValueError(f"state plane: resolution must be at least 2; got {resolution}")
         x, y = (

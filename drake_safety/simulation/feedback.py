@@ -65,15 +65,10 @@ def run_pairs(
 
     Args:
         variation: The actual plant.
-        num_workers: Number of processes; that of cores by default.
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        progress: Called with the number of episodes done and in all, two per pair; True shows it.
         **loop_options: Options of the task; they replace those of
             ``pairing_options`` of the task.
-
-    Raises:
-        ValueError: No such variation, or the folder holds other sets.
     """
     loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
@@ -102,11 +97,7 @@ def run_pairs(
 
 
 def AddFeedbackRecorder(
-    builder: DiagramBuilder,
-    loop: ClosedLoop,
-    *,
-    num_steps: int | None = None,
-    capacity: int = 400,
+    builder: DiagramBuilder, loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
 ) -> FeedbackRecorder:
     """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
     recorder = builder.AddNamedSystem(
@@ -151,11 +142,7 @@ def run_twins(
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Episodes:
-    """Simulates the nominal twins of recorded windows.
-
-    Raises:
-        ValueError: The task cannot begin with a given start.
-    """
+    """Simulates the nominal twins of recorded windows."""
     # pydrake never frees a system in Python: one loop serves every call.
     info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(
@@ -175,11 +162,7 @@ def pair_starts(
     *,
     seed: int = ADAPTATION.first,
 ) -> EpisodePairs:
-    """Simulates the nominal twins of episodes with known starts, in this process.
-
-    Raises:
-        ValueError: The task cannot begin with a given start.
-    """
+    """Simulates the nominal twins of episodes with known starts, in this process."""
     loop = worker_loop(scenario, _TWINS, {})
     twins = [
         run_episode(loop, episode.index, seed=seed, start=start)

@@ -9,12 +9,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import (
-    CanBePushed,
-    CanFall,
-    HasGoals,
-    require,
-)
+from drake_safety.simulation.capabilities import CanBePushed, CanFall, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng

@@ -80,7 +80,6 @@ class LeggedLoop(PlannedLoop):
     :meth:`_output_of`, the output that its plans specify.
 
     Attributes:
-        kinematics: Kinematics of the nominal robot.
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
@@ -124,11 +123,7 @@ class LeggedLoop(PlannedLoop):
         """Adds observers, with options of `StateObserver`; returns the controller's state."""
         noise = self.variation.observation_noise
         self._observers = Observers(
-            builder,
-            self.kinematics,
-            self._physics.state,
-            self.scenario.control_period_s,
-            **options,
+            builder, self.kinematics, self._physics.state, self.scenario.control_period_s, **options
         )
         self._observer = self._observers.add("observer", noise)
         seen_noise = combined(noise, self.variation.input_noise)

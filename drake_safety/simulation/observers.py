@@ -20,12 +20,7 @@ from drake_safety.systems.state_observer import StateObserver
 
 
 class Observers:
-    """Adds observers to a diagram, each with its own noise source.
-
-    Args:
-        plant_state: Port of its true state.
-        period_s: Sampling period of the noise [s].
-    """
+    """Adds observers to a diagram, each with its own noise source."""
 
     def __init__(
         self,

@@ -36,9 +36,6 @@ class OnlineAdaptation:
 
     Args:
         prior: The assessment before feedback.
-        recorder: The recorder, a system of the diagram.
-        assessor: The assessor, a system of the diagram.
-        method: Method of `SafetyAssessment.adapt`.
         run: Function that simulates the twins; see `feedback_of_windows`.
         capacity: Largest number of feedback sets kept; the oldest are dropped.
 
@@ -73,9 +70,6 @@ class OnlineAdaptation:
 
         Updates are between two calls of `AdvanceTo`, at the times of the recorder's rows: events
         and monitors of a simulation must not change its Context.
-
-        Args:
-            until_s: The time until which to simulate [s].
         """
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:

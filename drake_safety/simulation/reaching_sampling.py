@@ -59,9 +59,6 @@ class PostureSampling:
 
         Args:
             mirror: If given, the posture is mirrored: that of the other hand's episode.
-
-        Raises:
-            RuntimeError: No sampled posture is in the safe set.
         """
         kinematics = safe_set.kinematics
         robot = kinematics.robot
@@ -75,8 +72,7 @@ class PostureSampling:
                 -1, 1, kinematics.num_joints
             )
             offset = np.append(
-                rng.uniform(-1, 1, 2) * self.base_offset_m,
-                -rng.uniform(0, self.base_lowering_m),
+                rng.uniform(-1, 1, 2) * self.base_offset_m, -rng.uniform(0, self.base_lowering_m)
             )
             rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
             X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)

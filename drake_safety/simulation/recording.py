@@ -81,9 +81,7 @@ def record_episodes(
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             which is the diagram's default one. It may return the first row whose future is
             undisturbed, if that is not 0.
-        duration_s: Duration of a safe episode [s].
         step_s: Time between two rows, the unit of H [s].
-        parameters: Arguments of ``make_diagram``; part of the set's hash.
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
         name: Name of the set; that of ``make_diagram`` by default.
@@ -92,7 +90,6 @@ def record_episodes(
         path: Folder for the episodes; those of the same set that it already holds are kept. A set
             is identified by name, parameters, ports, times and seed, and by one of its episodes,
             which is simulated again and must be the same to the last bit.
-        progress: Called with the number done and in all; True shows it.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause

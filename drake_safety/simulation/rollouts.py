@@ -22,12 +22,7 @@ from drake_safety.learning.segments import (
     EpisodesInfo,
     installed_versions,
 )
-from drake_safety.simulation.capabilities import (
-    CanStartAnywhere,
-    HasGoals,
-    OffersPlans,
-    require,
-)
+from drake_safety.simulation.capabilities import CanStartAnywhere, HasGoals, OffersPlans, require
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
@@ -83,7 +78,6 @@ def run_episode(
 
     Args:
         loop: The closed loop; it has no state and can be used again.
-        index: Number of the episode in its set.
         goal: Goal of the plan, in place of a random one; for tasks with goals.
         is_standing: Whether it begins in the standing posture instead of a random one; requires a
             goal.

@@ -130,7 +130,6 @@ def calm_start(
     """Samples a start on a plan near the standing posture, without tracking error.
 
     Args:
-        rng: Random generator.
         half_widths_m: Half-widths of the plan's start and goal, about the stance, (2,) [m].
         plan_duration_s: Shortest and longest duration of the plan [s].
     """

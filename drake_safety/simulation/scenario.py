@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
-from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
@@ -26,8 +26,6 @@ from drake_safety.systems.safety_assessor import ON_ALARM
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
-
-    from drake_safety.learning.assessment import SafetyAssessment
 
 
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
@@ -108,11 +106,7 @@ class Scenario:
         return self.variations[name]
 
     def task_class(self) -> type[ClosedLoop]:
-        """The task, imported.
-
-        Raises:
-            ValueError: The import path is malformed or is not that of a ClosedLoop.
-        """
+        """The task, imported."""
         return _import_task(self.task, self.name, self.folder)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -123,7 +117,7 @@ class Scenario:
         self,
         variation: str = "nominal",
         *,
-        assessment: "SafetyAssessment | None" = None,
+        assessment: SafetyAssessment | None = None,
         meshcat: "Meshcat | None" = None,
         **options: Any,
     ) -> ClosedLoop:
@@ -314,9 +308,6 @@ def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
 
     Returns:
         The scenario without parameters, and the task's parameters as they stand in the file.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
     """
     path = _scenario_file(name)
     with reading(path):
@@ -341,12 +332,7 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
     """Reads a scenario from YAML text.
 
     Args:
-        text: The YAML.
-        folder: Folder of relative robot paths.
         task_folder: Folder in which the task's module may stand; "" for none.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
     """
     scenario, parameters = _parsed(text, name, folder)
     scenario.folder = task_folder

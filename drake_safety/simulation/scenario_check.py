@@ -55,7 +55,6 @@ def check_scenario(
         num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
         is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
             files are checked.
-        progress: Called with a stage, the number done and the number wanted.
     """
     report: StageProgress = progress or (lambda stage, done, total: None)
     scenario = yield from _guarded("scenario", _scenario(name, is_imported))

@@ -84,9 +84,6 @@ class ViolationCounter:
 
     Args:
         loop: A closed loop with a ``plant``, a ``robot_instance`` and ``kinematics``.
-
-    Raises:
-        ValueError: The plant's contacts and efforts are not Drake's.
     """
 
     _POSITION_SLACK_RAD = 0.02
@@ -148,14 +145,7 @@ def play_throws(
     duration_s: float,
     log_period_s: float,
 ) -> Iterator[float]:
-    """Advances a simulation while balls are thrown, and stops at every row of a log.
-
-    Args:
-        throws: The balls; each is released shortly before its impact at ``time_s``.
-
-    Yields:
-        The time of each row, from 0 on [s].
-    """
+    """Advances a simulation while balls are thrown; yields the time of every row of a log [s]."""
     thrown = require(loop, HasBall)
     waiting = sorted(throws, key=lambda throw: throw.time_s)
     for row in range(round(duration_s / log_period_s) + 1):
@@ -187,9 +177,7 @@ def run_throw(
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
-        throws: Balls in place of the random one.
         duration_s: End time [s]; by default 2.5 s after the first impact.
-        ports: More output ports to log, into ``extra``.
     """
     rng = episode_rng(seed, index)
     simulator = Simulator(loop)
@@ -261,7 +249,6 @@ def run_throws(
 
     Args:
         trigger_times_s: Time of the trigger by index [s]; by default there is no recovery.
-        progress: Called with the number done and in all; True shows it.
     """
     options = {"ball": True, "recovery": trigger_times_s is not None}
     times = trigger_times_s or {}

@@ -52,10 +52,8 @@ def run_batches(
 
     Args:
         function: A function at module level, or a partial of one; returns one result per item.
-        items: What it is called for, such as indices of episodes.
         progress: Called with the number done and in all, at the start and after each batch; True
             shows it.
-        num_done: Number done beforehand.
     """
     num_wanted = num_done + len(items)
     results = parallel_map(function, [(batch,) for batch in batches(items)], num_workers)
@@ -80,10 +78,6 @@ def parallel_map(
     Every call has one BLAS thread, so that results do not depend on the number of workers. On
     Ctrl-C or any error the workers end; when this process is killed they end within a second or
     two.
-
-    Args:
-        function: A function at module level.
-        arguments: One tuple per call.
 
     Raises:
         ChildProcessError: A worker was killed.
