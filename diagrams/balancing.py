@@ -33,7 +33,6 @@ class Balancing(LeggedLoop):
     """The diagram of the balancing task, for any robot.yaml with feet and joint gains.
 
     Args:
-        variation: Name of the plant variation.
         recovery: Whether to add recovery steps; by default if there is an assessment to trigger
             them. Without one the diagram has an input port ``safety_probability``.
         ball: Whether the plant has a ball; by default if pushes are sampled.

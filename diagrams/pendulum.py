@@ -63,9 +63,6 @@ class PendulumSafeSet:
     The features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
     pendulum cannot return. Following the plan takes the torque (l/g) φ̈ - sin φ, in units of the
     torque that holds the pendulum horizontally.
-
-    Args:
-        preview_step_s: Time between two samples of the outlook [s].
     """
 
     names = ("front", "back")

@@ -39,7 +39,6 @@ class Reaching(LeggedLoop):
     image, so that one assessment applies to both hands. All other ports are not mirrored.
 
     Args:
-        variation: Name of the plant variation.
         hand: The hand that reaches; the scenario's by default.
         exploring: Whether episodes with random goals have the scenario's random detours and pushes;
             otherwise every plan is straight and undisturbed.
@@ -101,8 +100,7 @@ class Reaching(LeggedLoop):
                 "preview_reflection",
                 MatrixGain(
                     D=np.kron(
-                        np.eye(scenario.assessment.horizon),
-                        np.diag(self.mirror.points(np.ones(3))),
+                        np.eye(scenario.assessment.horizon), np.diag(self.mirror.points(np.ones(3)))
                     )
                 ),
             )
@@ -268,11 +266,7 @@ class Reaching(LeggedLoop):
         return self._controller.model.reaching_position(q)
 
     def _set(
-        self,
-        context: Context,
-        q: np.ndarray,
-        goal: np.ndarray,
-        detour: np.ndarray | None = None,
+        self, context: Context, q: np.ndarray, goal: np.ndarray, detour: np.ndarray | None = None
     ) -> None:
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():

@@ -13,12 +13,7 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import (
-    load_policy,
-    network_file,
-    read_policy_file,
-    with_policy,
-)
+from drake_safety.control.policy import load_policy, network_file, read_policy_file, with_policy
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -46,7 +41,6 @@ class Walking(LeggedLoop):
     the measured velocity, and a goal is a constant command.
 
     Args:
-        variation: Name of the plant variation.
         disturbed: Whether some episodes begin with an offset of the state.
         command_s: Duration of a goal's command [s], after which the command is zero; that of the
             episode by default.
@@ -145,10 +139,7 @@ class Walking(LeggedLoop):
             builder,
             safe_set,
             outlook=desired["desired_outlook"],
-            controller_features=(
-                controller.GetOutputPort("action_state"),
-                controller.action_names,
-            ),
+            controller_features=(controller.GetOutputPort("action_state"), controller.action_names),
             has_stance=False,
         )
         assessor = self._export_robot(
@@ -281,11 +272,7 @@ class Walking(LeggedLoop):
         self._observers.silence(context)
 
     def set_command(self, context: Context, command: np.ndarray) -> None:
-        """Sets a constant command from now on.
-
-        Args:
-            command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
-        """
+        """Sets a constant command (v_x, v_y, ω_z) (3,) [m/s, rad/s] from now on."""
         self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
@@ -324,9 +311,6 @@ class Walking(LeggedLoop):
             command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
             duration_s: For how long [s]; rounded to the policy's period, so that the controller's
                 next update is due.
-
-        Returns:
-            The state at the end, above the origin, with the controller's memory.
         """
         if self._rehearsal is None:
             self._rehearsal = type(self)(self.scenario)

@@ -42,11 +42,7 @@ class CommandSampling:
     def sample_command(
         self, limits: CommandLimits, rng: np.random.Generator, reach: float = 1.0
     ) -> np.ndarray:
-        """Samples a command, (3,) [m/s, rad/s].
-
-        Args:
-            reach: Factor on the ranges.
-        """
+        """Samples a command, (3,) [m/s, rad/s]."""
         low, high = reach * np.array(limits.lowest), reach * np.array(limits.highest)
         drawn = rng.uniform(low, high)
         return np.zeros(3) if rng.random() < self.standing_share else drawn
@@ -54,11 +50,7 @@ class CommandSampling:
     def sample(
         self, limits: CommandLimits, rng: np.random.Generator, duration_s: float
     ) -> PiecewisePolynomial:
-        """Samples a profile of constant commands with short ramps between them.
-
-        Args:
-            duration_s: Of the profile [s].
-        """
+        """Samples a profile of constant commands with short ramps between them."""
         reach = 1.0 if rng.random() < self.inside_share else self.reach
         count = int(rng.integers(self.num_segments[0], self.num_segments[1] + 1))
         commands = [self.sample_command(limits, rng, reach) for _ in range(count)]
