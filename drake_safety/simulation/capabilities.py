@@ -110,7 +110,7 @@ class HasBall(Protocol):
         """Samples a ball with a given time of impact [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns the time."""
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns when."""
 
 
 @runtime_checkable
