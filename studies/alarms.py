@@ -16,6 +16,8 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
+from drake_safety.evaluation.tables import Column
+from drake_safety.evaluation.verdict_tables import Kind
 from drake_safety.simulation.goal_motion import GoalMotion, Mishap
 from drake_safety.simulation.throws import ThrowLog
 
@@ -23,6 +25,20 @@ FALSE_ALARM_SHARE = 0.05
 """Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
 NUM_ROWS = 2
 """Successive rows that give an alarm: a blow itself can make one row "don't know"."""
+ALARMS: Kind = (
+    "Alarms on pushed motions",
+    "Thresholds are chosen for the same share of false alarms on calibration motions.",
+    (
+        Column("detected", "detection rate", "%", 1, 1),
+        Column("lead_to_leaving_s", "lead time to leaving", "s", 1, 2),
+        Column("falls_detected", "detection rate of falls", "%", 1, 1),
+        Column("lead_to_fall_s", "lead time to the fall", "s", 1, 2),
+        Column("false_alarms_per_hour", "false-alarm rate", "/h", -1, 0),
+        Column("undisturbed_false_alarms_per_hour", "false-alarm rate, undisturbed", "/h", -1, 0),
+        Column("auc", "AUC", "", 1),
+    ),
+)
+"""The table of the set "monitoring"."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _TRACKING = "tracking_error_"
 _SLACK_S = 1e-9

@@ -35,9 +35,11 @@ from drake_safety.cli.training_folder import (
     episodes_folder,
 )
 from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import shifts_tables
-from drake_safety.evaluation.verdict_tables import verdict_tables
+from drake_safety.evaluation.tables import Table
+from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, SHIFTS
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import (
@@ -53,6 +55,7 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throws
 from studies.alarms import (
+    ALARMS,
     WatchedMotion,
     accepted,
     evaluate_alarms,
@@ -134,7 +137,12 @@ def evaluate(
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
     made_by = command_line("python -m studies")
     entries = {"calibration_episodes": calibration_episodes}
-    write(evaluation, "evaluation.json", made_by, verdict_tables, entries)
+    write(evaluation, "evaluation.json", made_by, _tables, entries)
+
+
+def _tables(results: Results) -> list[Table]:
+    alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
+    return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
 
 
 def _add_differences(

@@ -9,6 +9,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.verdict_tables import verdict_table
 from studies.alarms import (
+    ALARMS,
     Alarm,
     WatchedMotion,
     accepted,
@@ -183,7 +184,7 @@ def test_what_an_engineer_would_watch_is_found_by_name():
 
 def test_the_table_says_where_another_alarm_is_ahead():
     found = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST, num_rows=1)
-    table = verdict_table(Results(found), "monitoring")
+    table = verdict_table(Results(found), "monitoring", kind=ALARMS)
     assert [row.key for row in table.rows] == ["sharpened", "tilt"]
     (first, *_) = table.better_baselines()
     assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")

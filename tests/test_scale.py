@@ -45,4 +45,4 @@ def test_a_row_says_what_each_stage_costs_and_how_good_the_assessment_is(folder)
         each = 1e3 * row["cpu_s"].sum() / row["segments"]
         assert found["ms a segment"].value == pytest.approx(each)
         assert {one.n for one in found.values()} == {50}
-    np.testing.assert_allclose(rows[0]["score"], rows[1]["score"], atol=0.2)
+    assert np.abs(rows[0]["score"] - rows[1]["score"]).mean() < 0.1

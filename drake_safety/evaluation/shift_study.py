@@ -325,8 +325,7 @@ def evaluate_shifts(
 
 def shifts_tables(results: Results) -> list[Table]:
     """The table of all shifts."""
-    columns = [one for one in _COLUMNS if results.select(method=one.key.partition(".")[0])]
-    sets = dict.fromkeys(row.set for row in results.values())
+    sets = dict.fromkeys(row.set for row in results.values() if row.set.startswith("shifts."))
     false = results.get("shifts.nominal.monitor.false_alarms_per_hour")
     meaning = _MEANING
     if false is not None:
@@ -335,10 +334,12 @@ def shifts_tables(results: Results) -> list[Table]:
             f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
         )
     labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}
-    rows = rows_of(results, labels, columns)
-    return [
-        Table(corner="shift", columns=columns, rows=rows, title="Γ under shifts", meaning=meaning)
-    ]
+    rows = rows_of(results, labels, _COLUMNS)
+    table = Table(
+        corner="shift", columns=_COLUMNS, rows=rows, title="Γ under shifts", meaning=meaning
+    )
+    found = zip(*(row.estimates for row in rows), strict=True)
+    return [table.narrow([one.key for one, of in zip(_COLUMNS, found, strict=True) if any(of)])]
 
 
 def shifts_figure(estimates: Mapping[str, Estimate]) -> Figure:

@@ -79,12 +79,13 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     foot = kinematics.foot_names[0]
     weak_scale = _WEAK_SHARE * torques[loaded] / _effort_limit(kinematics, joint)
     lateral_n = _SIDE_FORCE_SHARE * mass_kg * 9.81
+    late_s = _whole(_DELAY_PERIODS * scenario.control_period_s, scenario.time_step_s)
     lasting = {
         "slope": Shift(slope_rad=_SLOPE_RAD),
         "side_force": Shift(base_force_n=[0.0, lateral_n, 0.0]),
         "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
         "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
-        "late_command": Shift(command_delay_s=_DELAY_PERIODS * scenario.control_period_s),
+        "late_command": Shift(command_delay_s=late_s),
         "hole": Shift(holes_m={foot: _HOLE_SHARE * kinematics.standing_height}),
     }
     if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
@@ -95,7 +96,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     faults = {
         "joint_bias": Fault(kind="bias", entries=positions, value=_JOINT_BIAS_RAD),
         "dead_velocities": Fault(kind="zero", entries=velocities),
-        "stale": Fault(kind="delay", value=round(_STALE_S / period_s) * period_s),
+        "stale": Fault(kind="delay", value=_whole(_STALE_S, period_s)),
         "frozen": Fault(kind="freeze"),
         "frozen_later": Fault(kind="freeze", start_s=_FROZEN_AT_S),
     }
@@ -119,6 +120,11 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
         **own,
         **{name: PlantShift(kind="sensor", variation=one) for name, one in sensors.items()},
     }
+
+
+def _whole(time_s: float, period_s: float) -> float:
+    """The multiple of a period, at least one, that is nearest to a time."""
+    return max(round(time_s / period_s), 1) * period_s
 
 
 def _effort_limit(kinematics: RobotKinematics, joint: str) -> float:

@@ -173,7 +173,7 @@ class Table:
         best = [self.best(number) for number in range(len(self.columns))]
         for i, row in enumerate(self.rows):
             cells = "".join(
-                f"<td{' class=best' * (i in best[j])}>{escape(column.value_text(one))} "
+                f"<td{' class=best' * (i in best[j])}>{_unbroken(column.value_text(one))} "
                 f"<small>{escape(column.interval_text(one))}</small></td>"
                 for j, (column, one) in enumerate(zip(self.columns, row.estimates, strict=True))
             )
@@ -194,3 +194,7 @@ def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Colum
         for prefix, label in labels.items()
     ]
     return [row for row in rows if any(row.estimates)]
+
+
+def _unbroken(text: str) -> str:
+    return escape(text).replace(" ", "&nbsp;")
