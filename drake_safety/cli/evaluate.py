@@ -114,7 +114,7 @@ def evaluate(
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Evaluate Γ on fresh episodes and throws, beside the paper's form and baseline classifiers.
+    """Evaluate Γ on fresh episodes and throws.
 
     For plans with a goal, verdicts on fresh targets at k = 0 are evaluated, beside inverse
     kinematics. Episodes are kept in ASSESSMENT: a stopped evaluation continues. With throws, or
