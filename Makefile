@@ -27,7 +27,7 @@ help: ## Show these targets
 demo: $(INSTALLED) ## Train on 300 episodes, evaluate, and throw balls at the robot
 	$(BIN)/drake-safety train laikago_balancing --episodes 300 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
-		--episodes 128 --calibration-episodes 60 --throws 30 --no-baselines
+		--episodes 128 --calibration-episodes 60 --throws 30
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
 walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies

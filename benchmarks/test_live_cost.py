@@ -10,7 +10,8 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.live.session import TICK_S, LiveGoals, LiveSession, LiveThrows
+from drake_safety.live.session import TICK_S, LiveSession
+from drake_safety.live.task_sessions import LiveGoals, LiveThrows
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 

@@ -72,7 +72,7 @@ def fit_cost(mode: str, folder: Path, num_episodes: int) -> dict[str, Any]:
 
 def classifier_cost(folder: Path, num_episodes: int) -> float:
     """CPU seconds of scikit-learn's gradient boosting, fitted to the same episodes."""
-    from drake_safety.evaluation.baselines import DirectClassifier
+    from studies.baselines import DirectClassifier
 
     episodes = load(folder, num_episodes)
     DirectClassifier("gradient_boosting").fit(episodes[:50])  # Imports are left out.

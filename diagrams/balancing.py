@@ -65,9 +65,7 @@ class Balancing(LeggedLoop):
         super().__init__(scenario, variation, assessment)
         recovery = assessment is not None if recovery is None else recovery
         parameters = scenario.parameters
-        # Assessor, trigger, step planner and controller update in this order in one plant step.
-        tick_offset_s = 0.25 * scenario.time_step_s
-        self._control_offset_s = 3 * tick_offset_s
+        self._control_offset_s = 3 * self.tick_s  # After assessor, trigger and step planner.
         builder = DiagramBuilder()
 
         has_ball = parameters.push.share > 0 if ball is None else ball
@@ -92,7 +90,7 @@ class Balancing(LeggedLoop):
                     persistence_s=parameters.recovery.persistence_s,
                     initial_uncertainty=scenario.assessment.initial_uncertainty,
                     period_s=scenario.control_period_s,
-                    offset_s=tick_offset_s,
+                    offset_s=self.tick_s,
                     horizon=scenario.assessment.horizon,
                     num_outlook=_NUM_OUTLOOK,
                 ),
@@ -140,7 +138,7 @@ class Balancing(LeggedLoop):
         )
         assessor = self._export_robot(
             builder,
-            assessment_period_s=parameters.recovery.assessment_period_s,
+            period_s=parameters.recovery.assessment_period_s,
             desired_output=desired["desired_output"],
             desired_preview=desired["desired_preview"],
             hold=recovery_active,

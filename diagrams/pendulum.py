@@ -219,7 +219,7 @@ class Pendulum(PlannedLoop):
         self.state_names = ["angle", "angle_rate"]
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
         output = observer.GetOutputPort("output")
-        self._export(builder, assessment_period_s=period_s, state=state, output=output)
+        self._export(builder, period_s=period_s, state=state, output=output)
         if meshcat is not None:
             scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
             PendulumGeometry.AddToBuilder(builder, pendulum.get_state_output_port(), scene_graph)

@@ -119,8 +119,7 @@ class Reaching(LeggedLoop):
                 hand=self.hand,
                 actuation_matrix=physics.actuation_matrix(kinematics.joint_names),
                 period_s=scenario.control_period_s,
-                # After the update of the noise, within the plant's step.
-                offset_s=0.5 * scenario.time_step_s,
+                offset_s=2 * self.tick_s,  # After the update of the noise.
             ),
         )
         self._controller = controller
@@ -137,7 +136,7 @@ class Reaching(LeggedLoop):
         self._watch(builder, self.safe_set)
         self._export_robot(
             builder,
-            assessment_period_s=parameters.assessment_period_s,
+            period_s=parameters.assessment_period_s,
             desired_preview=desired_preview,
             meshcat=meshcat,
         )

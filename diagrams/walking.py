@@ -103,8 +103,6 @@ class Walking(LeggedLoop):
         # The servos' gains are part of the policy, and its default posture is how it stands.
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
-        # Assessor, guard or trigger, and controller update in this order in one plant step.
-        tick_offset_s = 0.25 * scenario.time_step_s
         builder = DiagramBuilder()
         physics = self._add_robot(builder, Scene(), servos=True)
         measured = self._add_observers(builder, is_walking=True)
@@ -124,7 +122,7 @@ class Walking(LeggedLoop):
                     self.policy.parameters.command,
                     threshold=parameters.guard.threshold,
                     period_s=parameters.guard.period_s,
-                    offset_s=tick_offset_s,
+                    offset_s=self.tick_s,
                     num_outlook=_NUM_OUTLOOK,
                 ),
             )
@@ -135,10 +133,11 @@ class Walking(LeggedLoop):
         command = desired["desired_output"]
         trigger = None
         if recovery:
-            trigger, command = self._add_recovery(builder, command, tick_offset_s)
+            trigger, command = self._add_recovery(builder, command)
         controller = self._controller = builder.AddNamedSystem(
             "policy_controller",
-            PolicyController(self.kinematics, self.policy, offset_s=2 * tick_offset_s),
+            # After guard or trigger.
+            PolicyController(self.kinematics, self.policy, offset_s=2 * self.tick_s),
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
@@ -157,7 +156,7 @@ class Walking(LeggedLoop):
         )
         assessor = self._export_robot(
             builder,
-            assessment_period_s=parameters.assessment_period_s,
+            period_s=parameters.assessment_period_s,
             desired_output=desired["desired_output"],
             desired_preview=desired["desired_preview"],
             meshcat=meshcat,
@@ -178,7 +177,7 @@ class Walking(LeggedLoop):
         self.finish(builder)
 
     def _add_recovery(
-        self, builder: DiagramBuilder, nominal: OutputPort, offset_s: float
+        self, builder: DiagramBuilder, nominal: OutputPort
     ) -> tuple[RecoveryTrigger, OutputPort]:
         """The trigger, and the command, or a share of it during recovery."""
         recovery = self.scenario.parameters.recovery
@@ -189,7 +188,7 @@ class Walking(LeggedLoop):
                 initial_uncertainty=self.scenario.assessment.initial_uncertainty,
                 persistence_s=recovery.persistence_s,
                 period_s=self.scenario.control_period_s,
-                offset_s=offset_s,
+                offset_s=self.tick_s,
             ),
         )
         builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")

@@ -3,10 +3,3 @@
 They run from a checkout, on the folders written by ``drake-safety train`` and ``evaluate``, and are
 not part of the installed package.
 """
-
-from drake_safety.cli.console import command_line as _typed
-
-
-def command_line() -> str:
-    """The command line."""
-    return _typed("python -m studies")

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import typer
 
 from drake_safety.cli import run_app
-from studies.ablate import ablate
+from studies.ablation import ablate
 from studies.adaptation import adaptation
 from studies.animation import animation
 from studies.bench import bench
+from studies.compare import compare
 from studies.converged import converged
-from studies.kills import kills
-from studies.learning_curve import train_fewer
-from studies.plan_study import plan_study
+from studies.evaluate import evaluate
+from studies.planning import plan_study
+from studies.promises import promises
 from studies.publish import readme, ship, store
 from studies.readings import readings
 from studies.scale import scale
-from studies.soak import soak
 from studies.truth import truth
 from studies.walking import walking
 
@@ -27,22 +29,13 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command()(ablate)
-app.command()(plan_study)
-app.command("learning-curve")(train_fewer)
-app.command()(adaptation)
-app.command()(animation)
-app.command()(readings)
-app.command()(converged)
-app.command()(kills)
-app.command()(scale)
-app.command()(soak)
-app.command()(truth)
-app.command()(walking)
-app.command()(bench)
-app.command()(store)
-app.command()(readme)
-app.command()(ship)
+_COMMANDS: tuple[Callable[..., None], ...] = (
+    *(evaluate, compare, promises),
+    *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
+    *(animation, bench, store, readme, ship),
+)
+for _command in _COMMANDS:
+    app.command()(_command)
 
 
 def main() -> None:

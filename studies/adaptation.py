@@ -2,42 +2,51 @@
 
 from __future__ import annotations
 
-import json
+import copy
 import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 import typer
-from rich.table import Table
 
 from drake_safety.cli.adapt import fresh_actual_episodes, paired_episodes
 from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    console,
-    interval,
-    new_table,
-    open_stages,
     print_path,
     print_shipped,
-    versions,
 )
-from drake_safety.cli.training_folder import (
-    MODES,
-    adapted_folder,
-    assessment_folder,
-    check_fresh,
-    load_assessment,
-)
+from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
 from drake_safety.evaluation.figure_style import save
-from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import Assessments, SafetyAssessment
+from drake_safety.learning.beliefs import safe_share
+from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
+from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.scenario import load_scenario
-from studies import command_line
-from studies.adaptation_figure import adaptation_figure, study_figure
-from studies.adaptation_losses import STEPS, losses
-from studies.adaptation_study import AdaptationStudy, Pool, TestSet, study, train_baselines
+from drake_safety.simulation.worker_processes import parallel_map
+from studies.adaptation_figure import adaptation_figure
+from studies.baselines import DirectClassifier
+from studies.harness import open_study
 
+SIZES = (40, 80, 120, 160, 400)
+"""Numbers of feedback sets after which an assessment is evaluated."""
+THRESHOLD = 0.5
+"""Γ below which a segment is classified unsafe."""
+PUBLISHED: dict[str, Callable[[Assessments], np.ndarray]] = {
+    "calibrated": lambda result: result.probability,
+    "grid": lambda result: safe_share(result.belief),
+}
+"""By the key of results: the probability, and the safe share of the grid's belief."""
+NUM_NEIGHBOURS = 50
+STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
+"""The steps, see `losses`."""
 _SCRATCH_SIZES = (40, 160, 400)
 _POOL_STRIDE = 10  # Between the first seeds of two pools.
 
@@ -68,19 +77,29 @@ def adaptation(
 ) -> None:
     """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
 
-    Episodes are shared with `drake-safety adapt`; results and figures are written to
-    ASSESSMENT/adapted-VARIATION.
+    Episodes are shared with `drake-safety adapt`; study.json, its plot and the map before and after
+    feedback are written to ASSESSMENT/adapted-VARIATION.
     """
-    loaded = load_scenario(scenario)
-    learned = assessment_folder(loaded, assessment)
-    priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
-    seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
-    for prior in priors.values():
-        check_fresh(prior, loaded, [one for block in seeds for one in block.values()])
+    learned = assessment_folder(load_scenario(scenario), assessment)
     print_shipped(learned)
     folder = adapted_folder(learned.out, variation)
     pictures = []
-    with open_stages() as stages:
+    with open_study(
+        "study",
+        scenario,
+        learned.path,
+        seed=seed,
+        workers=workers,
+        out=folder,
+        plotted=lambda row: (
+            row.metric in ("brier", "auc", "unsafe_recall")
+            and row.set in ("sharpened.calibrated", "paper.grid")
+        ),
+    ) as study:
+        loaded, stages = study.scenario, study.stages
+        seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
+        spent = [one for block in seeds for one in block.values()]
+        priors = {mode: study.load(mode, spent) for mode in MODES}
         common = (learned.out, workers, stages)
         drawn = [
             paired_episodes(loaded, feedback, variation, block["adaptation"], *common)
@@ -96,108 +115,280 @@ def adaptation(
         learned_from = {}
         if oracle:
             learned_from["oracle"] = fresh_actual_episodes(
-                loaded,
-                oracle,
-                variation,
-                seeds[0]["oracle"],
-                *common,
-                what="episodes of the oracle",
+                loaded, oracle, variation, seeds[0]["oracle"], *common, what="those of the oracle"
             )
         if scratch:
             learned_from |= {
-                f"scratch.{n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback
+                f"scratch {n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback
             }
-        studies: dict[str, AdaptationStudy] = {}
         for mode, prior in priors.items():
-            baselines: dict[str, SafetyAssessment] = {}
-            if learned_from:
-                baselines = train_baselines(
-                    prior, learned_from, num_workers=workers, progress=stages
-                )
+            baselines = train_baselines(prior, learned_from, num_workers=workers, progress=stages)
             judged = [
                 Pool(feedback=one, test=TestSet.of(episodes, prior.parameters.shortest))
                 for one, episodes in zip(sets, fresh, strict=True)
             ]
-            studies[mode] = study(prior, judged, baselines=baselines, progress=stages)
+            study.add(mode, pool_estimates(prior, judged, baselines=baselines, progress=stages))
             if mode == "paper" and oracle:
-                studies[mode].estimates |= losses(
-                    prior, sets[0], learned_from["oracle"], judged[0].test
-                )
+                found = losses(prior, sets[0], learned_from["oracle"], judged[0].test)
+                study.add("losses", found)
             if len(sets[0]) >= prior.parameters.adaptation.update_interval:
                 picture = adaptation_figure(prior, sets[0])
                 pictures += save(picture, folder / f"adaptation_{mode}")
-    for published in ("calibrated", "grid"):
-        picture = study_figure(studies, published=published)
-        pictures += save(picture, folder / f"study_{published}")
-    report = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "scenario_hash": drawn[0].actual.info.scenario_hash,
-        "nominal_hash": drawn[0].nominal.info.scenario_hash,
-        "variation": variation,
-        "seed": seed,
-        "pools": pools,
-        "feedback_sets": [len(one) for one in sets],
-        "differing_pairs": [sum(pair.differs for pair in one) for one in sets],
-        "versions": versions(),
-        **{
-            f"{mode}.{key}": estimate.to_json()
-            for mode, found in studies.items()
-            for key, estimate in found.estimates.items()
-        },
-    }
-    file = folder / "study.json"
-    file.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for mode, found in studies.items():
-        for published in ("calibrated", "grid") if mode == "sharpened" else ("grid",):
-            console.print(_study_table(found, mode, published, variation))
-        if "losses.x.brier" in found.estimates:
-            console.print(_losses_table(found, mode))
-    print_path("figures", file)
+        study.entries |= {
+            "variation": variation,
+            "pools": pools,
+            "feedback_sets": [len(one) for one in sets],
+            "differing_pairs": [sum(pair.differs for pair in one) for one in sets],
+        }
     for path in pictures:
         print_path("picture", path)
 
 
-def _losses_table(found: AdaptationStudy, mode: str) -> Table:
-    brier = {name: found.estimates[f"losses.{name}.brier"].value for name in STEPS}
-    table = new_table("", "Brier", "lost", title=f"{mode}: where the Brier score is lost")
-    table.add_row("gradient boosting on x, from the oracle's episodes", f"{brier['x']:.3f}", "")
-    for name, before, label in (
-        ("psi", "x", "Ψ: their nearest in the embedding"),
-        ("grid", "psi", "the grid: their share in the cell"),
-        ("update", "grid", "the update, from all feedback"),
-        ("update_without_gpr", "grid", "the update without the discrepancy function"),
-    ):
-        table.add_row(label, f"{brier[name]:.3f}", f"{brier[name] - brier[before]:+.3f}")
-    return table
+@dataclass(frozen=True, kw_only=True)
+class TestSet:
+    """Fresh actual episodes for evaluation.
 
+    Attributes:
+        episodes: The episodes.
+        segments: Their segments from every row.
+    """
 
-def _study_table(found: AdaptationStudy, mode: str, published: str, variation: str) -> Table:
-    columns = ("brier", "auc", "unsafe_recall", "safe_recall", "unknown")
-    estimates = found.estimates
-    table = new_table(
-        "",
-        *columns,
-        "better in",
-        "gap closed",
-        title=f"{mode}, {published}: fresh episodes of '{variation}', {found.num_pools} pools of "
-        "feedback (mean, least and largest)",
-    )
-    names = {"prior": "before feedback"}
-    names |= {f"adapted.{n}": f"after {n} sets" for n in found.sizes}
-    names |= {f"scratch.{n}": f"from scratch on {n}" for n in _SCRATCH_SIZES}
-    names["oracle"] = "oracle"
-    for who, label in names.items():
-        key = f"{who}.{published}"
-        if f"{key}.brier" not in estimates:
-            continue
-        won, closed = estimates.get(f"{key}.pools_won"), estimates.get(f"{key}.gap_closed")
-        table.add_row(
-            label,
-            *(interval(estimates[f"{key}.{column}"]) for column in columns),
-            f"{round(won.value * won.n)} of {won.n}" if won is not None else "",
-            f"{100 * closed.value:.0f} %"
-            if closed is not None and math.isfinite(closed.value)
-            else "",
+    __test__ = False  # Not one of pytest's.
+
+    episodes: Episodes
+    segments: Segments
+
+    @classmethod
+    def of(cls, episodes: Episodes, shortest: int) -> TestSet:
+        """Cuts episodes at every row.
+
+        Args:
+            episodes: The episodes.
+            shortest: Minimum length of a segment of a safe episode [steps].
+        """
+        return cls(
+            episodes=episodes, segments=split(episodes, stride=1, discount=1.0, shortest=shortest)
         )
-    return table
+
+    def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
+        """1 - the safe share of each segment's belief, (N,)."""
+        segments = self.segments
+        features = segments.features if assessment.uses_features else None
+        found = assessment.predict(segments.state, segments.desired_preview, features)
+        return 1.0 - safe_share(found.belief)
+
+
+def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
+    """Metrics of an assessment on the test set, by form of Γ and metric.
+
+    "FORM.k0" are those of first rows alone; "unknown" is the share of "don't know".
+
+    Args:
+        assessment: The assessment.
+        test: The test set.
+    """
+    segments = test.segments
+    is_plain = not assessment.parameters.is_sharpened and test.episodes.info.variation == "nominal"
+    result = assessment.predict(
+        segments.true_state if is_plain else segments.state,
+        segments.desired_preview,
+        segments.features if assessment.uses_features else None,
+    )
+    unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
+    found = {}
+    for name, published in PUBLISHED.items():
+        unsafe, label = 1.0 - published(result), segments.is_unsafe
+        found[name] = _metrics(unsafe, label) | {"unknown": float(unknown.mean())}
+        found[f"{name}.k0"] = _metrics(unsafe[segments.is_first], label[segments.is_first])
+    return found
+
+
+def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
+    def share(is_right: np.ndarray, rows: np.ndarray) -> float:
+        return float(is_right[rows].mean()) if rows.any() else math.nan
+
+    return {
+        "brier": float(np.mean((unsafe - label) ** 2)),
+        "auc": area_under_curve(unsafe, label),
+        "unsafe_recall": share(unsafe > 1.0 - THRESHOLD, label),
+        "safe_recall": share(unsafe <= 1.0 - THRESHOLD, ~label),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pool:
+    """Feedback and the test set on which it is judged, with seeds of their own.
+
+    Attributes:
+        feedback: Feedback sets.
+        test: Fresh actual episodes.
+    """
+
+    feedback: Sequence[FeedbackSet]
+    test: TestSet
+
+
+def pool_estimates(
+    assessment: SafetyAssessment,
+    pools: Sequence[Pool],
+    *,
+    sizes: Sequence[int] = SIZES,
+    baselines: Mapping[str, SafetyAssessment] | None = None,
+    progress: StageProgress | None = None,
+) -> dict[str, Estimate]:
+    """Evaluates an assessment before and after feedback, on independent pools.
+
+    Orders of one pool would vary less than other feedback of the same robot does.
+
+    Args:
+        assessment: The assessment before feedback.
+        pools: Feedback, of which the first N sets are used, each with a test set.
+        sizes: The N; those above the number of sets are left out.
+        baselines: Other assessments by name.
+        progress: Called with a stage, the number done and the number wanted.
+
+    Returns:
+        By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior", "adapted N" or the name of a
+        baseline, the mean over pools, with minimum and maximum as interval. "gap" is the share of
+        pairs that differ, `pools_won` that of pools in which the Brier score is better than the
+        prior's, `gap_closed` that of the distance from the prior to "oracle".
+
+    Raises:
+        ValueError: There is less feedback than the smallest N.
+    """
+    least = min(len(pool.feedback) for pool in pools)
+    sizes = [size for size in sizes if size <= least]
+    if not sizes:
+        raise ValueError(f"adaptation study: there are only {least} feedback sets")
+    found: dict[str, list[dict[str, dict[str, float]]]] = {}
+    stage = f"{assessment.parameters.mode}: pools of feedback"
+    for i, pool in enumerate(pools):
+        for name, one in {"prior": assessment, **(baselines or {})}.items():
+            found.setdefault(name, []).append(scores(one, pool.test))
+        for k, size in enumerate(sizes):
+            adapted = assessment.adapt(pool.feedback[:size])
+            found.setdefault(f"adapted {size}", []).append(scores(adapted, pool.test))
+            if progress is not None:
+                progress(stage, i * len(sizes) + k + 1, len(pools) * len(sizes))
+    num_test = sum(len(pool.test.episodes) for pool in pools)
+    everything = [one for pool in pools for one in pool.feedback]
+    estimates = {"gap": proportion(sum(one.differs for one in everything), len(everything))}
+    for form in found["prior"][0]:
+        for who, of_pools in found.items():
+            for metric in of_pools[0][form]:
+                values = [one[form][metric] for one in of_pools]
+                estimates[f"{form}.{who}.{metric}"] = Estimate(
+                    float(np.mean(values)), min(values), max(values), num_test
+                )
+        brier = {who: np.array([p[form]["brier"] for p in ps]) for who, ps in found.items()}
+        before = brier["prior"]
+        for who in (f"adapted {size}" for size in sizes):
+            won = proportion(int(np.sum(brier[who] < before)), len(pools))
+            estimates[f"{form}.{who}.pools_won"] = won
+            if "oracle" in brier:
+                gap = np.mean(before) - np.mean(brier["oracle"])
+                share = float(np.mean(before - brier[who]) / gap) if gap > 0.0 else math.nan
+                estimates[f"{form}.{who}.gap_closed"] = Estimate.exact(share, num_test)
+    return estimates
+
+
+def train_baselines(
+    assessment: SafetyAssessment,
+    episodes: Mapping[str, Episodes],
+    *,
+    num_workers: int | None = None,
+    progress: StageProgress | None = None,
+) -> dict[str, SafetyAssessment]:
+    """Trains assessments from scratch on actual episodes, with the parameters of the prior.
+
+    Those with too few episodes for t-SNE are left out.
+
+    Args:
+        assessment: The assessment before feedback.
+        episodes: Training episodes by name.
+        num_workers: Number of worker processes.
+        progress: Called with a stage, the number done and the number wanted.
+    """
+    baselines: dict[str, SafetyAssessment] = {}
+    # The largest first, so that no worker is left with it at the end.
+    wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
+    arguments = [(name, assessment, one) for name, one in wanted]
+    for done, (name, baseline) in enumerate(parallel_map(_learned, arguments, num_workers)):
+        if baseline is not None:
+            baselines[name] = baseline
+        if progress is not None:
+            progress("learning from scratch", done + 1, len(arguments))
+    return {name: baselines[name] for name in episodes if name in baselines}
+
+
+def _learned(
+    name: str, assessment: SafetyAssessment, episodes: Episodes
+) -> tuple[str, SafetyAssessment | None]:
+    parameters = copy.deepcopy(assessment.parameters)
+    try:
+        return name, SafetyAssessment(parameters).fit(episodes)
+    except ValueError:
+        return name, None
+
+
+def losses(
+    prior: SafetyAssessment, feedback: Sequence[FeedbackSet], learned: Episodes, test: TestSet
+) -> dict[str, Estimate]:
+    """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
+
+    - "x": gradient boosting on x, trained on many actual episodes.
+    - "psi": share of unsafe ends among the nearest segments of these episodes in the embedding.
+    - "grid": share of unsafe ends among their segments in the same cell.
+    - "update": the grid after the paper's update from the feedback.
+    - "update_without_gpr": the same without discrepancy function.
+
+    The differences between steps are the losses of Ψ, of the grid and of the update. For an
+    ensemble, "psi" and "grid" are those of the first map.
+
+    Args:
+        prior: The assessment before feedback.
+        feedback: All feedback.
+        learned: Many actual episodes, other than the fresh ones.
+        test: The fresh episodes.
+
+    Raises:
+        ValueError: All actual episodes have the same end.
+    """
+    from sklearn.neighbors import KNeighborsClassifier
+
+    parameters = prior.parameters
+    known = split(learned, stride=1, discount=1.0, shortest=parameters.shortest)
+    judged = test.segments
+    boosting = DirectClassifier(
+        "gradient_boosting", uses_features=prior.uses_features, shortest=parameters.shortest
+    ).fit(learned)
+    here, there = (
+        prior.predict(
+            one.state, one.desired_preview, one.features if prior.uses_features else None
+        ).embedding
+        for one in (judged, known)
+    )
+    neighbours = KNeighborsClassifier(min(NUM_NEIGHBOURS, len(known)))
+    neighbours.fit(there, known.is_unsafe.astype(int))
+    share = neighbours.predict_proba(here)[:, 1]
+    cells, own = prior.grid_.locate(there), prior.grid_.locate(here)
+    inside = cells >= 0
+    count = np.bincount(cells[inside], minlength=prior.grid_.num_cells)
+    unsafe = np.bincount(cells[inside], known.is_unsafe[inside], minlength=prior.grid_.num_cells)
+    overall = known.is_unsafe.mean()
+    by_cell = np.divide(unsafe, count, out=np.full(len(count), overall), where=count > 0)
+    without_gpr = copy.copy(prior)
+    without_gpr.parameters = copy.deepcopy(parameters)
+    without_gpr.parameters.adaptation.gate = 0.0
+    probability = {
+        "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),
+        "psi": share,
+        "grid": np.where(own >= 0, by_cell[own], overall),
+        "update": test.unsafe_score(prior.adapt(feedback, method="paper")),
+        "update_without_gpr": test.unsafe_score(without_gpr.adapt(feedback, method="paper")),
+    }
+    found = {}
+    for name in STEPS:
+        value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
+        found[f"{name}.brier"] = Estimate.exact(value, len(test.episodes))
+    return found

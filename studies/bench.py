@@ -38,7 +38,10 @@ def read_run(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: The file holds no figures of benchmarks.
     """
-    content = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
     figures = content.get("figures") if isinstance(content, dict) else None
     if (
         not isinstance(figures, list)

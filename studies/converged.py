@@ -4,31 +4,15 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from functools import partial
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    ScenarioArgument,
-    TrainingOption,
-    WorkersOption,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-    versions,
-)
-from drake_safety.cli.training_folder import (
-    check_fresh,
-    feedback_folder,
-    load_assessment,
-    run_fresh_episodes,
-)
+from drake_safety.cli.adapt import paired_episodes
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
-from drake_safety.evaluation.plan_study import PROMISED_UNSAFE_RECALL
-from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
@@ -38,44 +22,30 @@ from drake_safety.learning.feedback import FeedbackSet, feedback_sets
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair
-from drake_safety.simulation.feedback import run_pairs
-from drake_safety.simulation.scenario import load_scenario
-from studies import command_line
-
-CONVERGED_FILE = "converged.json"
+from studies.harness import CalibrationOption, EpisodesOption, SeedOption, open_study
 
 
 def converged(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    calibration_episodes: Annotated[
-        int, typer.Option(help="Other ones, for thresholds and as nominal feedback.", min=20)
-    ] = 300,
+    episodes: EpisodesOption = 1000,
+    calibration_episodes: CalibrationOption = 300,
     throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
     pairs: Annotated[
         int, typer.Option(help="Pairs of the actual plant, the feedback before throws.", min=0)
     ] = 160,
-    seed: Annotated[int, typer.Option(help="First seed of the fresh ones.")] = EVALUATION.first,
+    seed: SeedOption = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Evaluate the paper's mode at its threshold 0.6, before and after its adaptation.
 
-    Nominal episodes are judged after feedback from other nominal episodes, throws at the actual
-    plant after feedback from it. Writes ASSESSMENT/converged.json.
+    Nominal episodes are judged after feedback from other nominal episodes, those for thresholds,
+    throws at the actual plant after feedback from it. Writes ASSESSMENT/converged.json.
     """
-    loaded = load_scenario(scenario)
-    loop = loaded.make_loop()
-    prior = load_assessment(assessment, "paper")
-    seeds = EVALUATION.seeds(seed)
-    check_fresh(prior, loaded, seeds.values())
-    with open_stages() as stages:
-        test, other = (
-            run_fresh_episodes(
-                loaded, assessment, count, seeds[purpose], partial(stages, purpose), workers
-            )
-            for purpose, count in (("evaluation", episodes), ("thresholds", calibration_episodes))
-        )
+    with open_study("converged", scenario, assessment, seed=seed, workers=workers) as study:
+        prior = study.load("paper")
+        loop, stages = study.scenario.make_loop(), study.stages
+        test, other = study.fresh(episodes), study.fresh(calibration_episodes, "thresholds")
         feedback = nominal_feedback(prior, other)
         adapted = prior.adapt(feedback, method="paper")
         rules = judged_rules(prior, adapted)
@@ -83,21 +53,19 @@ def converged(
         for name, gamma in {"adapted": adapted, "discrepancy": prior_alone}.items():
             rules[name] = (share_scorer(name, gamma), PAPER_THRESHOLD)
         fair = np.array([isinstance(loop, HasGoals) and is_fair(loop, one) for one in test])
-        estimates = recalls(rules, other, test, fair)
+        study.add("converged", recalls(rules, other, test, fair))
+        study.entries |= {
+            "training_episodes": prior.used_[0].num_episodes,
+            "feedback_episodes": calibration_episodes,
+            "feedback_pairs": pairs,
+        }
         if throws:
-            run = run_pairs(
-                loaded,
-                pairs,
-                seed=ADAPTATION.first,
-                num_workers=workers,
-                path=feedback_folder(
-                    assessment, loaded.simulation_hash("actual"), ADAPTATION.first
-                ),
-                progress=partial(stages, "pairs"),
+            run = paired_episodes(
+                study.scenario, pairs, "actual", ADAPTATION.first, assessment, workers, stages
             )
             literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
-            study = evaluate_throws(
-                loaded,
+            thrown, _ = evaluate_throws(
+                study.scenario,
                 [
                     TriggerRule(
                         name=name,
@@ -107,29 +75,11 @@ def converged(
                     for name, one in literal.items()
                 ],
                 num_throws=throws,
-                num_calibration=0,
-                seed=seeds["disturbances"],
-                calibration_seed=seeds["disturbance thresholds"],
+                seed=study.seeds["disturbances"],
                 num_workers=workers,
                 progress=stages,
             )
-            estimates |= study.estimates
-    entries = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "seed": seed,
-        "training_episodes": prior.used_[0].num_episodes,
-        "feedback_episodes": calibration_episodes,
-        "feedback_pairs": pairs,
-        "versions": versions(),
-    }
-    file = assessment / CONVERGED_FILE
-    Results({f"converged.{key}": one for key, one in estimates.items()}, entries).write(file)
-    table = new_table("figure", "value", "interval", "n")
-    for key, one in estimates.items():
-        table.add_row(key, f"{one.value:.3f}", f"{one.low:.3f} to {one.high:.3f}", f"{one.n}")
-    console.print(table)
-    print_path("figures", file)
+            study.add("converged", thrown)
 
 
 def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[FeedbackSet]:

@@ -6,36 +6,28 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    ScenarioArgument,
-    TrainingOption,
-    WorkersOption,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-    versions,
-)
-from drake_safety.cli.training_folder import episodes_folder, run_fresh_episodes
-from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Results
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.cli.training_folder import episodes_folder
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
-from drake_safety.simulation.scenario import Scenario, load_scenario
-from studies import command_line
+from drake_safety.simulation.scenario import Scenario
 from studies.converged import judged_rules, nominal_feedback, recalls
-from studies.learning_curve import parse_sizes
-
-READINGS_FILE = "readings.json"
+from studies.harness import (
+    CalibrationOption,
+    EpisodesOption,
+    SeedOption,
+    Study,
+    open_study,
+    parse_sizes,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,119 +139,82 @@ def readings(
     train_episodes: Annotated[
         int, typer.Option(help="Training episodes of each reading.", min=64)
     ] = 1024,
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 400,
-    calibration_episodes: Annotated[
-        int, typer.Option(help="Other ones, for thresholds and as nominal feedback.", min=20)
-    ] = 200,
+    episodes: EpisodesOption = 400,
+    calibration_episodes: CalibrationOption = 200,
     sizes: Annotated[
         str, typer.Option(help="Numbers of episodes for the default reading, such as '512,2048'.")
     ] = "",
     only: Annotated[str, typer.Option(help="Part of the names of the readings.")] = "",
-    seed: Annotated[int, typer.Option(help="First seed of the fresh ones.")] = EVALUATION.first,
+    seed: SeedOption = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Train the paper's mode under every reading, and judge it on fresh episodes.
 
+    The episodes for thresholds are its nominal feedback too.
     Episodes of readings with data of their own are kept in ASSESSMENT/readings. Writes
     ASSESSMENT/readings.json.
     """
-    loaded = load_scenario(scenario)
-    loaded.assessment.mode = "paper"
-    chosen = [one for one in readings_of(loaded) if only in one.name]
-    chosen += [
-        Reading(name=f"default, {size} episodes", num_episodes=size) for size in parse_sizes(sizes)
-    ]
-    if not chosen:
-        names = [one.name for one in readings_of(loaded)]
-        raise ValueError(f"--only '{only}': no reading of this name; they are {names}")
-    found: dict[str, dict[str, Estimate]] = {}
-    with open_stages() as stages:
+    with open_study("readings", scenario, assessment, seed=seed, workers=workers) as study:
+        base = study.scenario.assessment = replace(study.scenario.assessment, mode="paper")
+        readings = readings_of(study.scenario)
+        chosen = [one for one in readings if only in one.name]
+        chosen += [
+            Reading(name=f"default, {size} episodes", num_episodes=size)
+            for size in parse_sizes(sizes)
+        ]
+        if not chosen:
+            names = [one.name for one in readings]
+            raise ValueError(f"--only '{only}': no reading of this name; they are {names}")
         for position, reading in enumerate(chosen):
-            stages("readings", position, len(chosen))
-            sets = _EpisodeSets(loaded, assessment, reading, seed, workers, stages)
+            study.stages("readings", position, len(chosen))
+            sets = _EpisodeSets(study, reading)
             train = sets.training(reading.num_episodes or train_episodes)
-            test = sets.fresh("evaluation", episodes)
-            calibration = sets.fresh("thresholds", calibration_episodes)
-            learned = SafetyAssessment(reading.parameters(loaded.assessment)).fit(train)
+            test = sets.fresh(episodes, "evaluation")
+            calibration = sets.fresh(calibration_episodes, "thresholds")
+            learned = SafetyAssessment(reading.parameters(base)).fit(train)
             adapted = learned.adapt(nominal_feedback(learned, calibration), method="paper")
             rules = judged_rules(learned, adapted)
             # A promised miss rate takes more calibration episodes than the others need.
             del rules["conformal"]
             never = np.zeros(len(test), dtype=bool)
-            found[reading.name] = recalls(rules, calibration, test, never)
-        stages("readings", len(chosen), len(chosen))
-    file = assessment / READINGS_FILE
-    entries = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "seed": seed,
-        "training_episodes": train_episodes,
-        "versions": versions(),
-        "names": [one.name for one in chosen],
-    }
-    rows = {
-        f"readings.{position}.{key}": estimate
-        for position, one in enumerate(chosen)
-        for key, estimate in found[one.name].items()
-    }
-    Results(rows, entries).write(file)
-    columns = [f"{kind}.normalized.auc" for kind in ("segments", "first")]
-    columns += [
-        f"first.{rule}.{label}_recall"
-        for rule in ("normalized", "converged")
-        for label in ("safe", "unsafe")
-    ]
-    table = new_table("reading", *columns)
-    for name, estimates in found.items():
-        table.add_row(name, *(f"{estimates[key].value:.3f}" for key in columns))
-    console.print(table)
-    print_path("figures", file)
+            study.add(f"readings.{position}", recalls(rules, calibration, test, never))
+        study.entries |= {
+            "training_episodes": train_episodes,
+            "names": [one.name for one in chosen],
+        }
 
 
 class _EpisodeSets:
     """Episodes of a reading; those without changes are shared with `train` and `evaluate`."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        folder: Path,
-        reading: Reading,
-        seed: int,
-        workers: int | None,
-        stages: Any,
-    ):
-        self._folder, self._reading = folder, reading
-        self._is_own = reading.has_own_episodes(scenario.assessment)
-        self._scenario = reading.scenario(scenario) if self._is_own else scenario
-        self._seeds, self._workers, self._stages = EVALUATION.seeds(seed), workers, stages
+    def __init__(self, study: Study, reading: Reading):
+        self._study, self._reading = study, reading
+        self._is_own = reading.has_own_episodes(study.scenario.assessment)
+        self._scenario = reading.scenario(study.scenario) if self._is_own else study.scenario
 
     def training(self, count: int) -> Episodes:
         """The first training episodes."""
-        options = self._scenario.task_class().paper_options
-        if not self._is_own:
+        if self._is_own:
+            options = self._scenario.task_class().paper_options
+            episodes = self._run("training", count, 0, options)
+        else:
             mode = "sharpened" if self._reading.is_exploring else "paper"
-            episodes = load_episodes(episodes_folder(self._folder, mode))
+            folder = episodes_folder(self._study.folder, mode)
+            episodes = load_episodes(folder)[:count]
             if len(episodes) < count:
                 raise ValueError(
-                    f"readings: {episodes_folder(self._folder, mode)} holds {len(episodes)} "
-                    f"episodes, expected at least {count}: train with more"
+                    f"readings: {folder} holds {len(episodes)} episodes, expected at least "
+                    f"{count}: train with more"
                 )
-        else:
-            episodes = self._run("training", count, 0, options)
         info = replace(episodes.info, scenario_hash=self._scenario.simulation_hash())
-        return Episodes(info, list(episodes[:count]))
+        return Episodes(info, list(episodes))
 
-    def fresh(self, purpose: str, count: int) -> Episodes:
+    def fresh(self, count: int, purpose: str) -> Episodes:
         """Fresh episodes, as `evaluate` draws them."""
-        seed = self._seeds[purpose]
-        if self._is_own:
-            options = self._scenario.task_class().judging_options
-            return self._run(purpose, count, seed, options)
-        progress = partial(self._stages, f"episodes, {purpose}")
-        episodes = run_fresh_episodes(
-            self._scenario, self._folder, count, seed, progress, self._workers
-        )
-        return Episodes(episodes.info, list(episodes[:count]))
+        if not self._is_own:
+            return self._study.fresh(count, purpose)
+        options = self._scenario.task_class().judging_options
+        return self._run(purpose, count, self._study.seeds[purpose], options)
 
     def _run(self, what: str, count: int, seed: int, options: dict[str, Any]) -> Episodes:
         own = f"{self._scenario.simulation_hash()[:12]}-{what}-{seed}"
@@ -267,9 +222,9 @@ class _EpisodeSets:
             self._scenario,
             count,
             seed=seed,
-            num_workers=self._workers,
-            path=self._folder / "readings" / own,
-            progress=partial(self._stages, f"episodes, {what}"),
+            num_workers=self._study.workers,
+            path=self._study.folder / "readings" / own,
+            progress=partial(self._study.stages, f"episodes, {what}"),
             **options,
         )
-        return Episodes(episodes.info, list(episodes[:count]))
+        return episodes[:count]

@@ -2,45 +2,39 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import multiprocessing
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    ScenarioArgument,
-    TrainingOption,
-    WorkersOption,
-    console,
-    interval,
-    new_table,
-    open_stages,
-    print_path,
-    versions,
-)
-from drake_safety.cli.training_folder import MODES, episodes_folder, run_fresh_episodes
-from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.metrics import Estimate, auc, auc_difference
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, versions
+from drake_safety.cli.training_folder import MODES, episodes_folder
+from drake_safety.evaluation.metrics import Estimate, auc
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.learning.training import segments_for
 from drake_safety.simulation.dataset import load_episodes
-from drake_safety.simulation.scenario import load_scenario
-from studies import command_line
-from studies.learning_curve import parse_sizes
-from studies.scale_figure import STAGES, scale_figure
+from studies.baselines import auc_difference
+from studies.harness import (
+    Arrays,
+    EpisodesOption,
+    SeedOption,
+    fingerprint,
+    kept,
+    open_study,
+    parse_sizes,
+)
 
-SCALE_FILE = "scale.json"
+STAGES = ("distances", "t-SNE", "training", "rest")
+"""Stages of learning: those of `SafetyAssessment.fit`, the short ones together."""
 
 
 def scale(
@@ -51,66 +45,69 @@ def scale(
     ] = "5000,20000,50000,100000,200000",
     exact: Annotated[str, typer.Option(help="Those learned with exact neighbours too.")] = "",
     mode: Annotated[str, typer.Option(help="The mode.")] = "paper",
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes for the AUC.")] = 600,
-    seed: Annotated[int, typer.Option(help="First seed of the fresh ones.")] = EVALUATION.first,
+    episodes: EpisodesOption = 600,
+    seed: SeedOption = EVALUATION.first,
     workers: WorkersOption = None,
 ) -> None:
     """Learn from more and more segments: CPU time by stage, peak memory, size of the file, AUC.
 
     Every size is learned in a fresh process from the first episodes of ASSESSMENT that have so many
-    segments. Adds to ASSESSMENT/scale.json, and draws it; a stopped study continues.
+    segments, and kept there: a stopped study continues. Writes ASSESSMENT/scale.json and its plot.
     """
     if mode not in MODES:
         raise ValueError(f"scale: mode must be one of {list(MODES)}; got '{mode}'")
-    loaded = load_scenario(scenario)
-    parameters = dataclasses.replace(loaded.assessment, mode=mode)
-    path = episodes_folder(assessment, mode)
-    wanted = [(size, False) for size in parse_sizes(sizes)]
-    wanted += [(size, True) for size in parse_sizes(exact)]
-    counts = counts_for({size for size, _ in wanted}, load_episodes(path), parameters)
-    file = assessment / SCALE_FILE
-    rows = json.loads(file.read_text(encoding="utf-8"))["rows"] if file.is_file() else {}
-    with open_stages() as stages:
-        fresh = run_fresh_episodes(
-            loaded, assessment, episodes, seed, partial(stages, "fresh nominal episodes"), workers
+    with open_study(
+        "scale",
+        scenario,
+        assessment,
+        seed=seed,
+        workers=workers,
+        plotted=lambda row: row.metric in ("ms a segment", "peak GB", "auc"),
+    ) as study:
+        parameters = replace(study.scenario.assessment, mode=mode)
+        path = episodes_folder(assessment, mode)
+        training = load_episodes(path)
+        methods = {"": parameters, " exact": replace(parameters, candidates_per_neighbour=0)}
+        wanted = [(size, "") for size in parse_sizes(sizes)]
+        wanted += [(size, " exact") for size in parse_sizes(exact)]
+        counts = counts_for({size for size, _ in wanted}, training, parameters)
+        fresh = study.fresh(episodes)
+        rows = kept(
+            assessment / f"scale/{fingerprint(parameters, training.info, fresh.info, versions())}",
+            {
+                f"{mode} {size}{which}": (methods[which], path, counts[size], fresh)
+                for size, which in wanted
+            },
+            _in_fresh_process,
+            workers=1,
+            progress=lambda done, total: study.stages("sizes", done, total),
         )
-        for done, (size, is_exact) in enumerate(wanted):
-            stages("sizes", done, len(wanted))
-            key = f"{mode} {size}{' exact' if is_exact else ''}"
-            if key not in rows:
-                row = _in_fresh_process(parameters, path, counts[size], is_exact, fresh)
-                rows[key] = {"mode": mode, "is_exact": is_exact, **row}
-                _write(file, loaded.name, seed, rows)
-        stages("sizes", len(wanted), len(wanted))
-    chosen = {key: row for key, row in rows.items() if row["mode"] == mode}
-    segments = split(fresh, stride=1, discount=1.0)
-    table = new_table("segments", "episodes", *STAGES, "ms each", "GB", "file, MB", "AUC", "k = 0")
-    for row in sorted(chosen.values(), key=lambda row: (row["segments"], row["is_exact"])):
-        cpu_s = row["cpu_s"]
-        table.add_row(
-            f"{row['segments']}{' (exact)' if row['is_exact'] else ''}",
-            f"{row['episodes']}",
-            *(f"{cpu_s[stage]:.0f}" for stage in STAGES),
-            f"{1e3 * sum(cpu_s.values()) / row['segments']:.1f}",
-            f"{row['peak_gb']:.2f}",
-            f"{row['file_mb']:.1f}",
-            *(interval(one) for one in _areas(segments, np.array(row["score"]))),
+        segments = split(fresh, stride=1, discount=1.0)
+        for name, row in rows.items():
+            study.add(f"costs.{name}", row_estimates(row))
+            approximate = rows.get(name.removesuffix(" exact"), row)
+            for set_, part in (("segments", slice(None)), ("k0", segments.is_first)):
+                study.add(f"{set_}.{name}", _areas(segments, part, row, approximate))
+
+
+def row_estimates(row: Arrays) -> dict[str, Estimate]:
+    """What a size costs: CPU time by stage [s] and a segment [ms], peak memory, file [MB]."""
+    num = int(row["segments"])
+    costs = dict(zip((f"{stage} s" for stage in STAGES), row["cpu_s"], strict=True))
+    costs |= {"ms a segment": 1e3 * row["cpu_s"].sum() / num, "segments": num}
+    costs |= {"peak GB": row["peak_gb"], "file MB": row["file_mb"]}
+    return {name: Estimate.exact(float(cost), int(row["episodes"])) for name, cost in costs.items()}
+
+
+def _areas(segments: Segments, part: Any, row: Arrays, other: Arrays) -> dict[str, Estimate]:
+    """AUC, and that with approximate neighbours minus it, where the row has exact ones."""
+    truth = segments.is_unsafe[part], segments.episode[part]
+    found = {"auc": auc(row["score"][part], *truth)}
+    if other is not row:
+        found["approximate minus exact"] = auc_difference(
+            other["score"][part], row["score"][part], *truth
         )
-    console.print(table)
-    for key, row in chosen.items():
-        other = chosen.get(key.removesuffix(" exact"))
-        if row["is_exact"] and other is not None:
-            for what, part in (("segments", slice(None)), ("k = 0", segments.is_first)):
-                found = auc_difference(
-                    np.array(other["score"])[part],
-                    np.array(row["score"])[part],
-                    segments.is_unsafe[part],
-                    segments.episode[part],
-                )
-                console.print(f"{row['segments']}, {what}: AUC - exact AUC {interval(found)}")
-    print_path("figures", file)
-    for picture in save(scale_figure(list(chosen.values())), assessment / f"scale_{mode}"):
-        print_path("picture", picture)
+    return found
 
 
 def counts_for(
@@ -137,25 +134,7 @@ def counts_for(
     return {size: int(np.searchsorted(total, size)) + 1 for size in sizes}
 
 
-def _areas(segments: Segments, score: np.ndarray) -> list[Estimate]:
-    return [
-        auc(score[part], segments.is_unsafe[part], segments.episode[part])
-        for part in (slice(None), segments.is_first)
-    ]
-
-
-def _write(file: Path, scenario: str, seed: int, rows: dict[str, Any]) -> None:
-    report = {
-        "command": command_line(),
-        "scenario": scenario,
-        "seed": seed,
-        "versions": versions(),
-        "rows": rows,
-    }
-    file.write_text(json.dumps(report) + "\n", encoding="utf-8")
-
-
-def _in_fresh_process(*arguments: Any) -> dict[str, Any]:
+def _in_fresh_process(*arguments: Any) -> Arrays:
     # Peak memory is that of a process.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
@@ -163,23 +142,20 @@ def _in_fresh_process(*arguments: Any) -> dict[str, Any]:
 
 
 def learned_row(
-    parameters: AssessmentParameters, path: Path, count: int, is_exact: bool, fresh: Episodes
-) -> dict[str, Any]:
+    parameters: AssessmentParameters, path: Path, count: int, fresh: Episodes
+) -> Arrays:
     """Learns from the first episodes of a folder, and judges fresh ones.
 
     Args:
         parameters: Parameters of the assessment.
         path: The folder.
         count: Number of episodes.
-        is_exact: Whether all pairs of segments are compared.
         fresh: Fresh episodes.
 
     Returns:
-        "segments", "episodes", "cpu_s" by stage, "peak_gb" of this process, "file_mb", and
+        "segments", "episodes", "cpu_s" of the `STAGES`, "peak_gb" of this process, "file_mb", and
         "score", the unsafe score of every segment of the fresh episodes.
     """
-    if is_exact:
-        parameters = dataclasses.replace(parameters, candidates_per_neighbour=0)
     training = load_episodes(path)[:count]
     cpu_s = dict.fromkeys(STAGES, 0.0)
     last = time.process_time()
@@ -201,11 +177,12 @@ def learned_row(
         if line.startswith("VmHWM")
     )
     scorer = assessment_scorer(parameters.mode, learned)
-    return {
+    row = {
         "segments": len(segments_for(training, parameters)[0]),
         "episodes": count,
-        "cpu_s": cpu_s,
+        "cpu_s": list(cpu_s.values()),
         "peak_gb": int(peak) / 1024**2,
         "file_mb": size / 1e6,
-        "score": scorer.unsafe_score(split(fresh, stride=1, discount=1.0)).round(6).tolist(),
+        "score": scorer.unsafe_score(split(fresh, stride=1, discount=1.0)),
     }
+    return {name: np.asarray(value) for name, value in row.items()}

@@ -3,98 +3,48 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    ScenarioArgument,
-    console,
-    interval,
-    new_table,
-    open_stages,
-    print_path,
-)
-from drake_safety.cli.training_folder import MODES, episodes_folder, load_assessment
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.diagrams.walking_parameters import BRANCHES
-from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.scorers import classifier_scorers
-from drake_safety.files.progress import StageProgress
+from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
+from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import load_episodes
-from drake_safety.simulation.scenario import Scenario, load_scenario
-from studies import command_line
-from studies.walking_alarms import (
-    alarm_estimates,
-    alarm_thresholds,
-    guard_estimates,
-    recovery_estimates,
-    speed_estimates,
-    tour_estimates,
-    walking_alarms,
+from drake_safety.simulation.scenario import Scenario
+from studies.alarms import (
+    Alarm,
+    WatchedMotion,
+    first_alarm,
+    lowest_value,
+    scorer_alarm,
+    threshold_alarms,
 )
+from studies.baselines import classifier_scorers
+from studies.harness import open_study
 from studies.walking_motions import WalkedMotion, run_motions
 
-WALKING_FILE = "walking.json"
-TOUR_S, _PUSHED_S, _COMMANDED_S, _SPEED_S = 60.0, 5.0, 4.0, 12.0
+EARLY_S = 0.2
+"""Time before a fall that an alarm should leave [s]."""
+_LEAST = 1e-6  # Of a probability and its complement, in logits.
+_DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
+_SPEED_S = 12.0
 _SEEDS = {"calibration": 6_000_000, "tour": 6_000_001, "push": 6_000_002, "command": 6_000_004}
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Motions:
-    """Sets of motions of one plant, kept in a folder."""
-
-    scenario: Scenario
-    assessment: SafetyAssessment
-    variation: str
-    folder: Path
-    stages: StageProgress
-
-    def run(
-        self,
-        kind: str,
-        indices: Sequence[int],
-        duration_s: float,
-        *,
-        seeds: str = "",
-        variation: str = "",
-        branch: str = "",
-        is_guarded: bool = False,
-    ) -> list[WalkedMotion]:
-        scenario, plant = self.scenario, variation or self.variation
-        seeds = seeds or kind
-        options: dict[str, Any] = {}
-        if is_guarded:
-            options["guard"] = True
-        if branch:
-            options["recovery"] = True
-            recovery = replace(scenario.parameters.recovery, branch=branch)
-            scenario = copy.copy(scenario)
-            scenario.parameters = replace(scenario.parameters, recovery=recovery)
-        name = "-".join(filter(None, (seeds, plant, branch, "guard" if is_guarded else "")))
-        return run_motions(
-            scenario,
-            kind,
-            indices,
-            seed=_SEEDS[seeds],
-            duration_s=duration_s,
-            folder=self.folder / f"{scenario.simulation_hash(plant)[:12]}-{_SEEDS[seeds]}-{name}",
-            variation=plant,
-            assessment=self.assessment if options else None,
-            options=options,
-            progress=partial(self.stages, name),
-        )
 
 
 def walking(
     scenario: ScenarioArgument,
-    assessment: Annotated[Path, typer.Option(help="Folder written by train.")],
+    assessment: TrainingOption,
     tours: Annotated[int, typer.Option(help="Undisturbed tours of a minute.", min=1)] = 300,
     calibration_tours: Annotated[
         int, typer.Option(help="Others, on which thresholds are chosen.", min=1)
@@ -107,6 +57,7 @@ def walking(
     ] = 150,
     speeds: Annotated[int, typer.Option(help="Commands simulated in MuJoCo too.", min=0)] = 20,
     variation: Annotated[str, typer.Option(help="The plant.")] = "nominal",
+    workers: WorkersOption = None,
 ) -> None:
     """Judge a walking robot: falls on tours, alarms on pushes, guard, recovery, MuJoCo.
 
@@ -114,57 +65,267 @@ def walking(
     Motions are kept in ASSESSMENT/walking: a stopped study continues. With more tours, only those
     are simulated that are not there yet.
     """
-    loaded = load_scenario(scenario)
-    gamma = load_assessment(assessment, MODES[0])
-    estimates: dict[str, Estimate] = {}
-    with open_stages() as stages:
-        sets = _Motions(
-            scenario=loaded,
-            assessment=gamma,
-            variation=variation,
-            folder=assessment / "walking",
-            stages=stages,
-        )
+    with open_study("walking", scenario, assessment, workers=workers) as study:
+        walker, gamma = study.scenario, study.load(MODES[0], [])
+
+        def run(
+            kind: str,
+            indices: Sequence[int],
+            seeds: str = "",
+            plant: str = variation,
+            branch: str = "",
+            duration_s: float = 0.0,
+            **options: Any,
+        ) -> list[WalkedMotion]:
+            which = walker
+            if branch:
+                options["recovery"] = True
+                recovery = replace(walker.parameters.recovery, branch=branch)
+                which = copy.copy(walker)
+                which.parameters = replace(walker.parameters, recovery=recovery)
+            seed = _SEEDS[seeds or kind]
+            name = "-".join(filter(None, (seeds or kind, plant, branch, *options)))
+            return run_motions(
+                which,
+                kind,
+                indices,
+                seed=seed,
+                duration_s=duration_s or _DURATIONS_S[kind],
+                folder=assessment / f"walking/{which.simulation_hash(plant)[:12]}-{seed}-{name}",
+                variation=plant,
+                assessment=gamma if options else None,
+                options=options,
+                num_workers=workers,
+                progress=partial(study.stages, name),
+            )
+
         train_set = load_episodes(episodes_folder(assessment))
-        alarms = walking_alarms(loaded, gamma, classifier_scorers(train_set, stages))
-        calm = sets.run("tour", range(calibration_tours), TOUR_S, seeds="calibration")
+        alarms = walking_alarms(walker, gamma, classifier_scorers(train_set, study.stages))
+        calm = run("tour", range(calibration_tours), "calibration")
         thresholds = alarm_thresholds(alarms, calm)
-        pushed = sets.run("push", range(pushes), _PUSHED_S)
-        estimates |= alarm_estimates(
-            alarms, thresholds, pushed, loaded.parameters.random_pushes.duration_s
-        )
+        study.entries |= {
+            "variation": variation,
+            "seeds": _SEEDS,
+            "assessment_sha256": file_hash(assessment_file(assessment, MODES[0])),
+            "thresholds": thresholds,
+        }
+        pushed = run("push", range(pushes))
+        push_s = walker.parameters.random_pushes.duration_s
+        study.rows |= alarm_estimates(alarms, thresholds, pushed, push_s)
         if recovered:
             fallen = [m.index for m in pushed if m.fall_time_s >= m.push_time_s and m.has_fallen]
             fallen = fallen[:recovered]
             alone = [motion for motion in pushed if motion.index in set(fallen)]
             for branch in BRANCHES:
-                again = sets.run("push", fallen, _PUSHED_S, branch=branch)
-                estimates |= recovery_estimates(branch, alone, again)
+                again = run("push", fallen, branch=branch)
+                study.rows |= recovery_estimates(branch, alone, again)
         if commands:
-            unguarded = sets.run("command", range(commands), _COMMANDED_S)
-            guarded = sets.run("command", range(commands), _COMMANDED_S, is_guarded=True)
-            inside = sets.run("tour", range(guarded_tours), TOUR_S, is_guarded=True)
-            estimates |= guard_estimates(unguarded, guarded, inside)
+            unguarded = run("command", range(commands))
+            guarded = run("command", range(commands), guard=True)
+            inside = run("tour", range(guarded_tours), guard=True)
+            study.rows |= guard_estimates(unguarded, guarded, inside)
         if speeds:
             ours, theirs = (
-                sets.run("tour", range(speeds), _SPEED_S, seeds="calibration", variation=plant)
+                run("tour", range(speeds), "calibration", plant, duration_s=_SPEED_S)
                 for plant in ("nominal", "mujoco")
             )
-            estimates |= speed_estimates(ours, theirs)
-        walked = sets.run("tour", range(tours), TOUR_S)
-        estimates |= tour_estimates(alarms, thresholds, walked)
-    entries = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "variation": variation,
-        "seeds": _SEEDS,
-        "assessment_sha256": file_hash(assessment / f"{MODES[0]}.safetensors"),
-        "thresholds": thresholds,
+            study.rows |= speed_estimates(ours, theirs)
+        study.rows |= tour_estimates(alarms, thresholds, run("tour", range(tours)))
+
+
+def walking_alarms(
+    scenario: Scenario, assessment: SafetyAssessment, classifiers: Sequence[Scorer]
+) -> list[Alarm]:
+    """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action."""
+    loop = scenario.make_loop()
+    watched = require(loop, CanFall).watched_features
+    scorers = [assessment_scorer("sharpened", assessment), *classifiers]
+    alarms = [
+        *(_in_logits(scorer_alarm(scorer)) for scorer in scorers),
+        *threshold_alarms(loop.state_names, loop.feature_names, watched),
+    ]
+    column = loop.feature_names.index("action_change")
+    alarms.append(Alarm(name="action_change", value=lambda one: -one.features[:, column]))
+    return alarms
+
+
+def _in_logits(alarm: Alarm) -> Alarm:
+    """An alarm on the logit of a probability, whose lowest values are spread."""
+
+    def value(motion: WatchedMotion) -> np.ndarray:
+        p = np.clip(alarm.value(motion), _LEAST, 1.0 - _LEAST)
+        return np.log(p / (1.0 - p))
+
+    return Alarm(name=alarm.name, value=value)
+
+
+def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
+    """The alarm's value of each row; NaN, "don't know", is below every threshold."""
+    return np.nan_to_num(alarm.value(motion), nan=-math.inf)
+
+
+def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:
+    """Thresholds that give no alarm on undisturbed tours, with a reserve.
+
+    The reserve below the lowest value is half of its distance to the median of the tours' lowest
+    values, as many more hours have lower ones.
+
+    Args:
+        alarms: The alarms.
+        calm: Tours; those that leave the safe set are left out.
+
+    Raises:
+        ValueError: Every tour does.
+    """
+    calm = [motion for motion in calm if not motion.has_left]
+    if not calm:
+        raise ValueError("walking: the robot leaves its safe set on every calibration tour")
+    thresholds = {}
+    for alarm in alarms:
+        lowest = [lowest_value(motion, _values(alarm, motion)) for motion in calm]
+        thresholds[alarm.name] = float(min(lowest) - 0.5 * (np.median(lowest) - min(lowest)))
+    return thresholds
+
+
+def alarm_estimates(
+    alarms: Sequence[Alarm],
+    thresholds: Mapping[str, float],
+    pushed: Sequence[WalkedMotion],
+    push_s: float,
+) -> dict[str, Estimate]:
+    """Shares of falls announced, lead times, and alarms in motions without a fall.
+
+    Args:
+        alarms: The alarms.
+        thresholds: By alarm.
+        pushed: Motions with a push.
+        push_s: Duration of a push [s].
+    """
+    judged = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
+    fallen = [motion for motion in judged if motion.has_fallen]
+    safe = [motion for motion in judged if not motion.has_left]
+    until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
+    estimates = {
+        "pushes.fallen": proportion(len(fallen), len(judged)),
+        "pushes.left": proportion(sum(motion.has_left for motion in judged), len(judged)),
+        "pushes.push_to_fall_s": median(until),
+        "pushes.fallen_soon": proportion(int(np.sum(until < push_s + EARLY_S)), len(fallen)),
     }
-    file = assessment / WALKING_FILE
-    Results(estimates, entries).write(file)
-    table = new_table("figure", "value", "n")
-    for key, estimate in estimates.items():
-        table.add_row(key, interval(estimate), f"{estimate.n}")
-    console.print(table)
-    print_path("figures", file)
+    for alarm in alarms:
+        threshold = thresholds[alarm.name]
+        lead = np.array([_lead(alarm, motion, threshold) for motion in fallen])
+        false = sum(
+            math.isfinite(first_alarm(motion, _values(alarm, motion), threshold)) for motion in safe
+        )
+        key = f"alarm.{alarm.name}"
+        estimates |= {
+            f"{key}.announced": proportion(int(np.sum(lead >= EARLY_S - 1e-9)), len(fallen)),
+            f"{key}.lead_s": median(lead),
+            f"{key}.alarms_without_leaving": proportion(false, len(safe)),
+        }
+    return estimates
+
+
+def _lead(alarm: Alarm, motion: WalkedMotion, threshold: float) -> float:
+    since = motion.push_time_s
+    alarm_s = first_alarm(motion, _values(alarm, motion), threshold, since_s=since)
+    return motion.fall_time_s - alarm_s if alarm_s <= motion.fall_time_s else -math.inf
+
+
+def tour_estimates(
+    alarms: Sequence[Alarm], thresholds: Mapping[str, float], tours: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Shares of tours with a fall, and false alarms an hour on the others.
+
+    Args:
+        alarms: The alarms.
+        thresholds: By alarm.
+        tours: Undisturbed tours.
+    """
+    calm = [motion for motion in tours if not motion.has_left]
+    duration_s = sum(float(motion.time_s[-1]) for motion in calm)
+    estimates = {
+        "tours.without_fall": proportion(sum(not m.has_fallen for m in tours), len(tours)),
+        "tours.hours": Estimate.exact(duration_s / 3600.0, len(calm)),
+    }
+    for alarm in alarms:
+        threshold = thresholds[alarm.name]
+        count = 0
+        for motion in calm:
+            is_below = ~(_values(alarm, motion) >= threshold)
+            count += int(np.sum(np.diff(is_below.astype(int), prepend=0) > 0))
+        estimates[f"tours.{alarm.name}.false_alarms_per_hour"] = rate_per_hour(
+            count, duration_s, len(calm)
+        )
+    return estimates
+
+
+def recovery_estimates(
+    branch: str, alone: Sequence[WalkedMotion], again: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Share of falls saved by a branch, and impact speeds of those that it does not save.
+
+    Args:
+        branch: Name of the branch.
+        alone: Motions that fell without recovery.
+        again: The same with recovery.
+    """
+    not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
+    return {
+        f"recovery.{branch}.saved": proportion(len(alone) - len(not_saved), len(alone)),
+        f"recovery.{branch}.impact_m_s": median(np.array([b.impact_m_s for _, b in not_saved])),
+        f"recovery.{branch}.impact_without_m_s": median(
+            np.array([a.impact_m_s for a, _ in not_saved])
+        ),
+    }
+
+
+def guard_estimates(
+    unguarded: Sequence[WalkedMotion],
+    guarded: Sequence[WalkedMotion],
+    inside: Sequence[WalkedMotion],
+) -> dict[str, Estimate]:
+    """Falls with and without the guard, and the share of time in which it changes a command.
+
+    Args:
+        unguarded: Commands past the ranges.
+        guarded: The same with the guard.
+        inside: Tours of commands inside the ranges, with the guard.
+    """
+    without = sum(motion.has_fallen for motion in unguarded)
+    with_guard = sum(motion.has_fallen for motion in guarded)
+    kept = np.array([float(np.mean(motion.is_changed == 0)) for motion in inside])
+    estimates = {
+        "guard.falls_without": proportion(without, len(unguarded)),
+        "guard.falls_with": proportion(with_guard, len(guarded)),
+        "guard.left_without": proportion(sum(m.has_left for m in unguarded), len(unguarded)),
+        "guard.left_with": proportion(sum(m.has_left for m in guarded), len(guarded)),
+        "guard.fewer_falls": Estimate.exact(1.0 - with_guard / max(without, 1), len(guarded)),
+    }
+    if len(inside):
+        low, high = np.quantile(kept, [0.025, 0.975])
+        estimates["guard.unchanged_inside"] = Estimate(
+            float(kept.mean()), float(low), float(high), len(inside)
+        )
+        estimates["guard.falls_inside"] = proportion(
+            sum(motion.has_fallen for motion in inside), len(inside)
+        )
+    return estimates
+
+
+def speed_estimates(
+    ours: Sequence[WalkedMotion], theirs: Sequence[WalkedMotion]
+) -> dict[str, Estimate]:
+    """Difference of mean planar velocities between two engines, over the same commands.
+
+    Args:
+        ours: Tours in Drake.
+        theirs: The same in MuJoCo; of tours that last differently the common part counts.
+    """
+    pairs = []
+    for a, b in zip(ours, theirs, strict=True):
+        rows = min(len(a.output), len(b.output))
+        if not (a.has_fallen or b.has_fallen):
+            pairs.append((a.output[:rows].mean(axis=0), b.output[:rows].mean(axis=0)))
+    difference = np.array([np.linalg.norm((a - b)[:2]) for a, b in pairs])
+    return {"speed.difference_to_mujoco_m_s": median(difference)}

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +11,18 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.walking_parameters import profile
-from drake_safety.files.atomic import replacing
+from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.watched_motion import SEEN, WatchedMotion
-from drake_safety.simulation.worker_processes import Progress, run_batches
+from drake_safety.simulation.worker_processes import Progress
+from studies.alarms import WatchedMotion
+from studies.harness import Arrays, kept
 
 ROW_S = 0.02
 """Time between two rows of a motion [s]."""
-PUSHED_S = 5.0
-"""Duration of a pushed motion [s]."""
 _HELD_S = (2.0, 6.0)  # Shortest and longest time for which a tour holds a command.
 _STANDING_SHARE = 0.1
 _AFTER_FALL_S = 0.6  # Until the robot lies.
@@ -194,6 +191,7 @@ def run_motions(
     variation: str = "nominal",
     assessment: SafetyAssessment | None = None,
     options: dict[str, Any] | None = None,
+    num_workers: int | None = None,
     progress: Progress | None = None,
 ) -> list[WalkedMotion]:
     """Simulates motions in worker processes, and keeps them in a folder; existing ones are reused.
@@ -208,41 +206,28 @@ def run_motions(
         variation: The plant.
         assessment: Γ, for loops with a guard or recovery.
         options: Options of the loop.
+        num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and in all.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    wanted = [i for i in indices if not (folder / f"{i:05d}.npz").is_file()]
-    done = len(indices) - len(wanted)
-    if progress is not None:
-        progress(done, len(indices))
-    for motion in run_batches(
-        partial(_batch, scenario, variation, assessment, options or {}, kind, seed, duration_s),
-        wanted,
+    common = (scenario, variation, assessment, options or {}, kind, seed, duration_s)
+    found = kept(
+        folder,
+        {f"{i:05d}": (*common, i) for i in indices},
+        _run_motion,
+        workers=num_workers,
         progress=progress,
-        num_done=done,
-    ):
-        with replacing(folder / f"{motion.index:05d}.npz") as temporary:
-            with temporary.open("wb") as file:
-                arrays: dict[str, Any] = {k: _stored(v) for k, v in vars(motion).items()}
-                np.savez(file, **arrays)
-    return [_loaded(folder / f"{i:05d}.npz") for i in indices]
+    )
+    return [_motion(arrays) for arrays in found.values()]
 
 
-def _stored(value: Any) -> np.ndarray:
-    array = np.asarray(value)
-    return array.astype(np.float32) if array.ndim == 2 else array
+def _motion(arrays: Arrays) -> WalkedMotion:
+    fields: dict[str, Any] = {
+        n: value if value.ndim else value.item() for n, value in arrays.items()
+    }
+    return WalkedMotion(**fields)
 
 
-def _loaded(file: Path) -> WalkedMotion:
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            values = {field.name: arrays[field.name] for field in fields(WalkedMotion)}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{file} holds no motion, or is damaged ({error!r}): remove it") from error
-    return WalkedMotion(**{k: v if v.ndim else v.item() for k, v in values.items()})
-
-
-def _batch(
+def _run_motion(
     scenario: Scenario,
     variation: str,
     assessment: SafetyAssessment | None,
@@ -250,13 +235,15 @@ def _batch(
     kind: str,
     seed: int,
     duration_s: float,
-    indices: list[int],
-) -> list[WalkedMotion]:
+    index: int,
+) -> Arrays:
     if assessment is None:
         loop = worker_loop(scenario, variation, options)
     else:
         loop = _assessed_loop(scenario, variation, assessment, options)
-    return [KINDS[kind](loop, index, seed=seed, duration_s=duration_s) for index in indices]
+    motion = KINDS[kind](loop, index, seed=seed, duration_s=duration_s)
+    arrays = {name: np.asarray(value) for name, value in vars(motion).items()}
+    return {name: a.astype(np.float32) if a.ndim == 2 else a for name, a in arrays.items()}
 
 
 _LOOPS: dict[str, Any] = {}

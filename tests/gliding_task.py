@@ -100,7 +100,7 @@ class Gliding(ClosedLoop):
             period_s=0.04,
             **{
                 name: self.mass.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features")
+                for name in ("state", "desired_preview", "features", "margins")
             },
         )
         self.finish(builder)

@@ -36,8 +36,8 @@ def make_diagram(assessment=None):
     for name in ("output", "desired_preview", "margins"):
         builder.ExportOutput(flight.GetOutputPort(name), name)
     if assessment is not None:
-        preview = flight.GetOutputPort("desired_preview")
-        assessor = AddSafetyAssessor(builder, assessment, state=state, desired_preview=preview)
+        ports = {name: flight.GetOutputPort(name) for name in ("desired_preview", "margins")}
+        assessor = AddSafetyAssessor(builder, assessment, state=state, **ports)
         builder.ExportOutput(assessor.GetOutputPort("safety_probability"), "gamma")
     return builder.Build()
 

@@ -112,7 +112,7 @@ class Shuttling(ClosedLoop):
             period_s=0.04,
             **{
                 name: self.shuttle.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features")
+                for name in ("state", "desired_preview", "features", "margins")
             },
         )
         self.finish(builder)

@@ -244,6 +244,18 @@ def test_nothing_can_be_asked_before_something_is_learned():
 def test_parameters_out_of_range_are_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name):
         AssessmentParameters(**{name: value})
+    learner = SafetyAssessment()
+    setattr(learner.parameters, name, value)
+    with pytest.raises(ValueError, match=name):
+        learner.fit(None)
+
+
+@pytest.mark.parametrize(("part", "name"), [("paper", "loss"), ("adaptation", "count")])
+def test_parameters_of_parts_are_checked_before_learning_too(part, name):
+    learner = SafetyAssessment()
+    setattr(getattr(learner.parameters, part), name, "sharp")
+    with pytest.raises(ValueError, match=f"{name} is sharp"):
+        learner.fit(None)
 
 
 def test_the_defaults_are_the_papers_table():

@@ -1,10 +1,12 @@
+"""Baseline classifiers, and how Γ is compared with them."""
+
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.baselines import KINDS, DirectClassifier
 from drake_safety.evaluation.metrics import area_under_curve
-from drake_safety.learning.segments import Episodes, split
+from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
+from studies.baselines import KINDS, DirectClassifier, auc_difference, classifier_scorers
 
 pytestmark = pytest.mark.train
 
@@ -29,14 +31,9 @@ def predict(classifier, segments):
 
 
 def test_it_tells_unsafe_from_safe_segments_of_episodes_it_has_not_seen(classifier, fresh):
-    probability = predict(classifier, fresh)
-    assert probability.shape == (len(fresh),)
-    assert np.all((probability >= 0.0) & (probability <= 1.0))
-    assert area_under_curve(probability, fresh.is_unsafe) > 0.9
-
-
-def test_its_probabilities_are_better_than_the_share_of_unsafe_segments(classifier, fresh):
     probability, label = predict(classifier, fresh), fresh.is_unsafe
+    assert np.all((probability >= 0.0) & (probability <= 1.0))
+    assert area_under_curve(probability, label) > 0.9
     assert ((probability - label) ** 2).mean() < 0.6 * label.mean() * (1.0 - label.mean())
 
 
@@ -69,8 +66,6 @@ def test_a_column_that_never_changes_carries_nothing(classifier, fresh):
 
 def test_without_features_it_sees_the_paper_s_input(training, fresh):
     blind = DirectClassifier("gradient_boosting", uses_features=False).fit(training)
-    info = training.info
-    assert blind.num_inputs_ == len(info.state_names) + info.horizon * len(info.output_names)
     other = fresh.take(np.arange(9))
     expected = predict(blind, other)
     other.features[:] = 7.0
@@ -87,13 +82,33 @@ def test_the_episodes_that_decide_when_to_stop_are_held_out_whole(training):
         assert share / len(np.unique(segments.episode[is_class])) == pytest.approx(0.1, abs=0.02)
 
 
-def test_errors_say_what_was_expected(classifier, training, fresh):
-    with pytest.raises(ValueError, match="unknown kind 'forest'; the kinds are"):
-        DirectClassifier("forest")
-    with pytest.raises(ValueError, match="has not been fitted yet"):
-        predict(DirectClassifier(classifier.kind), fresh)
-    with pytest.raises(ValueError, match=f"it was fitted to {classifier.num_inputs_}"):
-        classifier.predict_unsafe(fresh.state, fresh.desired_preview)
-    safe = Episodes(training.info, [episode for episode in training if episode.is_safe])
-    with pytest.raises(ValueError, match="0 unsafe episodes, expected at least 2"):
-        DirectClassifier(classifier.kind).fit(safe)
+def test_every_direct_classifier_is_a_scorer_trained_on_the_segments_it_is_told_to(fresh):
+    episodes = make_episodes(40, seed=3, noise=0.05)
+    reports = []
+    whole = classifier_scorers(episodes, lambda *report: reports.append(report))
+    assert [scorer.name for scorer in whole] == list(KINDS)
+    assert [done for _, done, _ in reports] == list(range(len(KINDS) + 1))
+    for scorer in whole:
+        score = scorer.unsafe_score(fresh)
+        assert score[fresh.is_unsafe].mean() > score[~fresh.is_unsafe].mean()
+        assert scorer.used[0].seed == 3
+    short = classifier_scorers(episodes, lambda *report: None, shortest=1)[0]
+    segments = split(episodes, stride=1, discount=1.0, shortest=1)
+    rows = segments.take(~segments.is_unsafe & (segments.length < episodes.info.horizon))
+    # Only one of them has seen how safe episodes end.
+    assert short.unsafe_score(rows).mean() < whole[0].unsafe_score(rows).mean()
+
+
+def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetric(fresh):
+    label, episode = fresh.is_unsafe, fresh.episode
+    one, other = (label + np.random.default_rng(seed).normal(size=len(label)) for seed in range(2))
+    same = auc_difference(one, one, label, episode)
+    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
+    forth, back = (
+        auc_difference(one, other, label, episode),
+        auc_difference(other, one, label, episode),
+    )
+    assert (
+        forth.value == -back.value == area_under_curve(one, label) - area_under_curve(other, label)
+    )
+    assert forth.low == pytest.approx(-back.high)

@@ -194,7 +194,7 @@ def test_a_shell_completes_commands_and_scenarios_without_drake():
     ("arguments", "what"),
     [
         (["train", "pendulum", "--out"], "file"),
-        (["compare", "pendulum", "--out"], "file/inside"),
+        (["train", "pendulum", "--out"], "file/inside"),
         (["evaluate", "pendulum", "--assessment", ".", "--out"], "file"),
     ],
 )

@@ -20,7 +20,6 @@ class SlowIsSafe:
     """Γ is 1 up to a forward speed, and 0 beyond; its features are the command."""
 
     parameters = SimpleNamespace(initial_uncertainty=0.3)
-    uses_features = True
     info_ = SimpleNamespace(horizon=HORIZON, state_names=["s"], feature_names=["x", "y", "yaw"])
 
     def __init__(self, fastest=1.5, novelty=0.0):

@@ -71,13 +71,6 @@ def test_empty_cells_are_hatched_and_the_others_show_their_belief(assessment, fr
     assert colours[least, 0] > colours[least, 2]
 
 
-def test_the_right_panel_shows_causes_or_uncertainty_of_the_beliefs_given(assessment, fresh):
-    vacuous = assessment.beliefs_.copy()
-    vacuous[...] = 0.0
-    vacuous[..., 2] = 1.0
-    right = embedding_figure(assessment, fresh, beliefs=vacuous, right="uncertainty").axes[2]
-    assert len(right.collections[0].get_paths()) == 36
+def test_the_right_panel_names_the_causes(assessment, fresh):
     legend = embedding_figure(assessment, fresh).axes[2].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["support", "height"]
-    with pytest.raises(ValueError, match="right is 'mu', expected 'causes' or 'uncertainty'"):
-        embedding_figure(assessment, fresh, right="mu")

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.episode_study import evaluate_episodes
+from drake_safety.evaluation.episode_study import (
+    PROMISED_UNSAFE_RECALL,
+    evaluate_episodes,
+    evaluate_plans,
+    promised_miss_rate,
+)
 from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.evaluation.scorers import Scorer
 from lip_episodes import SUPPORT, make_episodes
@@ -15,8 +20,7 @@ def inside(state, *_):
 
 SCORERS = [
     Scorer(name="sharpened", probability=inside),
-    Scorer(name="mlp", probability=lambda state, *_: np.full(len(state), 0.5)),
-    Scorer(name="gradient_boosting", probability=lambda state, *_: 1.0 - inside(state)),
+    Scorer(name="blind", probability=lambda state, *_: np.full(len(state), 0.5)),
 ]
 
 
@@ -40,16 +44,12 @@ def test_every_scorer_has_every_figure_per_segment_and_at_planning_time(study):
 
 
 def test_the_scores_are_those_the_figures_come_from(study):
-    estimates, scores, is_unsafe = study
+    estimates, scores, segments = study
     for name, score in scores.items():
-        assert estimates[f"segments.{name}.auc"].value == area_under_curve(score, is_unsafe)
-    assert estimates["segments.mlp.auc"].value == 0.5
-
-
-def test_the_assessment_is_compared_with_the_better_of_the_classifiers(study):
-    estimates, *_ = study
-    difference = estimates["segments.sharpened_minus_best_classifier.auc"]
-    assert difference.value == pytest.approx(estimates["segments.sharpened.auc"].value - 0.5)
+        assert estimates[f"segments.{name}.auc"].value == area_under_curve(
+            score, segments.is_unsafe
+        )
+    assert estimates["segments.blind.auc"].value == 0.5
 
 
 def test_at_planning_time_every_episode_counts_once(study, fresh):
@@ -72,3 +72,29 @@ def test_thresholds_come_from_the_calibration_set_alone(study, fresh):
         for found in (estimates, again)
     )
     assert best >= other
+
+
+def test_plans_are_judged_once_by_a_stored_threshold_or_one_of_the_calibration_set(fresh):
+    calibration = make_episodes(30, seed=2)
+    found, scores, first = evaluate_plans(SCORERS, calibration, fresh, {"blind": 0.4})
+    assert first.is_first.all() and len(first) == len(fresh)
+    assert found["plans.blind.threshold"].value == 0.6
+    assert found["plans.blind.unsafe_recall"].value == 1.0
+    limit = 1.0 - found["plans.sharpened.threshold"].value
+    unsafe = scores["sharpened"][first.is_unsafe]
+    assert found["plans.sharpened.unsafe_recall"].value == np.mean(unsafe > limit)
+    assert found["plans.sharpened.unsafe_recall"].n == fresh.num_unsafe
+    # The lowest calibration score of an unsafe plan, as so few allow no miss.
+    assert found["plans.promised_unsafe_recall"].value < PROMISED_UNSAFE_RECALL
+    shares = [one.value for key, one in found.items() if key.startswith("plans.outcomes.")]
+    assert sum(shares) == pytest.approx(1.0)
+    assert found["plans.outcomes.safe"].value == fresh.num_safe / len(fresh)
+
+
+def test_a_promise_needs_unsafe_plans_and_is_what_their_number_allows(caplog):
+    with pytest.raises(ValueError, match="0 of 9 calibration plans are unsafe; it takes 124"):
+        promised_miss_rate(np.zeros(9, dtype=bool))
+    assert promised_miss_rate(np.ones(500, dtype=bool)) == 1.0 - PROMISED_UNSAFE_RECALL
+    assert not caplog.records
+    assert promised_miss_rate(np.ones(19, dtype=bool)) == pytest.approx(0.05)
+    assert "19 unsafe calibration episodes promise an unsafe recall of 0.950" in caplog.text

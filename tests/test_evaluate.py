@@ -1,22 +1,20 @@
-"""`evaluate` and `calibrate` for plans with a goal."""
+"""`evaluate` and `calibrate`, and the studies' `evaluate` beside baselines."""
 
 import shutil
+import sys
 
 import pytest
 
 from command_line import call
-from drake_safety.cli.evaluate_plans import PlanOptions, check_options
-from drake_safety.cli.training_folder import (
-    MODES,
-    fresh_episodes_folder,
-    load_assessment,
-)
+from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
 from drake_safety.evaluation import figure_style
 from drake_safety.evaluation.results import Results
-from drake_safety.simulation import pushed_motions, rollouts
+from drake_safety.learning.seeds import SHIFTS
+from drake_safety.simulation import rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
+from studies.__main__ import main as studies
 
 
 @pytest.fixture(scope="module")
@@ -26,39 +24,112 @@ def shuttle_run(tmp_path_factory):
     return train_shuttle(folder), folder
 
 
+OPTIONS = ("--episodes", 30, "--calibration-episodes", 20, "--workers", 1, "--seed", 100)
+
+
 def evaluate_shuttle(monkeypatch, run, *arguments):
     file, folder = run
-    options = ("--assessment", folder, "--episodes", 30, "--calibration-episodes", 20)
-    options += ("--workers", 1, "--seed", 100)
-    return call(monkeypatch, "evaluate", file, *options, *arguments)
+    return call(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments)
 
 
 @pytest.mark.slow
-def test_plans_with_a_goal_are_evaluated_before_anything_moves(monkeypatch, capsys, shuttle_run):
-    _, folder = shuttle_run
-    arguments = ("--other-hand", 10, "--plane-step", 0.6)
-    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
+def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
     printed = capsys.readouterr().out
-    for title in ("all targets", "the other hand", "paper uses its next H steps"):
-        assert title in printed
-    report = Results.read(folder / "evaluation.json")
-    assert report["plans.causes.right_cause"].n == report["plans.causes.by_cause_probability"].n
-    for name in ("sharpened", "paper", "gradient_boosting", "mlp"):
-        for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
-            assert f"{prefix}.{name}.unsafe_recall" in report
-    assert report["plans.outcomes.safe"].n == 30
-    assert report["plans.other_hand.outcomes.safe"].n == 10
-    assert report["plans.sharpened.threshold"].n == report.entries["calibration_episodes"] == 20
-    assert "plans.plane.sharpened.right" in report
-    for name in ("plans", "plans_roc", "reachable_region"):
-        assert (folder / f"{name}.png").is_file()
+    assert "all targets" in printed and "paper uses its next H steps" in printed
+    first = Results.read(folder / "evaluation.json")
+    judged = {row.method for row in first.values() if row.metric == "brier"}
+    assert judged == {"sharpened", "paper"}
+    assert first["plans.outcomes.safe"].n == 30
+    assert first["plans.sharpened.threshold"].n == first.entries["calibration_episodes"] == 20
+    for place in ("calibration", "calibration.rows"):
+        error = first[f"{place}.sharpened.expected_calibration_error"]
+        assert error.low <= error.high and error.n == 30
+    assert (folder / "reliability.png").is_file()
     # What takes throws or runs is no part of it.
-    assert not any(key.startswith(("throws.", "segments.")) for key in report)
+    assert not first.has("throws.") and not first.has("segments.")
+    hash_ = load_scenario(file).simulation_hash()
+    kept = [fresh_episodes_folder(folder, hash_, seed, {}) for seed in (100, 103)]
+    assert [len(completed(path)) for path in kept] == [30, 20]
+    # Once all are there, even a simulation that always fails is not needed.
+    monkeypatch.setattr(rollouts, "run_episode", None)
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    assert dict(Results.read(folder / "evaluation.json")) == dict(first)
+
+
+def study(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["studies", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        studies()
+    assert ended.value.code in (0, None)
+
+
+@pytest.mark.slow
+def test_shifts_and_promises_are_studied_beside_baselines(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    out, where = folder / "beside", ("--assessment", folder, "--workers", 1)
+    shifts = ("--shifts", 6, "--episodes", 12, "--out", out)
+    study(monkeypatch, "evaluate", file, *where, *shifts)
+    found = Results.read(out / "shifts.json")
+    assert found.entries["kinds"]["state of another row"] == "junk"
+    for method in ("gamma", "without_novelty", "gradient_boosting", "mlp", "deep_knn"):
+        assert f"shifts.gaussian.{method}.confident_error" in found
+        assert f"shifts.nominal.{method}.first.confident_error" in found
+    study(monkeypatch, "promises", file, *where, "--episodes", 40, "--splits", 5)
+    assert "needs 99 unsafe episodes" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.slow
+def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    alone = Results.read(folder / "evaluation.json")
+    arguments = ("--other-hand", 10, "--plane-step", 0.6, "--pushes", 15)
+    study(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments)
+    beside = Results.read(folder / "evaluation.json")
+    assert {key: beside[key] for key in alone} == dict(alone)
+    for method in ("sharpened", "paper", "gradient_boosting", "mlp"):
+        for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
+            assert f"{prefix}.{method}.unsafe_recall" in beside
+    assert beside["plans.other_hand.outcomes.safe"].n == 10
+    assert "plans.plane.sharpened.right" in beside
+    alarms = {row.method for row in beside.select(set="monitoring")}
+    assert alarms > {"motions", "sharpened", "paper", "mlp", "front_margin", "smallest_margin"}
+    pushed, refused = (beside[f"monitoring.motions.{k}"] for k in ("leave_safe_set", "refused"))
+    assert refused.n == 30 and pushed.n == 30 - round(30 * refused.value)
+    assert "Alarms on pushed motions" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys, shuttle_run):
+    file, folder = shuttle_run
+    words = ("evaluate", file, "--assessment", folder, "--shifts", 6, "--episodes", 12)
+    # The default of evaluations without shifts is a seed like any other.
+    for seed, given in ((1_000_000, ("--seed", 1_000_000)), (SHIFTS.first, ())):
+        out = folder / f"shifts-{seed}"
+        options = ("--workers", 1, "--out", out)
+        assert call(monkeypatch, *words, *given, *options) in (0, None)
+        results = Results.read(out / "shifts.json")
+        assert results.entries["seed"] == seed
+        hash_ = load_scenario(file).simulation_hash()
+        assert len(completed(fresh_episodes_folder(folder, hash_, seed, {}))) == 12
+    printed = capsys.readouterr().out
+    assert 'rows after its alarm count as "don\'t know"' in " ".join(printed.split())
+    assert results.entries["kinds"]["nominal"] == "nominal"
+    shifted = [name for name, kind in results.entries["kinds"].items() if kind == "plant"]
+    for method in ("gamma", "paper"):
+        for metric in ("unknown", "confident_error"):
+            assert f"shifts.{shifted[0]}.{method}.{metric}" in results
+    assert f"shifts.{shifted[0]}.monitor.delay_s" in results
+    assert (out / "shifts.png").is_file()
 
 
 def calibrate_shuttle(monkeypatch, run, *arguments):
     file, folder = run
-    options = ("--assessment", folder, "--episodes", 120, "--workers", 1, "--splits", 20)
+    options = ("--assessment", folder, "--episodes", 120, "--workers", 1)
     return call(monkeypatch, "calibrate", file, *options, *arguments)
 
 
@@ -73,7 +144,6 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
     printed = capsys.readouterr().out
     assert "at most 10 % of unsafe episodes called safe, on average" in printed
-    assert "needs 99 unsafe episodes" in printed
     stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
     for mode in MODES:
         assert stored[mode].keys() == {"plan", "motion"}
@@ -86,58 +156,23 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
     monkeypatch.undo()
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, run, "--plane-step", 0) in (0, None)
-    report = Results.read(folder / "evaluation.json")
-    threshold = report["plans.sharpened.threshold"].value
+    assert evaluate_shuttle(monkeypatch, run) in (0, None)
+    found = Results.read(folder / "evaluation.json")
+    threshold = found["plans.sharpened.threshold"].value
     assert threshold == pytest.approx(stored["sharpened"]["plan"].threshold)
-    assert report["calibration.plan.sharpened.promised_miss_rate"].value == 0.1
-    missed = report["calibration.plan.sharpened.miss_rate"].value
-    assert missed == pytest.approx(1.0 - report["plans.sharpened.unsafe_recall"].value)
+    assert found["calibration.plan.sharpened.promised_miss_rate"].value == 0.1
+    missed = found["calibration.plan.sharpened.miss_rate"].value
+    assert missed == pytest.approx(1.0 - found["plans.sharpened.unsafe_recall"].value)
     assert evaluate_shuttle(monkeypatch, run, "--seed", 2_000_000) == 2
     printed = " ".join(capsys.readouterr().out.split())
     assert "start as the 120 'nominal' episodes of its calibration" in printed
     assert "choose another seed, such as 2000001" in printed
 
 
-@pytest.mark.slow
-def test_fresh_targets_are_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
-    file, folder = shuttle_run
-    arguments = ("--plane-step", 0)
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
-    first = Results.read(folder / "evaluation.json")
-    hash_ = load_scenario(file).simulation_hash()
-    kept = [
-        fresh_episodes_folder(folder, hash_, seed, options)
-        for seed, options in ((100, {}), (103, {}), (100, {"side": "right"}))
-    ]
-    assert [len(completed(path)) for path in kept] == [30, 20, 30]
-
-    def forbidden(*arguments, **options):
-        raise AssertionError("simulated again")
-
-    # Once all are there, even a simulation that always fails is not needed.
-    monkeypatch.setattr(rollouts, "run_episode", forbidden)
-    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) in (0, None)
-    again = Results.read(folder / "evaluation.json")
-    assert list(map(str, again.values())) == list(map(str, first.values()))
-
-
-@pytest.mark.slow
-def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttle_run, tmp_path):
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    options = ("--plane-step", 0, "--other-hand", 0, "--no-baselines", "--out", tmp_path)
-    assert evaluate_shuttle(monkeypatch, shuttle_run, *options) in (0, None)
-    report = Results.read(tmp_path / "evaluation.json")
-    judged = {key.split(".")[1] for key in report if key.endswith(".brier")}
-    assert judged == {"sharpened", "paper", "fair"}
-
-
 @pytest.mark.train
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--plane-x", "5"], "the plane x = 5 m misses the target box"),
         (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
         (["--seed", "-3"], "seed 0 gives episodes that start as the 60 'nominal'"),
     ],
@@ -145,60 +180,6 @@ def test_without_baselines_nothing_but_either_mode_is_judged(monkeypatch, shuttl
 def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
     monkeypatch, capsys, shuttle_run, arguments, message
 ):
-    def forbidden(*arguments, **options):
-        raise AssertionError("simulated")
-
-    monkeypatch.setattr(rollouts, "run_episode", forbidden)
+    monkeypatch.setattr(rollouts, "run_episode", None)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) == 2
     assert message in " ".join(capsys.readouterr().out.split())
-
-
-def test_options_of_targets_are_refused_where_plans_have_no_goal():
-    loop = load_scenario("laikago_balancing").make_loop()
-    check_options(loop, PlanOptions())
-    for options in (PlanOptions(other_hand=5), PlanOptions(plane_x=0.8)):
-        with pytest.raises(
-            ValueError, match=r"leave out --other-hand.*'Balancing' has no plans with a"
-        ):
-            check_options(loop, options)
-
-
-@pytest.mark.slow
-def test_who_notices_pushes_is_part_of_the_evaluation(monkeypatch, capsys, shuttle_run):
-    file, folder = shuttle_run
-    options = ("--assessment", folder, "--episodes", 20, "--calibration-episodes", 20)
-    options += ("--workers", 1, "--seed", 100, "--plane-step", 0, "--other-hand", 0)
-    assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
-    printed = capsys.readouterr().out
-    report = Results.read(folder / "evaluation.json")
-    judged = {key.split(".")[1] for key in report if key.startswith("monitoring.")}
-    assert judged == {
-        "motions",
-        "sharpened",
-        "paper",
-        "gradient_boosting",
-        "mlp",
-        "front_margin",
-        "smallest_margin",
-    }
-    pushed, refused = (report[f"monitoring.motions.{key}"] for key in ("leave_safe_set", "refused"))
-    assert refused.n == 30 and pushed.n == 30 - round(30 * refused.value)
-    assert 0 < pushed.value < 1
-    assert "Alarms on pushed motions" in printed
-    assert (folder / "monitoring.png").is_file()
-    # The motions are kept, as the fresh episodes are: the second time nothing is simulated.
-    monkeypatch.setattr(pushed_motions, "run_pushed_motion", None)
-    monkeypatch.setattr(rollouts, "run_episode", None)
-    assert call(monkeypatch, "evaluate", file, *options, "--pushes", 15) in (0, None)
-    again = Results.read(folder / "evaluation.json")
-    assert str(again.select(set="monitoring")) == str(report.select(set="monitoring"))
-
-
-@pytest.mark.train
-def test_pushes_are_refused_where_there_is_no_way_to_push(monkeypatch, capsys, shuttle_run):
-    _, folder = shuttle_run
-    arguments = ("--assessment", folder, "--throws", 0, "--pushes", 3)
-    assert call(monkeypatch, "evaluate", "laikago_balancing", *arguments) == 2
-    assert "leave out --pushes; alarms are evaluated on throws" in " ".join(
-        capsys.readouterr().out.split()
-    )

@@ -1,18 +1,18 @@
 import matplotlib.image
-import numpy as np
 
-from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.roc_figure import roc_figure
+from drake_safety.evaluation.figure_style import drawing_style, new_figure, save
 
 
 def picture():
-    label = np.array([False, True, True, False])
-    return roc_figure({"scorer": (np.array([0.1, 0.9, 0.4, 0.5]), label)})
+    with drawing_style():
+        figure = new_figure(10.0, 5.0)
+        figure.subplots().plot([0.1, 0.9, 0.4])
+    return figure
 
 
 def test_a_picture_is_saved_as_png_and_svg_and_again_with_the_same_bits(tmp_path):
-    png, svg = save(picture(), tmp_path / "new" / "roc.pdf")
-    assert (png.name, svg.name) == ("roc.png", "roc.svg")
+    png, svg = save(picture(), tmp_path / "new" / "curve.pdf")
+    assert (png.name, svg.name) == ("curve.png", "curve.svg")
     assert matplotlib.image.imread(png).shape == (1000, 2000, 4)
     again = save(picture(), tmp_path / "again")
     assert svg.read_bytes() == again[1].read_bytes()
@@ -21,5 +21,5 @@ def test_a_picture_is_saved_as_png_and_svg_and_again_with_the_same_bits(tmp_path
 
 def test_drawing_and_saving_leave_no_trace_in_the_reader_s_own_settings(tmp_path):
     before = dict(matplotlib.rcParams)
-    save(picture(), tmp_path / "roc")
+    save(picture(), tmp_path / "curve")
     assert dict(matplotlib.rcParams) == before

@@ -133,7 +133,7 @@ def test_what_an_actual_robot_does_is_no_alarm_after_feedback(innovation, novelt
 @pytest.mark.train
 def test_too_little_motion_gives_no_alarm(novelty):
     innovation = Innovation.fit(motions(1, 11)[0:1], NUM_STATES, STEP_S, novelty)
-    assert np.all(np.isinf([chart.limit for chart in innovation.charts]))
+    assert np.all(np.isinf(innovation.chart_limits))
 
 
 def test_a_motion_of_one_input_is_refused():
@@ -157,12 +157,6 @@ def test_damaged_arrays_are_refused(innovation, name):
     with pytest.raises(ValueError, match=name):
         Innovation.from_arrays(
             arrays | {name: arrays[name][..., :-1]}, num_inputs=6, num_states=NUM_STATES
-        )
-    with pytest.raises(ValueError, match=name):
-        Innovation.from_arrays(
-            arrays | {name: np.full_like(arrays[name], np.nan)},
-            num_inputs=6,
-            num_states=NUM_STATES,
         )
 
 

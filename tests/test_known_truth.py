@@ -9,14 +9,14 @@ from cart_episodes import make_episode, make_info
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.episode_start import StatePlane
 from shuttle_task import shuttling
-from studies.known_truth import (
+from studies.truth import (
     KnownTruth,
     agreement,
     boundary_distance,
+    known_truth_figure,
     random_plan_estimates,
     simulate_truth,
 )
-from studies.known_truth_figure import known_truth_figure
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
 HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)
@@ -60,9 +60,7 @@ def test_grids_of_different_shapes_are_refused():
 
 
 def test_a_task_without_planes_says_so():
-    with pytest.raises(
-        ValueError, match="'Shuttling' has no state planes; it has plans with a goal"
-    ):
+    with pytest.raises(ValueError, match=r"'Shuttling' has no state plane 'hold'; it has \[\]"):
         simulate_truth(shuttling(), "hold", 3, num_workers=1)
 
 

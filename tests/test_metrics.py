@@ -3,15 +3,16 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import poisson
 
 from drake_safety.evaluation.metrics import (
     Bootstrap,
     Estimate,
     area_under_curve,
     auc,
-    auc_difference,
     median,
     proportion,
+    rate_per_hour,
     segment_estimates,
     threshold_at,
 )
@@ -152,17 +153,6 @@ def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
     assert 0.90 <= num_covered / 200 <= 0.99
 
 
-def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetric(segments):
-    one, other = blurred_truth(segments, 0), blurred_truth(segments, 1)
-    label, episode = segments.is_unsafe, segments.episode
-    same = auc_difference(one, one, label, episode)
-    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
-    forth = auc_difference(one, other, label, episode)
-    back = auc_difference(other, one, label, episode)
-    assert forth.value == -back.value
-    assert forth.low == pytest.approx(-back.high)
-
-
 def test_segment_figures_of_the_truth_are_perfect_and_their_recalls_still_uncertain(segments):
     estimates = segment_estimates(segments, segments.is_unsafe.astype(float), threshold=0.5)
     assert set(estimates) == {"auc", "safe_recall", "unsafe_recall", "brier"}
@@ -206,14 +196,6 @@ def test_not_knowing_is_judged_unsafe_and_charged_as_certainty(segments):
     assert estimates["brier"].value == pytest.approx((~segments.is_unsafe).mean())
 
 
-def test_scores_that_are_no_probabilities_have_no_brier_score(segments):
-    logit = 4.0 * segments.is_unsafe - 2.0
-    with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got -2.0..2.0"):
-        segment_estimates(segments, logit, threshold=0.0)
-    estimates = segment_estimates(segments, logit, threshold=0.0, is_probability=False)
-    assert set(estimates) == {"auc", "safe_recall", "unsafe_recall"}
-
-
 def test_there_must_be_one_score_a_segment(segments):
     with pytest.raises(ValueError, match="segment_estimates: scores, labels and episodes"):
         segment_estimates(segments, np.zeros(3), threshold=0.5)
@@ -221,11 +203,24 @@ def test_there_must_be_one_score_a_segment(segments):
         area_under_curve(np.zeros(3), np.zeros(3))
 
 
+def test_a_score_that_is_no_probability_is_refused(segments):
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got -2.0..2.0"):
+        segment_estimates(segments, 4.0 * segments.is_unsafe - 2.0, threshold=0.0)
+
+
+def test_rates_have_the_exact_interval_of_a_poisson_process():
+    estimate = rate_per_hour(5, 7200.0, 100)
+    assert estimate.value == 2.5
+    assert poisson.sf(4, 2 * estimate.low) == pytest.approx(0.025)
+    assert poisson.cdf(5, 2 * estimate.high) == pytest.approx(0.025)
+    assert rate_per_hour(0, 3600.0, 1).low == 0.0
+    assert math.isnan(rate_per_hour(0, 0.0, 0).value)
+
+
 def test_the_threshold_separates_what_can_be_separated():
     score = np.array([0.1, 0.2, 0.3, 0.7, 0.9])
     label = np.array([False, False, False, True, True])
     assert threshold_at(score, label) == pytest.approx(0.5)
-    assert threshold_at(score, label, "equal_error") == pytest.approx(0.5)
 
 
 def test_no_other_threshold_has_a_better_balanced_accuracy():
@@ -240,24 +235,14 @@ def test_no_other_threshold_has_a_better_balanced_accuracy():
     assert balanced(threshold_at(score, label)) == pytest.approx(best)
 
 
-def test_the_equal_error_threshold_errs_alike_on_both_classes():
-    rng = np.random.default_rng(5)
-    label = rng.random(4000) < 0.1
-    score = rng.normal(size=4000) + 2.0 * label
-    threshold = threshold_at(score, label, "equal_error")
-    assert abs((score[label] <= threshold).mean() - (score[~label] > threshold).mean()) < 0.01
-
-
 def test_no_threshold_lies_above_what_is_infinitely_unsafe():
     label = np.array([True, False, False])
     assert threshold_at(np.array([0.2, np.inf, np.inf]), label) < math.inf
 
 
-def test_a_threshold_needs_both_classes_a_finite_score_and_a_known_criterion():
+def test_a_threshold_needs_both_classes_and_a_finite_score():
     score = np.array([0.1, 0.2])
     with pytest.raises(ValueError, match="0 of 2 samples are unsafe"):
         threshold_at(score, np.array([False, False]))
     with pytest.raises(ValueError, match="none of the 2 scores is finite"):
         threshold_at(score * np.nan, np.array([False, True]))
-    with pytest.raises(ValueError, match="unknown criterion 'f1'; the criteria are"):
-        threshold_at(score, np.array([False, True]), "f1")

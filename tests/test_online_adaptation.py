@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import load_assessment, load_scenario, run_episode
@@ -49,7 +49,7 @@ class Prior:
         return [row for one in feedback for row in range(NUM_STEPS)]
 
 
-def run(duration_s, capacity=400, **settings):
+def run(duration_s, capacity=400, monitor=None, **settings):
     builder = DiagramBuilder()
     recorder = builder.AddSystem(
         FeedbackRecorder(INFO, num_steps=NUM_STEPS, plant_state_size=2, watch_period_s=STEP_S)
@@ -72,8 +72,10 @@ def run(duration_s, capacity=400, **settings):
         None, Prior(**settings), recorder, assessor, method="paper", run=twins, capacity=capacity
     )
     simulator = Simulator(diagram)
-    simulator.set_monitor(adaptation)
-    simulator.AdvanceTo(duration_s)
+    if monitor is not None:
+        simulator.set_monitor(monitor)
+    adaptation.advance(simulator, duration_s)
+    assert monitor is not None or simulator.get_context().get_time() == duration_s
     return adaptation, adopted
 
 
@@ -91,8 +93,9 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(settings
     assert len(adaptation.feedback) == 5
     assert adaptation.adapted == [("paper", number) for number in numbers]
     assert [adapted for _, adapted in adopted] == adaptation.adapted
+    # At the last row of a window, and not within a step of the simulator.
     times = [0.4 * number for number in numbers]
-    assert [time_s for time_s, _ in adopted] == pytest.approx(times, abs=1.5 * STEP_S)
+    assert [time_s for time_s, _ in adopted] == pytest.approx(times)
 
 
 def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_memory():
@@ -101,11 +104,22 @@ def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_mem
     assert len(adopted) == 10
     assert [one.index for one in adaptation.feedback] == [7, 8, 9]
     assert [number for _, number in adaptation.adapted] == [3] * 8  # Of the newest updates.
+    assert adaptation.num_updates == 10
 
 
 def test_nothing_is_adapted_before_the_first_window_ends():
     adaptation, adopted = run(0.35, update_interval=1)
     assert not adaptation.feedback and not adopted
+
+
+def test_a_monitor_that_ends_the_simulation_ends_it_here_too():
+    def monitor(context):
+        if context.get_time() > 0.85:
+            return EventStatus.ReachedTermination(None, "enough")
+        return EventStatus.DidNothing()
+
+    adaptation, _ = run(2.05, monitor=monitor, update_interval=1)
+    assert adaptation.num_updates == 2
 
 
 def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterwards():
@@ -120,12 +134,11 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     simulator = Simulator(builder.Build())
     assessor = loop.GetSubsystemByName("safety_assessor")
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
-    simulator.set_monitor(online)
     root = simulator.get_mutable_context()
     for index in range(3):
         loop.reset(root, episode_rng(7, index))
         simulator.Initialize()
-        simulator.AdvanceTo(scenario.episode_duration_s + 0.5 * scenario.control_period_s)
+        online.advance(simulator, scenario.episode_duration_s + 0.5 * scenario.control_period_s)
     alone = scenario.make_loop("payload", ball=False)
     for index in range(3):
         # A loop in a diagram begins and moves as it does alone. One that falls may come back into
@@ -139,6 +152,6 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     assert len(online.adapted) == len(online.feedback) // 2 > 0
     expected = prior.adapt(online.feedback[: 2 * len(online.adapted)])
     np.testing.assert_array_equal(online.adapted[-1].beliefs_, expected.beliefs_)
-    context = assessor.GetMyContextFromRoot(root)
-    np.testing.assert_array_equal(assessor.get_beliefs(context), expected.beliefs_)
+    context = assessor.evaluator.GetMyContextFromRoot(root)
+    np.testing.assert_array_equal(assessor.evaluator.get_beliefs(context), expected.beliefs_)
     assert not np.array_equal(expected.beliefs_, prior.beliefs_)

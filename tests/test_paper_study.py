@@ -11,8 +11,8 @@ from drake_safety.simulation.scenario import load_scenario
 from lip_assessments import QUICK
 from lip_episodes import make_episodes
 from studies.converged import judged_rules, nominal_feedback, recalls
+from studies.documents import render
 from studies.readings import Reading, readings_of
-from studies.readme import converged_text, readings_text, summary_text
 
 
 @pytest.mark.parametrize(
@@ -84,14 +84,14 @@ def test_the_tables_of_the_papers_mode_say_what_was_found():
     estimates = {f"readings.{i}.{key}": one for i in range(2) for key in keys}
     estimates |= {f"converged.{key}": one for key in keys}
     found = Results(estimates, {"readings": entries, "converged": entries})
-    text = readings_text(found)
+    text = render("readings", found)
     assert "python -m studies x" in text and "| raw x | 0.500 (0.400–0.600) |" in text
     assert "64 episodes" in text and "100 fresh ones of seed 3" in text
-    text = converged_text(found)
+    text = render("converged", found)
     assert "k = 0: b_safe < 0.6, after adaptation | 0.50 | 0.500" in text
     assert "fair" not in text and "throws" not in text
     estimates |= {f"converged.{key}": one for key in [*throws, "throws.falls_without_recovery"]}
-    text = converged_text(Results(estimates, found.entries))
+    text = render("converged", Results(estimates, found.entries))
     assert "| after adaptation | 50.0 % (40.0–60.0) | 50.0 % (40.0–60.0) |" in text
     assert "after 8 pairs" in text
 
@@ -106,7 +106,7 @@ def test_the_summary_shows_the_papers_mode_after_its_adaptation():
         dict.fromkeys(keys, one),
         entries | {"converged": entries | {"training_episodes": 9}},
     )
-    text = summary_text(found)
+    text = render("summary", found)
     assert "`paper` has learned from 9 episodes." in text
     rates = "25.0 % (20.0–30.0) | 25.0 % (20.0–30.0)"
     auc = "0.250 (0.200–0.300) | 0.250 (0.200–0.300)"

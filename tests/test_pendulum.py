@@ -11,7 +11,7 @@ from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import parse_scenario
-from studies.known_truth import agreement, simulate_truth
+from studies.truth import agreement, simulate_truth
 
 
 @pytest.fixture(scope="module")

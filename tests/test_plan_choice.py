@@ -17,8 +17,6 @@ THRESHOLD = 0.5
 class SlowIsSafe(FieldAssessment):
     """Γ falls with the speed along x."""
 
-    uses_features = True
-
     def __init__(self):
         super().__init__(lambda state: np.exp(-state[:, 3]))
 
@@ -66,7 +64,6 @@ def test_where_no_plan_passes_the_choice_asks_for_another_target(loop, context):
 def test_of_equally_good_plans_the_first_stays(loop, context):
     before = state(loop, context)
     indifferent = FieldAssessment(lambda goals: np.full(len(goals), 0.7))
-    indifferent.uses_features = True
     choice = choose_plan(
         loop, indifferent, context, threshold=THRESHOLD, rng=np.random.default_rng(0)
     )

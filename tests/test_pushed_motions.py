@@ -5,12 +5,11 @@ import pytest
 
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation import pushed_motions
-from drake_safety.simulation.pushed_motions import run_pushed_motion, run_pushed_motions
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import ThrowLog
-from drake_safety.simulation.watched_motion import WatchedMotion
 from shuttle_task import shuttling
+from studies.alarms import WatchedMotion
+from studies.pushed_motions import run_pushed_motion, run_pushed_motions
 
 
 @pytest.fixture(scope="module")
@@ -46,52 +45,6 @@ def test_a_motion_follows_from_its_seed_and_index_alone(motions):
     for again, before in zip(run_pushed_motion(loop, 5, seed=4), motions[10:12], strict=True):
         np.testing.assert_array_equal(again.state, before.state)
         assert again.push_time_s == before.push_time_s
-
-
-def assert_same(some, others):
-    for one, other in zip(some, others, strict=True):
-        for name, value in vars(one).items():
-            np.testing.assert_array_equal(getattr(other, name), value)
-            assert type(getattr(other, name)) is type(value)
-
-
-def test_pairs_are_kept_as_they_finish_and_not_simulated_again(motions, tmp_path, monkeypatch):
-    indices = []
-
-    def counted(loop, index, *, seed):
-        indices.append(index)
-        return run_pushed_motion(loop, index, seed=seed)
-
-    def stop(done, total):
-        if done >= 4:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(pushed_motions, "run_pushed_motion", counted)
-    options = {"seed": 4, "variation": "nominal", "num_workers": 1, "path": tmp_path}
-    with pytest.raises(KeyboardInterrupt):
-        run_pushed_motions(shuttling(), 12, **options, progress=stop)
-    assert indices == [0, 1, 2, 3]
-    calls = []
-    again = run_pushed_motions(
-        shuttling(), 12, **options, progress=lambda *call: calls.append(call)
-    )
-    assert indices == list(range(12))
-    assert calls[0] == (4, 12) and calls[-1] == (12, 12)
-    assert_same(again, motions)
-    assert_same(run_pushed_motions(shuttling(), 5, **options), motions[:10])
-    assert indices == list(range(12))
-    for other in ({"seed": 5}, {"variation": "actual"}):
-        with pytest.raises(ValueError, match="holds episodes of another set"):
-            run_pushed_motions(shuttling(), 5, **{**options, **other})
-
-
-def test_a_damaged_pair_is_named(tmp_path):
-    options = {"seed": 4, "variation": "nominal", "num_workers": 1, "path": tmp_path}
-    run_pushed_motions(shuttling(), 2, **options)
-    file = tmp_path / "motions-00001.npz"
-    file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(ValueError, match=r"motions-00001\.npz .*damaged.*remove it"):
-        run_pushed_motions(shuttling(), 2, **options)
 
 
 def test_goals_that_nobody_reaches_safely_are_no_place_to_be_pushed_on_the_way_to(monkeypatch):

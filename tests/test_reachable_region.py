@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.evaluation.plan_study import SAFE
-from drake_safety.evaluation.reachable_region import plane_of, reachable_region
-from drake_safety.evaluation.region_figure import region_figure
 from drake_safety.evaluation.scorers import assessment_scorer
 from shuttle_task import BOX, FAIR_X_M, shuttling
+from studies.reachable_region import SAFE, reachable_region, region_figure
 
 
 @pytest.fixture(scope="module")
@@ -17,11 +15,15 @@ def assessment():
     return SafetyAssessment(scenario.assessment).fit(run_episodes(scenario, 80, num_workers=1))
 
 
+def on_plane(assessment, **options):
+    return reachable_region(
+        shuttling(), assessment, lambda *_: None, threshold=0.5, num_workers=1, **options
+    )
+
+
 @pytest.fixture(scope="module")
 def region(assessment):
-    return reachable_region(
-        shuttling(), assessment, threshold=0.5, x_m=0.9, step_m=0.3, num_workers=1
-    )
+    return on_plane(assessment, x_m=0.9, step_m=0.3)
 
 
 @pytest.mark.train
@@ -48,9 +50,7 @@ def test_the_truth_is_what_the_simulation_says_of_each_target(region):
 
 @pytest.mark.train
 def test_beyond_a_wall_the_truth_is_that_wall(assessment):
-    region = reachable_region(
-        shuttling(), assessment, threshold=0.5, x_m=1.2, step_m=0.6, num_workers=1
-    )
+    region = on_plane(assessment, x_m=1.2, step_m=0.6)
     assert set(region.outcomes[region.outcomes != "flank"]) == {"front"}
     assert region.estimates()["share_safe"].value == 0.0
 
@@ -83,25 +83,9 @@ def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
     assert not any(name.startswith("reachability") for name in estimates)
 
 
-def test_the_plane_is_in_the_middle_of_the_fair_box_unless_it_is_said_where():
-    loop = shuttling().make_loop()
-    x, box = plane_of(loop, None, 0.1)
-    assert x == pytest.approx(0.5 * (FAIR_X_M + BOX[1, 0]))
-    np.testing.assert_array_equal(box, BOX[:, 1:])
-    assert plane_of(loop, 0.7, 0.1)[0] == 0.7
-
-
-@pytest.mark.parametrize(
-    ("x", "step", "message"),
-    [
-        (2.0, 0.1, r"x = 2 m misses the target box, 0.6..1.4 m"),
-        (0.9, 0.0, "the step must be positive"),
-        (0.9, 1.0, "no longer than the target box's sides"),
-    ],
-)
-def test_a_plane_that_cannot_be_is_refused(x, step, message):
-    with pytest.raises(ValueError, match=message):
-        plane_of(shuttling().make_loop(), x, step)
+@pytest.mark.train
+def test_the_plane_is_in_the_middle_of_the_fair_box_unless_it_is_said_where(assessment):
+    assert on_plane(assessment, step_m=0.8).x_m == pytest.approx(0.5 * (FAIR_X_M + BOX[1, 0]))
 
 
 @pytest.mark.train

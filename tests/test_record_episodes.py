@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 
 import quadrotor_file
-from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, record_episodes
+from drake_safety import record_episodes
 from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 
@@ -258,27 +258,6 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
         simulator.Initialize()
         gamma.append(diagram.GetOutputPort("gamma").Eval(context)[0])
     assert gamma[0] > 0.6 > gamma[1]
-
-
-@pytest.mark.train
-def test_an_assessor_refuses_ports_that_its_assessment_does_not_know():
-    assessment = SafetyAssessment(
-        AssessmentParameters(horizon=5, epochs=2, ensemble_size=1, hidden_sizes=[8], perplexity=5)
-    ).fit(record(30))
-    builder = DiagramBuilder()
-    glider = builder.AddSystem(Glider(None))
-    state, preview = (glider.GetOutputPort(n) for n in ("position_and_speed", "desired_preview"))
-    with pytest.raises(ValueError, match=r"'output' for state has size 1; .* fitted with 2"):
-        AddSafetyAssessor(
-            builder, assessment, state=glider.GetOutputPort("output"), desired_preview=preview
-        )
-    assessor = AddSafetyAssessor(builder, assessment, state=state, desired_preview=preview)
-    context = builder.Build().CreateDefaultContext()
-    assert (
-        0
-        <= assessor.GetOutputPort("safety_probability").Eval(assessor.GetMyContextFromRoot(context))
-        <= 1
-    )
 
 
 @pytest.mark.train

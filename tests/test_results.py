@@ -63,7 +63,7 @@ def test_what_is_written_is_read_again_with_six_digits(tmp_path):
         ({"../../x.y": [1.0, 0.0, 1.0, 1]}, "between dots"),
         ({"x.y": ["much", 0.0, 1.0, 1]}, "much"),
         ({"x.y": [1.0, 0.0, 1.0, 1e999]}, "infinity"),
-        ({"x.y": [1.0]}, "argument"),
+        ({"x.y": [1.0]}, "not enough values"),
     ],
 )
 def test_a_forged_file_is_not_read(tmp_path, figures, words):

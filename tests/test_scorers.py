@@ -3,8 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.baselines import KINDS, DirectClassifier
-from drake_safety.evaluation.scorers import Scorer, assessment_scorer, classifier_scorers
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
 
@@ -56,28 +55,3 @@ def test_an_assessment_scores_by_its_probability_on_what_its_mode_sees(episodes,
     score = scorer.unsafe_score(segments)
     assert (score[is_unknown] == 1.0).all()
     assert not np.isnan(score).any()
-
-
-@pytest.mark.train
-def test_every_direct_classifier_is_a_scorer_and_says_how_far_its_training_is(episodes):
-    reports = []
-    scorers = classifier_scorers(episodes, lambda *report: reports.append(report))
-    assert [scorer.name for scorer in scorers] == list(KINDS)
-    assert [done for _, done, _ in reports] == list(range(len(KINDS) + 1))
-    segments = split(episodes, stride=1, discount=1.0)
-    for scorer in scorers:
-        score = scorer.unsafe_score(segments)
-        assert score[segments.is_unsafe].mean() > score[~segments.is_unsafe].mean()
-
-
-@pytest.mark.train
-def test_direct_classifiers_learn_from_the_segments_they_are_told_to(episodes):
-    whole, short = (
-        DirectClassifier("gradient_boosting", shortest=shortest).fit(episodes)
-        for shortest in (None, 1)
-    )
-    segments = split(episodes, stride=1, discount=1.0, shortest=1)
-    rows = segments.take(~segments.is_unsafe & (segments.length < episodes.info.horizon))
-    # Only one of them has seen how safe episodes end.
-    inputs = (rows.state, rows.desired_preview, rows.features)
-    assert short.predict_unsafe(*inputs).mean() < whole.predict_unsafe(*inputs).mean()

@@ -24,8 +24,8 @@ from drake_safety.learning.seeds import (
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import run_pairs
 from lip_episodes import make_episodes
-from studies.ablate import ablate
-from studies.plan_study import plan_study
+from studies.ablation import ablate
+from studies.planning import plan_study
 
 
 def default_seed(function):

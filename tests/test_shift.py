@@ -8,6 +8,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_scenario
+from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.shift import Fault, JointShift, Shift
@@ -150,6 +151,16 @@ def test_a_faulty_input_does_not_change_the_motion(fault, seen):
     np.testing.assert_array_equal(episode.true_state, plain.true_state)
     assert seen(episode.state, episode.true_state)
     assert not seen(plain.state, plain.true_state)
+
+
+def test_the_delays_of_the_catalogue_fit_every_period():
+    scenario = load_scenario(SCENARIO)
+    loop = scenario.make_loop()
+    scenario.time_step_s, scenario.control_period_s = 0.004, 0.03
+    shifts = plant_shifts(scenario, loop)
+    assert shifts["late_command"].variation.shift.command_delay_s == pytest.approx(0.152)
+    (stale,) = shifts["stale"].variation.shift.sensor_faults
+    assert stale.value == pytest.approx(0.21)
 
 
 def test_noise_of_a_fault_follows_from_the_episode():

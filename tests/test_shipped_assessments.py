@@ -20,9 +20,8 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import SCENARIO
-from studies.cards import CARD_FILE, card_text
-from studies.shipping import NUM_EPISODES, check_shipped
-from studies.stored_results import EVALUATION_FILE
+from studies.documents import CARD_FILE, EVALUATION_FILE, card_text
+from studies.publish import NUM_EPISODES, check_shipped
 
 NAME = "shuttling"
 MEGABYTE = 1e6
@@ -93,11 +92,11 @@ def run(tmp_path_factory):
             learned = SafetyAssessment(scenario.assessment).fit(episodes)
             learned.save(assessment_file(folder, mode))
         options = ("--assessment", folder, "--workers", 1)
-        calibrated = ("--episodes", 120, "--splits", 0, "--miss-rate", 0.1)
+        calibrated = ("--episodes", 120, "--miss-rate", 0.1)
         assert call(patch, "calibrate", NAME, *options, *calibrated) == 0
         patch.setattr("drake_safety.evaluation.figure_style.save", lambda estimate, path: [])
-        judged = ("--episodes", 30, "--calibration-episodes", 20, "--plane-step", 0)
-        assert call(patch, "evaluate", NAME, *options, *judged, "--other-hand", 0) == 0
+        judged = ("--episodes", 30, "--calibration-episodes", 20)
+        assert call(patch, "evaluate", NAME, *options, *judged) == 0
     return scenarios, folder
 
 
@@ -260,7 +259,7 @@ def test_a_command_takes_the_shipped_assessment_and_says_so(package, monkeypatch
     told = capsys.readouterr().out
     assert f"comes with the package, {package / NAME}" in told
     assert "at most 10 % of unsafe episodes called safe" in told
-    calibrated = ("--episodes", 60, "--splits", 0, "--miss-rate", 0.2, "--workers", 1)
+    calibrated = ("--episodes", 60, "--miss-rate", 0.2, "--workers", 1)
     assert call(monkeypatch, "calibrate", NAME, *calibrated) == 0
     # What is written goes to the working folder, never into the package.
     assert {path: path.read_bytes() for path in package.rglob("*") if path.is_file()} == before

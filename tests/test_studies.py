@@ -1,20 +1,22 @@
 """The studies' commands, on a task that is cheap."""
 
-import json
 import shutil
 import sys
+from dataclasses import replace
 
 import pytest
 import typer
 
+from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation import rollouts
+from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
-from studies import ablation_study, planning_study
+from studies import planning, scale
 from studies.__main__ import app, main
-from studies.learning_curve import parse_sizes
 
 
 def call(monkeypatch, *arguments):
@@ -31,31 +33,33 @@ def run(tmp_path_factory):
     return train_shuttle(folder), folder
 
 
+def results_of(monkeypatch, capsys, folder, name, *arguments):
+    """The results that a command writes into the folder as NAME.json, and what it prints."""
+    assert call(monkeypatch, *arguments) in (0, None)
+    results = Results.read(folder / f"{name}.json")
+    assert results.entries["command"].startswith(f"python -m studies {arguments[0]} ")
+    return results, " ".join(capsys.readouterr().out.split())
+
+
+FRESH = ("--episodes", 40, "--calibration-episodes", 30, "--seed", 100, "--workers", 1)
+
+
 @pytest.mark.slow
-def test_an_ablation_writes_a_row_a_variant_and_goes_on_where_it_was_stopped(
+def test_an_ablation_gives_rows_of_every_variant_and_goes_on_where_it_was_stopped(
     monkeypatch, capsys, run
 ):
     file, folder = run
-    options = ("--assessment", folder, "--quick", "--workers", 1, "--episodes", 40)
-    options += ("--calibration-episodes", 30, "--seed", 100)
-    assert call(monkeypatch, "ablate", file, *options) in (0, None)
-    printed = capsys.readouterr().out
-    report = json.loads((folder / "ablation_quick.json").read_text())
-    names = [row["name"] for row in report["rows"]]
-    assert names[0] == "baseline"
-    assert {"score_weight=0.1", "horizon=half", "episodes=half", "paper"} <= set(names)
-    for row in report["rows"]:
-        assert row["name"] in printed and row["figures"]["k0.auc"]["n"] == 40
-    # The shuttle's states are not named after what they are, and nobody has adapted.
-    assert report["left_out"].keys() >= {"horizon H", "velocities", "n_f"}
-    assert "left out, n_f: there are no pairs" in printed
-    for suffix in (".csv", ".png", ".svg"):
-        assert (folder / f"ablation_quick{suffix}").is_file()
-    monkeypatch.setattr(ablation_study, "unsafe_scores", None)
+    options = ("ablate", file, "--assessment", folder, "--only", "min_count", *FRESH)
+    found, printed = results_of(monkeypatch, capsys, folder, "ablation", *options)
+    names = ["baseline", "min_count 1", "min_count 20", "min_count 50"]
+    assert [row.method for row in found.select(set="k0", metric="auc")] == names
+    assert all(row.n == 40 for row in found.select(set="k0", metric="auc"))
+    assert "min_count 20" in printed.replace("min count", "min_count")
+    assert (folder / "ablation.png").is_file()
+    monkeypatch.setattr(SafetyAssessment, "fit", None)
     monkeypatch.setattr(rollouts, "run_episode", None)
-    assert call(monkeypatch, "ablate", file, *options) in (0, None)
-    again = json.loads((folder / "ablation_quick.json").read_text())
-    assert again["rows"] == report["rows"]
+    again, _ = results_of(monkeypatch, capsys, folder, "ablation", *options)
+    assert dict(again) == dict(found)
     assert call(monkeypatch, "ablate", file, "--assessment", folder, "--seed", 0) == 2
     assert "start as the" in " ".join(capsys.readouterr().out.split())
 
@@ -66,57 +70,49 @@ def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(monkeypatch, capsys,
     folder = tmp_path / "never_judged"  # Others evaluate theirs, which chooses a threshold.
     folder.mkdir()
     shutil.copy(trained / "sharpened.safetensors", folder)
-    options = ("--assessment", folder, "--episodes", 10, "--candidates", 3, "--workers", 1)
-    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path) in (0, None)
-    printed = capsys.readouterr().out
-    report = json.loads((tmp_path / "planning.json").read_text())
-    shares = [report[f"planning.{name}"]["value"] for name in ("default", "best_in_hindsight")]
-    assert shares[0] <= report["planning.chosen"]["value"] <= shares[1]
-    assert report["planning.default"]["n"] == report["candidates"] + 7 == 10
-    for name in ("default plan", "chosen by Γ", "best in hindsight", "promises nothing"):
-        assert name in printed
+    options = ("plan-study", file, "--assessment", folder, "--episodes", 10, "--candidates", 3)
+    options += ("--workers", 1, "--out", tmp_path)
+    found, printed = results_of(monkeypatch, capsys, tmp_path, "planning", *options)
+    shares = [
+        found[f"planning.{name}.safe"] for name in ("default plan", "chosen", "best in hindsight")
+    ]
+    assert sorted(one.value for one in shares) == [one.value for one in shares]
+    assert {one.n for one in shares} == {10}
+    assert "promises nothing" in printed
     # The motions are kept with the assessment: a second study simulates nothing.
-    monkeypatch.setattr(planning_study, "run_episode", None)
-    assert call(monkeypatch, "plan-study", file, *options, "--out", tmp_path / "b") in (0, None)
-    again = json.loads((tmp_path / "b" / "planning.json").read_text())
-    assert all(again[key] == report[key] for key in report if key.startswith("planning."))
+    monkeypatch.setattr(planning, "run_episode", None)
+    again, _ = results_of(monkeypatch, capsys, tmp_path, "planning", *options)
+    assert dict(again) == dict(found)
     monkeypatch.undo()
-    assert call(monkeypatch, "plan-study", file, *options, "--seed", 0) == 2
+    assert call(monkeypatch, *options, "--seed", 0) == 2
     assert "start as the" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_a_learning_curve_is_drawn_and_stored_with_the_evaluation(monkeypatch, capsys, run):
+def test_studies_of_a_run_are_stored_with_its_evaluation(monkeypatch, capsys, run):
     file, folder = run
-    options = ("--assessment", folder, "--episodes", 30, "--calibration-episodes", 20)
-    options += ("--workers", 1, "--seed", 100)
-    assert call(monkeypatch, "learning-curve", file, *options, "--sizes", "40,60") in (0, None)
-    assert "Learning curve" in capsys.readouterr().out
-    curve = Results.read(folder / "learning_curve.json")
-    assert {"plans.learning_curve.40.auc", "plans.learning_curve.60.fair.brier"} <= curve.keys()
-    assert curve.entries["command"].startswith("python -m studies learning-curve ")
-    assert (folder / "learning_curve.png").is_file()
-    assert call(monkeypatch, "learning-curve", file, *options, "--sizes", "61") == 2
-    assert "60 training episodes; got sizes [61]" in capsys.readouterr().out
-    # Stored beside the evaluation that it belongs to, and refused beside another.
-    judged = {"plans.sharpened.auc": proportion(29, 30)}
-    Results(judged, curve.entries).write(folder / "evaluation.json")
+    options = (file, "--assessment", folder, "--episodes", 40, "--seed", 100, "--workers", 1)
+    # A promised miss rate takes more than a hundred unsafe episodes.
+    more = (*options, "--calibration-episodes", 300)
+    found, _ = results_of(monkeypatch, capsys, folder, "converged", "converged", *more)
+    assert {"converged.first.literal.auc", "converged.fair.converged.auc"} <= set(found)
+    only = ("--calibration-episodes", 30, "--only", "none", "--sizes", 60)
+    found, _ = results_of(monkeypatch, capsys, folder, "readings", "readings", *options, *only)
+    assert found.entries["names"] == ["default, 60 episodes"]
+    assert found["readings.0.first.normalized.auc"].n == 40
+    assert call(monkeypatch, "readings", *options, "--only", "default") == 2
+    assert "holds 60 episodes, expected at least 1024" in " ".join(capsys.readouterr().out.split())
+    Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
+        folder / "evaluation.json"
+    )
     stored = folder / "stored.json"
     assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) in (0, None)
-    found = Results.read(stored)
-    assert {"plans.sharpened.auc", "plans.learning_curve.40.auc"} <= found.keys()
-    Results(judged, curve.entries | {"seed": 7}).write(folder / "evaluation.json")
-    assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) == 2
-    assert "is of another training or other seeds" in " ".join(capsys.readouterr().out.split())
-    for name in ("evaluation.json", "learning_curve.json"):
-        (folder / name).unlink()
-
-
-def test_sizes_of_a_learning_curve_are_numbers_between_commas():
-    assert parse_sizes("512,1024") == (512, 1024)
-    assert parse_sizes("") == ()
-    with pytest.raises(ValueError, match="--sizes 'many': give numbers of episodes"):
-        parse_sizes("many")
+    again = Results.read(stored)
+    assert {"plans.sharpened.auc", "converged.first.literal.auc"} <= set(again)
+    assert again.entries["converged"]["feedback_episodes"] == 300
+    assert again.entries["readings"]["seed"] == 100
+    for name in ("evaluation", "converged", "readings"):
+        (folder / f"{name}.json").unlink()
 
 
 @pytest.mark.slow
@@ -126,16 +122,43 @@ def test_adaptation_is_judged_on_several_pools_beside_its_baselines(monkeypatch,
     name = next(one for one in scenario.variations if one != "nominal")
     options = ("--assessment", folder, "--variation", name, "--feedback", 40, "--evaluate", 20)
     options += ("--pools", 2, "--oracle", 40, "--scratch", "--workers", 1)
-    assert call(monkeypatch, "adaptation", file, *options) in (0, None)
-    printed = capsys.readouterr().out
-    assert "2 pools of feedback" in " ".join(printed.split())
-    study = folder / f"adapted-{name}"
-    report = json.loads((study / "study.json").read_text())
-    assert report["feedback_sets"] == [40, 40]
-    keys = {"prior", "adapted.40", "oracle", "scratch.40"}
-    assert {f"sharpened.{key}.calibrated.brier" for key in keys} <= report.keys()
-    for picture in ("study_calibrated", "study_grid", "adaptation_sharpened"):
-        assert (study / f"{picture}.png").is_file()
+    out = folder / f"adapted-{name}"
+    found, _ = results_of(monkeypatch, capsys, out, "study", "adaptation", file, *options)
+    assert found.entries["feedback_sets"] == [40, 40]
+    for method in ("prior", "adapted 40", "oracle", "scratch 40"):
+        assert found[f"sharpened.calibrated.{method}.brier"].n == 40
+    for picture in ("study", "adaptation_sharpened"):
+        assert (out / f"{picture}.png").is_file()
+
+
+@pytest.mark.slow
+def test_scale_learns_in_a_process_of_its_own_and_keeps_what_it_has(monkeypatch, capsys, run):
+    file, folder = run
+    options = ("scale", file, "--assessment", folder, "--sizes", "200", "--exact", "200")
+    options += ("--episodes", 20, "--seed", 100, "--workers", 1)
+    found, _ = results_of(monkeypatch, capsys, folder, "scale", *options)
+    assert found["costs.paper 200.segments"].value >= 200
+    assert "segments.paper 200 exact.approximate minus exact" in found
+    monkeypatch.setattr(scale, "learned_row", None)
+    again, _ = results_of(monkeypatch, capsys, folder, "scale", *options)
+    assert dict(again) == dict(found)
+
+
+@pytest.mark.slow
+def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, capsys, tmp_path):
+    scenario = load_scenario("pendulum")
+    episodes = run_episodes(scenario, 120, num_workers=1, path=episodes_folder(tmp_path))
+    for mode in MODES:
+        scenario.assessment = replace(scenario.assessment, mode=mode, epochs=2, ensemble_size=1)
+        learned = SafetyAssessment(scenario.assessment).fit(episodes)
+        learned.save(assessment_file(tmp_path, mode))
+    options = ("--assessment", tmp_path, "--episodes", 20, "--resolution", 3, "--workers", 1)
+    found, _ = results_of(
+        monkeypatch, capsys, tmp_path, "known_truth", "truth", "pendulum", *options
+    )
+    assert found["hold.paper.safe_share"].n == 9
+    assert found["random.sharpened.confident_errors"].n == 20
+    assert (tmp_path / "known_truth_paper.png").is_file()
 
 
 @pytest.mark.train
@@ -150,13 +173,10 @@ def test_every_study_says_in_a_sentence_what_it_does():
     assert list(commands) == [
         "ablate",
         "plan-study",
-        "learning-curve",
         "adaptation",
         "readings",
         "converged",
-        "kills",
         "scale",
-        "soak",
         "truth",
         "walking",
         "bench",

@@ -5,15 +5,10 @@ import pytest
 
 from drake_safety.evaluation import throw_study
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.throw_study import (
-    ThrowStudy,
-    TriggerRule,
-    choose_threshold,
-    evaluate_throws,
-)
-from drake_safety.evaluation.throws_figure import OUTCOMES
+from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.throws import ThrowLog
+from studies.throws import choose_threshold, classifier_rules
 
 IMPACT_S, LEAVE_S, FALL_S = 0.5, 0.8, 1.0
 TIME_S = np.arange(0.0, 1.02, 0.02)
@@ -77,75 +72,49 @@ def rule(name, threshold, delay_rows=0):
     )
 
 
-def study_of(rules, **options):
-    numbers = {"num_throws": 9, "num_calibration": 6, "seed": 1, "calibration_seed": 2}
-    return evaluate_throws(None, rules, **numbers | options)
+CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
 
 
 def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(simulation):
-    study = study_of([rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)])
-    assert study.estimates["throws.falls_without_recovery"].value == 3 / 9
-    assert study.estimates["throws.prompt.falls_with_recovery"].value == 0.0
-    assert study.estimates["throws.late.falls_with_recovery"].value == 3 / 9
-    assert study.estimates["throws.late.falls_missed"].value == 0.0
-    assert study.estimates["throws.prompt.trigger_after_impact_s"].value == pytest.approx(0.0)
-    assert study.estimates["throws.late.trigger_after_impact_s"].value == pytest.approx(0.2)
-    assert study.estimates["throws.late.trigger_before_fall_s"].value == pytest.approx(0.3)
-    assert study.outcomes("prompt") == 3 * ["recovered", "survived", "survived"]
-    assert study.outcomes("late") == study.outcomes() == 3 * ["fell", "survived", "survived"]
+    found, logs = evaluate_throws(
+        None, [rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)], num_throws=9, seed=1
+    )
+    assert [log.index for log in logs] == list(range(9))
+    assert found["throws.falls_without_recovery"].value == 3 / 9
+    assert found["throws.prompt.falls_with_recovery"].value == 0.0
+    assert found["throws.late.falls_with_recovery"].value == 3 / 9
+    assert found["throws.late.falls_missed"].value == 0.0
+    assert found["throws.prompt.false_triggers"].value == 0.0
+    assert found["throws.prompt.trigger_after_impact_s"].value == pytest.approx(0.0)
+    assert found["throws.late.trigger_after_impact_s"].value == pytest.approx(0.2)
+    assert found["throws.late.trigger_before_fall_s"].value == pytest.approx(0.3)
 
 
 def test_a_recovery_that_rules_agree_on_is_simulated_once(simulation):
     same = [rule("one", 0.6), rule("other", 0.5), rule("late", 0.5, delay_rows=2)]
     reports = []
-    study = study_of(same, progress=lambda *report: reports.append(report))
+    evaluate_throws(
+        None, same, num_throws=9, seed=1, progress=lambda *report: reports.append(report)
+    )
     recoveries = [times for _, times in simulation.calls if times is not None]
     # Three throws are triggered at two instants each; a round has every throw once.
     assert [sorted(times) for times in recoveries] == [[0, 3, 6], [0, 3, 6]]
-    for index in (0, 3, 6):
-        assert study.recovered["one"][index] is study.recovered["other"][index]
-        assert study.recovered["late"][index].trigger_time_s == pytest.approx(IMPACT_S + 0.04)
+    assert recoveries[1][0] - recoveries[0][0] == pytest.approx(0.04)
     done = [report for report in reports if report[0] == "throws, with recovery"]
     assert done == [("throws, with recovery", count, 6) for count in range(1, 7)]
 
 
-def test_thresholds_left_open_are_chosen_on_other_throws(simulation):
-    study = study_of([rule("given", 0.6), rule("open", None)])
-    assert study.thresholds["given"] == 0.6
-    assert study.thresholds["open"] == study.estimates["throws.open.threshold"].value > 0.6
-    assert simulation.calls[0] == ((0, 1, 2, 3, 4, 5), None)
-    assert [log.index for log in study.calibration_logs] == [0, 1, 2, 3, 4, 5]
-
-
-def test_throws_that_are_judged_are_not_those_that_thresholds_are_chosen_on(simulation):
-    with pytest.raises(ValueError, match="seed and calibration seed are both 1; they must differ"):
-        study_of([rule("open", None)], calibration_seed=1)
-
-
 def test_the_chosen_threshold_is_the_highest_with_few_enough_false_triggers():
     logs = [log_of(index) for index in range(40)]
-    probabilities = [log.state[:, 0] for log in logs]
-    lowest = np.array([p.min() for p in probabilities])
+    lowest = np.array([log.state[:, 0].min() for log in logs])
     for bound in (0.0, 0.1, 0.5):
-        threshold = choose_threshold(logs, probabilities, max_false_share=bound)
+        threshold = choose_threshold(logs, CALM, max_false_share=bound)
         assert (lowest < threshold).mean() <= bound
         assert (lowest < threshold + 0.0101).mean() > bound
+    (one,) = classifier_rules([CALM], logs, 0.0)
+    assert (one.name, one.threshold) == ("calm", choose_threshold(logs, CALM))
     with pytest.raises(ValueError, match="no calibration throw stays in the safe set"):
-        choose_threshold([log_of(0, falls=True)], [np.ones(3)])
-
-
-def test_outcomes_are_told_in_the_words_of_the_figure():
-    logs = [log_of(0), log_of(1), log_of(2, leaves=True), log_of(3, falls=True)]
-    study = ThrowStudy(
-        estimates={},
-        logs=logs,
-        trigger_times_s={},
-        recovered={"rule": {1: log_of(1), 2: log_of(2, leaves=True)}},
-        thresholds={},
-    )
-    assert study.outcomes("rule") == ["survived", "false trigger", "recovered", "fell"]
-    assert study.outcomes() == ["survived", "survived", "survived", "fell"]
-    assert set(study.outcomes("rule")) == set(OUTCOMES)
+        choose_threshold([log_of(0, falls=True)], CALM)
 
 
 def test_a_probability_that_is_not_known_triggers():

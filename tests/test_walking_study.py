@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.evaluation.alarms import Alarm
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
-from studies.walking_alarms import (
+from studies.alarms import Alarm
+from studies.documents import render
+from studies.walking import (
     alarm_estimates,
     alarm_thresholds,
     guard_estimates,
@@ -19,7 +20,6 @@ from studies.walking_alarms import (
     tour_estimates,
 )
 from studies.walking_motions import WalkedMotion, random_command, run_motions
-from studies.walking_table import walking_text
 
 ALARM = Alarm(name="value", value=lambda motion: motion.features[:, 0])
 
@@ -107,7 +107,7 @@ def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: P
     assert (tmp_path / "00000.npz").stat().st_mtime_ns == written
     np.testing.assert_array_equal(again[0].state, first.state)
     (tmp_path / "00001.npz").write_bytes(b"no motion")
-    with pytest.raises(ValueError, match=r"00001\.npz holds no motion"):
+    with pytest.raises(ValueError, match=r"00001\.npz is damaged"):
         run_motions(scenario, "tour", [1], **options)
 
 
@@ -124,12 +124,12 @@ def test_the_table_has_a_row_for_every_alarm_and_branch():
         estimates=dict.fromkeys(keys, estimate),
         entries={"walking": {"command": "run me", "thresholds": {"sharpened": 1, "tilt": 2}}},
     )
-    text = walking_text(results)
+    text = render("walking", results)
     assert text.startswith("```sh\nrun me\n```\n\nOf 10 tours")
     assert text.count("50.0 % (40.0–60.0)") == 9
     plans = {f"plans.mlp.{key}": estimate for key in ("auc", "safe_recall", "unsafe_recall")}
     plans["plans.outcomes.safe"] = estimate
-    with_plans = walking_text(Results({**results, **plans}, results.entries))
+    with_plans = render("walking", Results({**results, **plans}, results.entries))
     assert "| MLP | 0.500 (0.400–0.600) | 0.500" in with_plans
     for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| slower |"):
         assert row in text

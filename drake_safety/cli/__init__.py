@@ -68,7 +68,8 @@ COMMANDS = {
     ),
     "evaluate": Entry(
         "evaluate",
-        "Evaluate Γ on fresh episodes and throws.",
+        "Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other "
+        "plants.",
         "train",
         "",
     ),

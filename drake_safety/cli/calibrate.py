@@ -14,7 +14,6 @@ from drake_safety.cli.console import (
     ScenarioArgument,
     WorkersOption,
     console,
-    interval,
     new_table,
     open_stages,
     print_path,
@@ -29,7 +28,6 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.evaluation.calibration_study import PromiseKept, repeated_splits
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import KINDS, Calibration, episode_scores
@@ -54,9 +52,6 @@ def calibrate(
         typer.Option(help="Confidence of the promise, such as 0.95; on average by default."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Fresh episodes.", min=2)] = 1000,
-    splits: Annotated[
-        int, typer.Option(help="Number of splits that check the promises; 0 for none.", min=0)
-    ] = 200,
     variation: Annotated[
         str | None,
         typer.Option(
@@ -103,7 +98,6 @@ def calibrate(
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}
-    kept: dict[str, list[PromiseKept]] = {}
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
         for kind in KINDS:
@@ -120,16 +114,10 @@ def calibrate(
                 variation=plant,
             )
             found.setdefault(mode, []).append(one)
-            if splits and mode == MODES[0]:
-                kept[kind] = repeated_splits(
-                    of_episodes, is_unsafe, confidence=confidence, num_splits=splits, seed=seed
-                )
     for mode, gamma in learned.items():
         gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
         gamma.save(assessment_file(folder.out, mode))
     console.print(_table(found))
-    for kind, promises in kept.items():
-        console.print(_splits_table(kind, promises, splits))
     for mode in learned:
         print_path("calibrated", assessment_file(folder.out, mode))
 
@@ -159,28 +147,4 @@ def _table(found: dict[str, list[Calibration]]) -> Table:
                 f"{calibration.num_missed} of {calibration.num_unsafe}",
                 f"{calibration.num_accepted} of {calibration.num_safe}",
             )
-    return table
-
-
-def _splits_table(kind: str, promises: list[PromiseKept], num_splits: int) -> Table:
-    table = new_table(
-        "promised miss rate [%]",
-        "observed [%]",
-        "splits above it [%]",
-        "safe recall [%]",
-        title=f"{MODES[0]}, {kind}: calibrated on one half and tested on the other, "
-        f"{num_splits} splits",
-    )
-    for one in promises:
-        promised = f"{100 * one.miss_rate:g}"
-        if one.observed.n == 0:
-            missing = f"needs {one.num_needed} unsafe episodes in each half; there are "
-            table.add_row(promised, f"{missing}{one.num_calibration}", "-", "-")
-            continue
-        table.add_row(
-            promised,
-            interval(one.observed, 100, 2),
-            f"{100 * one.share_broken:.0f}",
-            interval(one.safe_recall, 100, 1),
-        )
     return table

@@ -1,13 +1,17 @@
-"""``drake-safety evaluate``: evaluates Γ on fresh episodes and throws, beside baselines."""
+"""``drake-safety evaluate``: evaluates Γ on fresh episodes, on throws, and under shifts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from matplotlib.figure import Figure
 
 from drake_safety.cli.console import (
     ClusterOption,
@@ -20,346 +24,312 @@ from drake_safety.cli.console import (
     print_path,
     versions,
 )
-from drake_safety.cli.evaluate_monitoring import evaluate_monitoring, evaluate_pushes
-from drake_safety.cli.evaluate_plans import (
-    PlanOptions,
-    check_options,
-    evaluate_plans,
-)
-from drake_safety.cli.evaluate_shifts import evaluate_shifts_command
-from drake_safety.cli.findings import Findings, Judged
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_file,
     check_fresh,
     check_writable,
-    episodes_folder,
+    fresh_episodes_folder,
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.learning.seeds import EVALUATION
+from drake_safety.evaluation import shift_study
+from drake_safety.evaluation.embedding_figure import embedding_figure
+from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.shift_study import Judge, JudgedShift, Motion, MotionSet, shifts_tables
+from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.tables import Table
+from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
+from drake_safety.evaluation.verdict_tables import verdict_tables
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.calibration import PLAN, episode_scores
+from drake_safety.learning.seeds import EVALUATION, SHIFTS, SeedBlock
+from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.throws import ThrowLog
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from drake_safety.evaluation.metrics import Estimate
-    from drake_safety.evaluation.throw_study import ThrowStudy
-    from drake_safety.learning.segments import Episodes
-
+SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
+_MOST_JUDGED = 1000  # Nominal motions under `--shifts`; all of them count for false alarms.
+
+
+@dataclass(kw_only=True)
+class Evaluation:
+    """An evaluation under way: what is judged, where the results go, and what was found.
+
+    Attributes:
+        assessments: Γ by mode.
+        seeds: Seeds of fresh simulations by purpose.
+        estimates: By dotted key.
+        pictures: Files of the figures.
+    """
+
+    scenario: Scenario
+    assessments: Mapping[str, SafetyAssessment]
+    run_folder: Path
+    folder: Path
+    seeds: Mapping[str, int]
+    workers: int | None
+    stages: StageProgress
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    pictures: list[Path] = field(default_factory=list)
+
+    @property
+    def scorers(self) -> list[Scorer]:
+        """The probability of either mode."""
+        return [assessment_scorer(mode, one) for mode, one in self.assessments.items()]
+
+    @property
+    def plan_thresholds(self) -> dict[str, float]:
+        """Stored thresholds of plans by mode, of the unsafe score."""
+        stored = {mode: one.calibrations_.get("plan") for mode, one in self.assessments.items()}
+        return {mode: 1.0 - one.threshold for mode, one in stored.items() if one is not None}
+
+    def fresh(self, what: str, number: int, purpose: str, **options: str) -> Episodes:
+        """Fresh nominal episodes, kept in the run's folder."""
+        return run_fresh_episodes(
+            self.scenario,
+            self.run_folder,
+            number,
+            self.seeds[purpose],
+            partial(self.stages, what),
+            self.workers,
+            **options,
+        )
+
+    def add(self, estimates: Mapping[str, Estimate], **figures: Figure) -> None:
+        """Adds results, and figures by name, which are written."""
+        self.estimates |= estimates
+        for name, figure in figures.items():
+            self.pictures += save(figure, self.folder / name)
 
 
 def evaluate(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    throws: Annotated[
-        int | None,
-        typer.Option(
-            help="Fresh throws at the actual plant; 600 by default for tasks with recovery.",
-            min=0,
-        ),
-    ] = None,
     calibration_episodes: Annotated[
         int, typer.Option(help="Other nominal episodes, for thresholds of the recalls.", min=20)
     ] = 300,
-    calibration_throws: Annotated[
-        int, typer.Option(help="Other throws, for thresholds of the baseline classifiers.", min=1)
-    ] = 200,
-    other_hand: Annotated[
+    throws: Annotated[
         int | None,
-        typer.Option(
-            help="Targets: number mirrored to the other hand; at most 400 by default.", min=0
-        ),
+        typer.Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
     ] = None,
-    plane_x: Annotated[
-        float | None,
-        typer.Option(help="Targets: x of the reachable region's plane [m]; the task's by default."),
-    ] = None,
-    plane_step: Annotated[
-        float,
-        typer.Option(
-            help="Targets: spacing of those simulated on it [m]; 0 to leave it out.", min=0
-        ),
-    ] = 0.1,
-    pushes: Annotated[
-        int,
-        typer.Option(
-            help="Targets: pushed motions of the actual robot, to evaluate alarms; as many more "
-            "for thresholds.",
-            min=0,
-        ),
-    ] = 0,
     shifts: Annotated[
         int,
         typer.Option(
-            help="Motions of each shift of plant, sensors and plans: evaluates Γ's \"don't know\" "
+            help="Motions of each changed plant and faulty sensor: evaluates Γ's \"don't know\" "
             "and the monitor instead of all else.",
             min=0,
         ),
     ] = 0,
-    baselines: Annotated[
-        bool,
-        typer.Option(
-            "--baselines/--no-baselines",
-            help="Baseline classifiers, trained on the same episodes; they take half of the time.",
-        ),
-    ] = True,
     seed: Annotated[
-        int, typer.Option(help="First of the seeds of fresh simulations.")
-    ] = EVALUATION.first,
+        int | None,
+        typer.Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Evaluate Γ on fresh episodes and throws.
+    """Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other plants.
 
-    For plans with a goal, verdicts on fresh targets at k = 0 are evaluated, beside inverse
-    kinematics. Episodes are kept in ASSESSMENT: a stopped evaluation continues. With throws, or
-    --pushes, Γ is evaluated as an alarm too, beside margins and tracking errors. With --shifts,
-    only motions under conditions that training does not have are evaluated.
+    It gives AUC, recalls and reliability, in every row and in the first of an episode, and falls
+    with and without recovery. Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
-    from drake_safety.evaluation.embedding_figure import embedding_figure
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.results import Results
-    from drake_safety.evaluation.scorers import classifier_scorers
-    from drake_safety.evaluation.verdict_tables import verdict_tables
-    from drake_safety.learning.assessment_file import file_hash
-    from drake_safety.simulation.capabilities import (
-        CanBePushed,
-        HasBall,
-        HasGoals,
-        require,
-    )
-    from drake_safety.simulation.dataset import load_episodes
-    from drake_safety.simulation.scenario import load_scenario
-
-    loaded = load_scenario(scenario)
-    check_writable(assessment, out or assessment)
+    loaded, folder = load_scenario(scenario), out or assessment
+    check_writable(assessment, folder)
     if shifts:
-        evaluate_shifts_command(
-            loaded,
-            assessment,
-            shifts,
-            episodes,
-            baselines=baselines,
-            seed=None if seed == EVALUATION.first else seed,
-            folder=out or assessment,
-            workers=workers,
-        )
+        with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
+            entries = add_shifts(evaluation, shifts, episodes)
+        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, entries)
         return
     loop = loaded.make_loop()
-    has_goals, has_recovery = isinstance(loop, HasGoals), isinstance(loop, HasBall)
     if throws is None:
-        throws = _DEFAULT_THROWS if has_recovery and not has_goals else 0
+        is_thrown_at = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
+        throws = _DEFAULT_THROWS if is_thrown_at else 0
     if throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
-    if pushes:
-        require(loop, HasGoals, "evaluate: leave out --pushes; alarms are evaluated on throws")
-        require(loop, CanBePushed, "evaluate: leave out --pushes")
-        loaded.variation("actual")
-    options = PlanOptions(
-        other_hand=other_hand,
-        plane_x=plane_x,
-        plane_step=plane_step,
-    )
-    folder = out or assessment
-    sharpened, paper = (load_assessment(assessment, mode) for mode in MODES)
-    # Without baselines, the training episodes need not be there.
-    train_set = load_episodes(episodes_folder(assessment)) if baselines else None
-    trained = next(one for one in sharpened.used_ if one.purpose == "training")
-    seeds = EVALUATION.seeds(seed)
-    for gamma in (sharpened, paper):
-        check_fresh(gamma, loaded, seeds.values())
-    check_options(loop, options)
+    with begun(loaded, assessment, EVALUATION, seed, folder, workers) as evaluation:
+        test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
+        other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
+        add_verdicts(evaluation, evaluation.scorers, other, test)
+        add_reliability(evaluation, test)
+        if throws:
+            add_throws(evaluation, throws)
+    entries = {"calibration_episodes": calibration_episodes}
+    write(evaluation, "evaluation.json", command_line(), verdict_tables, entries)
+
+
+@contextmanager
+def begun(
+    scenario: Scenario,
+    run_folder: Path,
+    block: SeedBlock,
+    seed: int | None,
+    folder: Path,
+    workers: int | None,
+) -> Iterator[Evaluation]:
+    """An evaluation of a run by seeds of a block, which begin at `seed` or the default."""
+    assessments = {mode: load_assessment(run_folder, mode) for mode in MODES}
+    seeds = block.seeds(seed)
+    for gamma in assessments.values():
+        check_fresh(gamma, scenario, seeds.values())
     with open_stages() as stages:
-
-        def run_set(what: str, num_episodes: int, purpose: str, **loop_options: Any) -> Episodes:
-            progress = partial(stages, what)
-            return run_fresh_episodes(
-                loaded,
-                assessment,
-                num_episodes,
-                seeds[purpose],
-                progress,
-                workers,
-                **loop_options,
-            )
-
-        test_set = run_set("fresh nominal episodes", episodes, "evaluation")
-        calibration_set = run_set("calibration episodes", calibration_episodes, "thresholds")
-        shortest = sharpened.parameters.shortest_segment or None
-        judged = Judged(
-            scenario=loaded,
-            sharpened=sharpened,
-            paper=paper,
-            classifiers=classifier_scorers(train_set, stages, shortest=shortest)
-            if train_set is not None
-            else [],
-            run_folder=assessment,
-            calibration_set=calibration_set,
-            test_set=test_set,
+        yield Evaluation(
+            scenario=scenario,
+            assessments=assessments,
+            run_folder=run_folder,
             folder=folder,
+            seeds=seeds,
             workers=workers,
             stages=stages,
         )
-        findings = Findings(
-            pictures=[
-                *save(embedding_figure(sharpened, test_set), folder / "embedding_sharpened"),
-                *save(embedding_figure(paper, test_set), folder / "embedding_paper"),
-            ]
-        )
-        if has_goals:
-            findings.add(evaluate_plans(judged, options, partial(run_set, purpose="evaluation")))
-        else:
-            findings.add(_evaluate_segments(judged))
-        findings.add(_evaluate_calibration(judged))
-        if throws:
-            findings.add(_evaluate_throws(judged, throws, calibration_throws, seeds))
-        if pushes:
-            findings.add(
-                evaluate_pushes(
-                    judged,
-                    pushes,
-                    pushes,
-                    threshold=findings.estimates["plans.sharpened.threshold"].value,
-                    seed=seeds["disturbances"],
-                    calibration_seed=seeds["disturbance thresholds"],
-                )
-            )
-    entries = {
-        "command": command_line(),
-        "scenario": loaded.name,
-        "scenario_hash": sharpened.info_.scenario_hash,
-        "seed": seed,
-        "training_seed": trained.seed,
-        "training_episodes": trained.num_episodes,
-        "assessment_sha256": {mode: file_hash(assessment_file(assessment, mode)) for mode in MODES},
-        "versions": versions(),
-        **findings.entries,
-    }
-    results = Results(findings.estimates, entries)
-    file = folder / "evaluation.json"
-    results.write(file)
-    for table in verdict_tables(results):
-        console.print(table.to_rich())
-    print_path("figures", file)
-    for picture in findings.pictures:
-        print_path("picture", picture)
 
 
-def _evaluate_segments(judged: Judged) -> Findings:
-    """Evaluates all scorers on fresh episodes, on every segment and at k = 0."""
-    from drake_safety.evaluation.episode_study import evaluate_episodes
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.roc_figure import roc_figure
-    from drake_safety.evaluation.scorers import assessment_scorer
+def add_verdicts(
+    evaluation: Evaluation, scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
+) -> tuple[dict[str, np.ndarray], Segments]:
+    """Evaluates scorers on fresh plans with a goal, else on every segment and first rows.
 
-    scorers = [
-        assessment_scorer("sharpened", judged.sharpened),
-        assessment_scorer("paper", judged.paper),
-        *judged.classifiers,
-    ]
-    estimates, scores, labels = evaluate_episodes(scorers, judged.calibration_set, judged.test_set)
-    curves = {name: (score, labels) for name, score in scores.items()}
-    return Findings(
-        estimates=estimates,
-        pictures=save(roc_figure(curves), judged.folder / "roc"),
-    )
+    Returns:
+        Unsafe scores by scorer, (N,), and the N judged segments.
+    """
+    if isinstance(evaluation.scenario.make_loop(), HasGoals):
+        thresholds = evaluation.plan_thresholds
+        found, scores, rows = evaluate_plans(scorers, calibration, test, thresholds)
+    else:
+        found, scores, rows = evaluate_episodes(scorers, calibration, test)
+    maps = {f"embedding_{m}": embedding_figure(g, test) for m, g in evaluation.assessments.items()}
+    evaluation.add(found, **maps)
+    return scores, rows
 
 
-def _evaluate_throws(
-    judged: Judged, num_throws: int, num_calibration: int, seeds: dict[str, int]
-) -> Findings:
-    """Evaluates all rules as triggers of recovery, and alarms on the same throws."""
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
-    from drake_safety.simulation.watched_motion import WatchedMotion
+def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
+    """Evaluates the reliability of either mode, and its stored calibrations."""
+    segments = split(test, stride=1, discount=1.0, shortest=1)
+    found, curves = {}, {}
+    for scorer in evaluation.scorers:
+        mode, score = scorer.name, scorer.unsafe_score(segments)
+        of_first, label = episode_scores(segments, score, PLAN)
+        first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
+        rows = reliability(score, segments.is_unsafe, segments.episode)
+        curves[f"{mode}, every row"] = rows
+        found[f"calibration.{mode}.expected_calibration_error"] = first.error
+        found[f"calibration.rows.{mode}.expected_calibration_error"] = rows.error
+        for kind, one in evaluation.assessments[mode].calibrations_.items():
+            shares = verdict_shares(one, *episode_scores(segments, score, kind))
+            found |= {f"calibration.{kind}.{mode}.{what}": n for what, n in shares.items()}
+    evaluation.add(found, reliability=reliability_figure(curves))
 
-    recovery = judged.scenario.parameters.recovery
-    rules = trigger_rules(
-        judged.sharpened,
-        judged.paper,
-        judged.classifiers,
-        threshold=recovery.threshold,
-    )
-    study = evaluate_throws(
-        judged.scenario,
-        rules,
+
+def add_throws(
+    evaluation: Evaluation, num_throws: int, rules: Sequence[TriggerRule] = ()
+) -> list[ThrowLog]:
+    """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
+    recovery = evaluation.scenario.parameters.recovery
+    own = trigger_rules(*evaluation.assessments.values(), threshold=recovery.threshold)
+    found, logs = evaluate_throws(
+        evaluation.scenario,
+        [*own, *rules],
         persistence_s=recovery.persistence_s,
         num_throws=num_throws,
-        num_calibration=num_calibration,
-        seed=seeds["disturbances"],
-        calibration_seed=seeds["disturbance thresholds"],
-        num_workers=judged.workers,
-        progress=judged.stages,
+        seed=evaluation.seeds["disturbances"],
+        num_workers=evaluation.workers,
+        progress=evaluation.stages,
     )
-    estimates = dict(study.estimates)
-    estimates["throws.falls_with_recovery"] = estimates["throws.sharpened.falls_with_recovery"]
-    findings = Findings(
-        estimates=estimates,
-        pictures=save(_throws_picture(study), judged.folder / "throws"),
-    )
-    findings.add(
-        evaluate_monitoring(
-            judged,
-            [WatchedMotion.of_throw(log) for log in study.calibration_logs],
-            [WatchedMotion.of_throw(log) for log in study.logs],
+    evaluation.add(found)
+    return logs
+
+
+def add_shifts(
+    evaluation: Evaluation,
+    num_motions: int,
+    num_nominal: int,
+    judges: Mapping[str, Judge] | None = None,
+    others: Callable[[Sequence[Motion]], Mapping[str, MotionSet]] = lambda nominal: {},
+    more: Callable[[JudgedShift, str], Mapping[str, Estimate]] = lambda judged, kind: {},
+) -> dict[str, Any]:
+    """Evaluates both modes, or other methods, on changed plants and faulty sensors.
+
+    Args:
+        evaluation: The evaluation.
+        num_motions: Motions of each shift.
+        num_nominal: Nominal motions, for false alarms.
+        judges: Methods; Γ, named "gamma", and the paper's mode by default.
+        others: Further sets, made of the nominal motions.
+        more: Further estimates of a shift of a kind.
+
+    Returns:
+        The kind of each shift.
+    """
+    gamma, paper = evaluation.assessments.values()
+    if judges is None:
+        modes = {"gamma": gamma, "paper": paper}
+        judges = {name: shift_study.assessment_judge(one) for name, one in modes.items()}
+    scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
+    nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
+    sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
+    shifts = plant_shifts(scenario, scenario.make_loop())
+    for i, (name, shift) in enumerate(shifts.items()):
+        stages("shifted motions", i, len(shifts))
+        shifted = shifted_scenario(scenario, name, shift)
+        options = {**scenario.task_class().judging_options, **shift.options}
+        hash_ = shifted.simulation_hash(name)
+        episodes = run_episodes(
+            shifted,
+            num_motions,
+            variation=name,
+            seed=seed,
+            num_workers=evaluation.workers,
+            path=fresh_episodes_folder(evaluation.run_folder, hash_, seed, options),
+            **options,
         )
-    )
-    return findings
+        sets[name] = (shift.kind, shift_study.motions_of(episodes))
+    stages("shifted motions", len(shifts), len(shifts))
+    sets |= others(nominal[:num_motions])
+    found = shift_study.evaluate_shifts(sets, judges, gamma, stages, more)
+    alarms = shift_study.false_alarms(nominal, gamma)
+    found["shifts.nominal.monitor.false_alarms_per_hour"] = alarms
+    evaluation.add(found, shifts=shift_study.shifts_figure(found))
+    return {"kinds": {name: kind for name, (kind, _) in sets.items()}}
 
 
-def _throws_picture(study: ThrowStudy) -> Figure:
-    from drake_safety.evaluation.throws_figure import throws_figure
-
-    balls = [log.throw for log in study.logs]
-    return throws_figure(
-        np.array([ball.speed_m_s for ball in balls]),
-        np.array([ball.direction_rad for ball in balls]),
-        {
-            "without recovery": study.outcomes(),
-            "with recovery, triggered by Γ": study.outcomes("sharpened"),
-        },
-        mass_kg=np.array([ball.mass_kg for ball in balls]),
-    )
-
-
-def _evaluate_calibration(judged: Judged) -> Findings:
-    """Reliability of both modes at k = 0, and rates of stored calibrations."""
-    from drake_safety.evaluation.calibration_study import reliability, verdict_shares
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.metrics import Bootstrap
-    from drake_safety.evaluation.reliability_figure import reliability_figure
-    from drake_safety.evaluation.scorers import assessment_scorer
-    from drake_safety.learning.calibration import PLAN, episode_scores
-    from drake_safety.learning.segments import split
-
-    segments = split(judged.test_set, stride=1, discount=1.0, shortest=1)
-    estimates: dict[str, Estimate] = {}
-    curves = {}
-    for mode, gamma in {"sharpened": judged.sharpened, "paper": judged.paper}.items():
-        score = assessment_scorer(mode, gamma).unsafe_score(segments)
-        expected, is_unsafe = episode_scores(segments, score, PLAN)
-        curves[mode] = reliability(expected, is_unsafe)
-
-        def error(
-            weight: np.ndarray, p: np.ndarray = expected, label: np.ndarray = is_unsafe
-        ) -> float:
-            drawn = np.repeat(np.arange(len(p)), weight.astype(int))
-            return reliability(p[drawn], label[drawn]).calibration_error
-
-        estimates[f"calibration.{mode}.expected_calibration_error"] = Bootstrap(
-            num_resamples=100
-        ).over_episodes(error, np.arange(len(expected)))
-        for kind, one in gamma.calibrations_.items():
-            shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            estimates |= {
-                f"calibration.{kind}.{mode}.{key}": value for key, value in shares.items()
-            }
-    return Findings(
-        estimates=estimates,
-        pictures=save(reliability_figure(curves), judged.folder / "reliability"),
-    )
+def write(
+    evaluation: Evaluation,
+    name: str,
+    command: str,
+    tables: Callable[[Results], Sequence[Table]],
+    entries: Mapping[str, Any],
+) -> None:
+    """Writes what was found to a file of results, and prints its tables."""
+    sharpened = evaluation.assessments[MODES[0]]
+    trained = next(one for one in sharpened.used_ if one.purpose == "training")
+    files = {mode: assessment_file(evaluation.run_folder, mode) for mode in MODES}
+    origin = {
+        "command": command,
+        "scenario": evaluation.scenario.name,
+        "scenario_hash": sharpened.info_.scenario_hash,
+        "seed": next(iter(evaluation.seeds.values())),
+        "training_seed": trained.seed,
+        "training_episodes": trained.num_episodes,
+        "assessment_sha256": {mode: file_hash(file) for mode, file in files.items()},
+        "versions": versions(),
+    }
+    results = Results(evaluation.estimates, {**origin, **entries})
+    results.write(evaluation.folder / name)
+    for table in tables(results):
+        console.print(table.to_rich())
+    print_path("figures", evaluation.folder / name)
+    for picture in evaluation.pictures:
+        print_path("picture", picture)

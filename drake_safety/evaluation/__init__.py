@@ -1,1 +1,1 @@
-"""Evaluation of assessments: metrics with intervals, baselines, studies, figures and the report."""
+"""Evaluation of assessments: metrics with intervals, shifts, tables and figures."""

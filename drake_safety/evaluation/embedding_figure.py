@@ -37,13 +37,7 @@ SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_
 """Colours from unsafe through a pale middle to safe."""
 
 
-def embedding_figure(
-    assessment: SafetyAssessment,
-    episodes: Episodes,
-    *,
-    beliefs: np.ndarray | None = None,
-    right: str = "causes",
-) -> Figure:
+def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the map: segments in the embedding, beliefs of the cells, and causes.
 
     It shows the first map of an ensemble.
@@ -51,19 +45,8 @@ def embedding_figure(
     Args:
         assessment: A fitted assessment.
         episodes: Episodes whose segments are drawn, preferably not the training episodes.
-        beliefs: Beliefs, (K, R*R, 3 + n_c); those of the assessment by default.
-        right: Content of the right panel: "causes", the constraint most likely to be violated, or
-            "uncertainty", μ.
-
-    Raises:
-        ValueError: Unknown `right`.
     """
-    if right not in ("causes", "uncertainty"):
-        raise ValueError(
-            f"embedding_figure: right is '{right}', expected 'causes' or 'uncertainty'"
-        )
-    cells = (assessment.beliefs_ if beliefs is None else beliefs)[0]
-    grid = assessment.grid_
+    cells, grid = assessment.beliefs_[0], assessment.grid_
     count = assessment.training_.counts(grid)[0]
     with drawing_style():
         fig = new_figure(14.0, 4.6)
@@ -82,10 +65,7 @@ def embedding_figure(
             most=most,
         )
         middle.set_title("Belief of each cell: safe")
-        if right == "causes":
-            _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
-        else:
-            _draw_uncertainty(fig, last, grid, cells)
+        _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
         for axes in (left, middle, last):
             half = grid.half_width
             axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
@@ -193,17 +173,6 @@ def _draw_causes(
         handlelength=1.0,
         handleheight=1.0,
     )
-
-
-def _draw_uncertainty(fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-
-    ramp = LinearSegmentedColormap.from_list("unknown", ["#fbfbfc", "#b3a5c9", "#3f2a63"])
-    shade = ScalarMappable(Normalize(0.0, 1.0), ramp)
-    draw_cells(axes, grid, shade.to_rgba(cells[:, UNCERTAINTY]), cells[:, UNCERTAINTY] >= 1.0)
-    axes.set_title("Belief of each cell: unknown")
-    add_colour_bar(fig, axes, shade, "uncertainty μ")
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:

@@ -8,14 +8,12 @@ likely. A segment is classified unsafe when its score exceeds a threshold, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from drake_safety.learning.segments import Segments
-
-CRITERIA = ("balanced_accuracy", "equal_error")
 
 
 @dataclass(frozen=True)
@@ -38,11 +36,6 @@ class Estimate:
     def exact(cls, value: float, n: int) -> Estimate:
         """A value without uncertainty, such as a threshold: both ends of the interval equal it."""
         return cls(value, value, value, n)
-
-    @classmethod
-    def from_json(cls, fields: Mapping[str, float | int | None]) -> Estimate:
-        """The inverse of :meth:`to_json`."""
-        return cls.of_row([fields[name] for name in ("value", "low", "high", "n")])
 
     @classmethod
     def of_row(cls, row: Sequence[float | int | None]) -> Estimate:
@@ -79,11 +72,9 @@ class Bootstrap:
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
     ) -> Estimate:
-        """A statistic of weighted samples, with an interval from resampling whole episodes.
+        """A statistic of weights of samples, (N,), with an interval by resampling whole episodes.
 
-        Args:
-            statistic: Maps the weight of each sample, (N,), to a number; NaN where undefined.
-            episode: Index of each sample's episode, (N,).
+        The statistic is NaN where it is undefined; `episode` is the index of each sample's, (N,).
         """
         members = np.unique(episode, return_inverse=True)[1]
         value = statistic(np.ones(len(members)))
@@ -144,6 +135,19 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     return Estimate(float(_middle(values)), float(low), float(high), values.size)
 
 
+def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
+    """Events per hour, with the exact interval of a Poisson process, observed on n motions."""
+    from scipy.stats import chi2
+
+    if not duration_s > 0:
+        return Estimate.exact(math.nan, n)
+    tail = 0.5 * (1.0 - confidence)
+    hours = duration_s / 3600.0
+    low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
+    high = 0.5 * chi2.ppf(1.0 - tail, 2 * count + 2)
+    return Estimate(count / hours, float(low / hours), float(high / hours), n)
+
+
 def _middle(ordered: np.ndarray) -> np.ndarray:
     """Median along the last axis of sorted values."""
     size = ordered.shape[-1]
@@ -155,13 +159,8 @@ def area_under_curve(
 ) -> float:
     """Area under the ROC curve: probability that an unsafe sample scores above a safe one.
 
-    Args:
-        unsafe_score: Unsafe scores, (N,); NaN counts as the most unsafe. Ties count one half.
-        is_unsafe: Labels, (N,).
-        weight: Weights, (N,); ones by default.
-
-    Returns:
-        The area; NaN unless both classes have weight.
+    Scores, labels and weights are (N,). A NaN score counts as the most unsafe, a tie one half. The
+    area is NaN unless both classes have weight.
     """
     score, label = _checked("area_under_curve", unsafe_score, is_unsafe)
     rank = _ranks(score)
@@ -176,15 +175,9 @@ def auc(
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Estimate:
-    """The area under the ROC curve, with an interval from a bootstrap over episodes.
+    """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,).
 
     If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
-
-    Args:
-        unsafe_score: Unsafe scores, (N,).
-        is_unsafe: Labels, (N,).
-        episode: Index of each sample's episode, (N,).
-        bootstrap: Settings of the interval.
     """
     score, label = _checked("auc", unsafe_score, is_unsafe, episode)
     rank = _ranks(score)
@@ -195,31 +188,30 @@ def auc(
     return bootstrap.over_episodes(area, episode)
 
 
-def auc_difference(
-    unsafe_score: np.ndarray,
-    other_score: np.ndarray,
-    is_unsafe: np.ndarray,
-    episode: np.ndarray,
-    *,
-    bootstrap: Bootstrap = _BOOTSTRAP,
+def share(
+    is_hit: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap = _BOOTSTRAP
 ) -> Estimate:
-    """The AUC of one scorer minus that of another on the same samples, from paired resamples.
+    """The share of samples (N,) that hit, with an interval over their episodes (N,).
 
-    Args:
-        unsafe_score: Unsafe scores of the first, (N,).
-        other_score: Unsafe scores of the second, (N,).
-        is_unsafe: Labels, (N,).
-        episode: Index of each sample's episode, (N,).
-        bootstrap: Settings of the interval.
+    It is a bootstrap; that of Clopper and Pearson with one sample an episode, where it is exact,
+    and, over the number of episodes, where all or no samples hit and resampling has no spread.
     """
-    score, label = _checked("auc_difference", unsafe_score, is_unsafe, episode)
-    other, _ = _checked("auc_difference", other_score, is_unsafe)
-    rank, other_rank = _ranks(score), _ranks(other)
+    num_hits, num_samples = int(is_hit.sum()), len(is_hit)
+    num_episodes = len(np.unique(episode))
+    if num_samples == num_episodes:
+        return proportion(num_hits, num_samples, confidence=bootstrap.confidence)
+    if num_hits in (0, num_samples):
+        count = num_episodes if num_hits else 0
+        return proportion(count, num_episodes, confidence=bootstrap.confidence)
+    return _mean(is_hit.astype(float), episode, bootstrap)
 
-    def difference(weight: np.ndarray) -> float:
-        return _ranked_area(rank, label, weight) - _ranked_area(other_rank, label, weight)
 
-    return bootstrap.over_episodes(difference, episode)
+def _mean(values: np.ndarray, episode: np.ndarray, bootstrap: Bootstrap) -> Estimate:
+    def average(weight: np.ndarray) -> float:
+        total = weight.sum()
+        return float(weight @ values / total) if total else math.nan
+
+    return bootstrap.over_episodes(average, episode)
 
 
 def segment_estimates(
@@ -227,83 +219,49 @@ def segment_estimates(
     unsafe_score: np.ndarray,
     *,
     threshold: float,
-    is_probability: bool = True,
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> dict[str, Estimate]:
     """AUC, recalls and Brier score of a scorer on segments.
 
-    Intervals are bootstraps over episodes. Recalls have Clopper-Pearson intervals where these are
-    exact, with one sample an episode (k = 0 alone: `segments.take(segments.is_first)`), and, over
-    the number of episodes, where all samples are right or all wrong and resampling has no spread.
+    Intervals are over episodes: bootstraps, and those of :func:`share` for the recalls.
 
     Args:
         segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
-        unsafe_score: Unsafe score of each, (N,).
+        unsafe_score: Unsafe score of each, (N,), in [0, 1].
         threshold: Score above which a segment is classified unsafe.
-        is_probability: Whether the scores are probabilities and have a Brier score.
         bootstrap: Settings of the intervals.
 
     Returns:
-        `auc`, `safe_recall`, `unsafe_recall`, and `brier` for probabilities.
+        `auc`, `safe_recall`, `unsafe_recall` and `brier`.
 
     Raises:
-        ValueError: The number of scores differs, or a probability is outside [0, 1].
+        ValueError: The number of scores differs, or one is outside [0, 1].
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode
 
-    def mean(values: np.ndarray, rows: np.ndarray) -> Estimate:
-        values, members = values[rows].astype(float), episode[rows]
-
-        def average(weight: np.ndarray) -> float:
-            total = weight.sum()
-            return float(weight @ values / total) if total else math.nan
-
-        return bootstrap.over_episodes(average, members)
-
-    def recall(is_right: np.ndarray, rows: np.ndarray) -> Estimate:
-        num_right, num_samples = int(is_right[rows].sum()), int(rows.sum())
-        num_episodes = len(np.unique(episode[rows]))
-        confidence = bootstrap.confidence
-        if num_samples == num_episodes:
-            return proportion(num_right, num_samples, confidence=confidence)
-        if num_right in (0, num_samples):
-            count = num_episodes if num_right else 0
-            return proportion(count, num_episodes, confidence=confidence)
-        return mean(is_right, rows)
-
-    estimates = {
+    probability = np.where(np.isposinf(score), 1.0, score)
+    if not np.all((probability >= 0.0) & (probability <= 1.0)):
+        raise ValueError(
+            f"segment_estimates: probabilities must lie in [0, 1], got {probability.min()}.."
+            f"{probability.max()}"
+        )
+    return {
         "auc": auc(score, label, episode, bootstrap=bootstrap),
-        "safe_recall": recall(score <= threshold, ~label),
-        "unsafe_recall": recall(score > threshold, label),
+        "safe_recall": share((score <= threshold)[~label], episode[~label], bootstrap=bootstrap),
+        "unsafe_recall": share((score > threshold)[label], episode[label], bootstrap=bootstrap),
+        "brier": _mean((probability - label) ** 2, episode, bootstrap),
     }
-    if is_probability:
-        squared = _squared_error("segment_estimates", score, label)
-        estimates["brier"] = mean(squared, np.ones(len(label), dtype=bool))
-    return estimates
 
 
-def threshold_at(
-    unsafe_score: np.ndarray, is_unsafe: np.ndarray, criterion: str = "balanced_accuracy"
-) -> float:
-    """Chooses a threshold on calibration samples.
+def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
+    """The threshold of scores (N,) with the best balanced accuracy, the mean of both recalls.
 
-    Args:
-        unsafe_score: Unsafe scores, (N,).
-        is_unsafe: Labels, (N,).
-        criterion: "balanced_accuracy" maximises the mean of both recalls; "equal_error" minimises
-            their difference.
-
-    Returns:
-        A threshold midway between two scores; the middle one of equally good ones.
+    It is midway between two scores; of equally good ones, it is the middle one.
 
     Raises:
-        ValueError: Unknown criterion, or one of the classes is missing.
+        ValueError: One of the classes is missing, or no score is finite.
     """
-    if criterion not in CRITERIA:
-        raise ValueError(
-            f"threshold_at: unknown criterion '{criterion}'; the criteria are {list(CRITERIA)}"
-        )
     score, label = _checked("threshold_at", unsafe_score, is_unsafe)
     num_unsafe = int(label.sum())
     if num_unsafe in (0, len(label)):
@@ -325,10 +283,7 @@ def threshold_at(
     candidates = np.concatenate([[lowest], middle, [finite[-1]]])
     unsafe_recall, safe_recall = (r[: len(candidates)] for r in (unsafe_recall, safe_recall))
     balanced = 0.5 * (unsafe_recall + safe_recall)
-    merit = balanced
-    if criterion == "equal_error":
-        merit = -np.abs(unsafe_recall - safe_recall) + 1e-6 * balanced
-    best = np.flatnonzero(merit >= merit.max() - 1e-12)
+    best = np.flatnonzero(balanced >= balanced.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
 
 
@@ -343,16 +298,6 @@ def _checked(
     if score.ndim != 1 or len(set(shapes)) != 1:
         raise ValueError(f"{who}: scores, labels and episodes must be as many, got {shapes}")
     return np.where(np.isnan(score), math.inf, score), label
-
-
-def _squared_error(who: str, score: np.ndarray, label: np.ndarray) -> np.ndarray:
-    probability = np.where(np.isposinf(score), 1.0, score)
-    if not np.all((probability >= 0.0) & (probability <= 1.0)):
-        raise ValueError(
-            f"{who}: probabilities must lie in [0, 1], got {probability.min()}.."
-            f"{probability.max()}; scores of another kind take is_probability=False"
-        )
-    return (probability - label) ** 2
 
 
 def _ranks(score: np.ndarray) -> np.ndarray:

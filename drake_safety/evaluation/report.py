@@ -11,6 +11,7 @@ from typing import Any
 
 from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.results import SCHEMA, Results
+from drake_safety.evaluation.shift_study import shifts_tables
 from drake_safety.evaluation.tables import Column
 from drake_safety.evaluation.verdict_tables import MEANINGS, set_title, verdict_tables
 from drake_safety.extras import require_extra
@@ -54,7 +55,10 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
             "`drake-safety train` and `evaluate` write them"
         )
     infos = [assessment.info_ for assessment in assessments.values()]
-    tables = [(one, verdict_tables(one)) for one in results]
+    tables = [
+        (one, [*verdict_tables(one), *(shifts_tables(one) if one.has("shifts.") else [])])
+        for one in results
+    ]
     columns = {one.key: one for _, found in tables for table in found for one in table.columns}
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -1,4 +1,4 @@
-"""Scorers: safety probabilities of assessments and baseline classifiers behind one interface."""
+"""Scorers: safety probabilities of assessments, and of others, behind one interface."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_safety.evaluation.baselines import KINDS, DirectClassifier
-from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import UsedEpisodes
-from drake_safety.learning.segments import Episodes, Segments
+from drake_safety.learning.segments import Segments
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +31,7 @@ class Scorer:
     used: Sequence[UsedEpisodes] = ()
 
     def unsafe_score(self, segments: Segments) -> np.ndarray:
-        """Unsafe score of each segment, one minus its safety probability, (N,).
-
-        Where nothing is known it is 1.
-        """
+        """Unsafe score of each segment, (N,): one minus its safety probability, 1 if unknown."""
         state = segments.true_state if self.uses_true_state else segments.state
         probability = self.probability(state, segments.desired_preview, segments.features)
         return 1.0 - np.nan_to_num(probability, nan=0.0)
@@ -65,35 +60,3 @@ def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
         uses_true_state=not assessment.parameters.is_sharpened,
         used=assessment.used_,
     )
-
-
-def classifier_scorers(
-    episodes: Episodes, progress: StageProgress | bool | None = None, *, shortest: int | None = None
-) -> list[Scorer]:
-    """The baseline classifiers, trained on the training episodes of the assessment.
-
-    Args:
-        episodes: Training episodes.
-        progress: Called with a stage, the number done and the number wanted; True shows it.
-        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
-    """
-    scorers = []
-    with shown(progress, lambda stages: stages) as report:
-        for i, kind in enumerate(KINDS):
-            if report is not None:
-                report("baseline classifiers", i, len(KINDS))
-            classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
-            used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
-            scorers.append(_classifier_scorer(classifier, used))
-        if report is not None:
-            report("baseline classifiers", len(KINDS), len(KINDS))
-    return scorers
-
-
-def _classifier_scorer(classifier: DirectClassifier, used: Sequence[UsedEpisodes]) -> Scorer:
-    def probability(
-        state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
-    ) -> np.ndarray:
-        return 1.0 - classifier.predict_unsafe(state, desired_preview, features)
-
-    return Scorer(name=classifier.kind, probability=probability, used=used)

@@ -1,23 +1,21 @@
-"""Catalogue of shifts: conditions that training does not have, scaled to the robot."""
+"""Catalogue of shifts: plants and faulty sensors unlike those of training, scaled to the robot."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from pydrake.math import RotationMatrix
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 
@@ -33,9 +31,6 @@ _JOINT_BIAS_RAD = 0.05
 _NOISE_FACTOR = 10.0
 _FROZEN_AT_S = 0.4
 _STALE_S = 0.2
-_FARTHER, _FASTER = 1.5, 2.0
-_START_SPEED = 0.75  # Of sqrt(g h), h the standing height: the capture point is 0.75 h ahead.
-_LIFT_SHARE = 0.5  # Of the standing height.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +79,13 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     foot = kinematics.foot_names[0]
     weak_scale = _WEAK_SHARE * torques[loaded] / _effort_limit(kinematics, joint)
     lateral_n = _SIDE_FORCE_SHARE * mass_kg * 9.81
+    late_s = _whole(_DELAY_PERIODS * scenario.control_period_s, scenario.time_step_s)
     lasting = {
         "slope": Shift(slope_rad=_SLOPE_RAD),
         "side_force": Shift(base_force_n=[0.0, lateral_n, 0.0]),
         "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
         "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
-        "late_command": Shift(command_delay_s=_DELAY_PERIODS * scenario.control_period_s),
+        "late_command": Shift(command_delay_s=late_s),
         "hole": Shift(holes_m={foot: _HOLE_SHARE * kinematics.standing_height}),
     }
     if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
@@ -100,7 +96,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     faults = {
         "joint_bias": Fault(kind="bias", entries=positions, value=_JOINT_BIAS_RAD),
         "dead_velocities": Fault(kind="zero", entries=velocities),
-        "stale": Fault(kind="delay", value=round(_STALE_S / period_s) * period_s),
+        "stale": Fault(kind="delay", value=_whole(_STALE_S, period_s)),
         "frozen": Fault(kind="freeze"),
         "frozen_later": Fault(kind="freeze", start_s=_FROZEN_AT_S),
     }
@@ -126,6 +122,11 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     }
 
 
+def _whole(time_s: float, period_s: float) -> float:
+    """The multiple of a period, at least one, that is nearest to a time."""
+    return max(round(time_s / period_s), 1) * period_s
+
+
 def _effort_limit(kinematics: RobotKinematics, joint: str) -> float:
     limit = by_pattern(kinematics.robot.effort_limits, joint, "effort limit", kinematics.robot.name)
     if limit is None:
@@ -138,63 +139,8 @@ def _effort_limit(kinematics: RobotKinematics, joint: str) -> float:
     return float(limit)
 
 
-Reshape = Callable[[EpisodeStart, RobotKinematics], EpisodeStart]
-"""Changes a start of an episode."""
-
-
-def _scaled_plan(
-    plan: PiecewisePolynomial, *, distance: float, speed: float
-) -> PiecewisePolynomial:
-    """A plan whose points are farther from its start, and reached earlier."""
-    start_s = plan.start_time()
-    origin = plan.value(start_s)
-    scaled = PiecewisePolynomial(origin) if plan.get_number_of_segments() == 0 else plan
-    times = np.array(scaled.get_segment_times())
-    samples = np.linspace(times[0], times[-1], 41)
-    points = origin + distance * (np.hstack([scaled.value(t) for t in samples]) - origin)
-    return PiecewisePolynomial.FirstOrderHold(start_s + (samples - start_s) / speed, points)
-
-
-def _farther(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
-    del kinematics
-    return dataclasses.replace(start, plan=_scaled_plan(start.plan, distance=_FARTHER, speed=1.0))
-
-
-def _faster(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
-    del kinematics
-    return dataclasses.replace(start, plan=_scaled_plan(start.plan, distance=1.0, speed=_FASTER))
-
-
-def _moving(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
-    v = start.v.copy()
-    v[4] += _START_SPEED * math.sqrt(9.81 * kinematics.standing_height)
-    return dataclasses.replace(start, v=v)
-
-
-STARTS: Mapping[str, Reshape] = {"farther": _farther, "faster": _faster, "moving": _moving}
-"""Plans and initial velocities outside the range of training, by name."""
-
-
-def _lifted(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
-    q = start.q.copy()
-    q[6] += _LIFT_SHARE * kinematics.standing_height
-    return dataclasses.replace(start, q=q)
-
-
-def _lying(roll_rad: float) -> Reshape:
-    def reshape(start: EpisodeStart, kinematics: RobotKinematics) -> EpisodeStart:
-        del kinematics
-        q = start.q.copy()
-        R = RotationMatrix.MakeXRotation(roll_rad).ToQuaternion()
-        q[:4], q[6] = R.wxyz(), 0.3 * q[6]
-        return dataclasses.replace(start, q=q, v=np.zeros_like(start.v))
-
-    return reshape
-
-
-POSTURES: Mapping[str, Reshape] = {
-    "lifted": _lifted,
-    "on_its_side": _lying(0.5 * math.pi),
-    "on_its_back": _lying(math.pi),
-}
-"""Postures in which no episode of training is, by name; all are unsafe."""
+def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenario:
+    """The scenario with a shift as a further variation."""
+    shifted = copy.copy(scenario)
+    shifted.variations = {**scenario.variations, name: shift.variation}
+    return shifted

@@ -16,7 +16,7 @@ from drake_safety.evaluation.results import Results
 OURS = "sharpened"
 """The method that baselines are compared with."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
-_SCALES = {"%": 100.0, "=%": 100.0, "ms": 1000.0}
+_SCALES = {"%": 100.0, "points": 100.0, "=%": 100.0, "ms": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Column:
     Attributes:
         key: The metric.
         title: Its heading.
-        unit: "", "%", "ms", "s", "of" for counts out of n, "n" for a number of trials, "/h" for a
-            rate, or "=" and "=%" for values without interval.
+        unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "n" for a number
+            of trials, "/h" for a rate, or "=" and "=%" for values without interval.
         better: 1 if larger is better, -1 if smaller is, 0 otherwise.
         digits: Digits after the decimal point.
     """
@@ -50,12 +50,12 @@ class Column:
         if self.unit == "n":
             return f"{estimate.value:.0f}"
         unit = self.unit.removeprefix("=")
-        space = "" if unit in ("", "/h") else f" {unit}"
+        space = "" if unit in ("", "/h", "points") else f" {unit}"
         return f"{_SCALES.get(self.unit, 1.0) * estimate.value:.{self.digits}f}{space}"
 
     def interval_text(self, estimate: Estimate | None) -> str:
         """The interval of an estimate in brackets, if any."""
-        if estimate is None or self.unit not in ("", "%", "/h"):
+        if estimate is None or self.unit not in ("", "%", "points", "/h"):
             return ""
         if not all(map(math.isfinite, (estimate.value, estimate.low, estimate.high))):
             return ""
@@ -173,7 +173,7 @@ class Table:
         best = [self.best(number) for number in range(len(self.columns))]
         for i, row in enumerate(self.rows):
             cells = "".join(
-                f"<td{' class=best' * (i in best[j])}>{escape(column.value_text(one))} "
+                f"<td{' class=best' * (i in best[j])}>{_unbroken(column.value_text(one))} "
                 f"<small>{escape(column.interval_text(one))}</small></td>"
                 for j, (column, one) in enumerate(zip(self.columns, row.estimates, strict=True))
             )
@@ -194,3 +194,7 @@ def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Colum
         for prefix, label in labels.items()
     ]
     return [row for row in rows if any(row.estimates)]
+
+
+def _unbroken(text: str) -> str:
+    return escape(text).replace(" ", "&nbsp;")

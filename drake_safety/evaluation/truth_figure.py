@@ -70,7 +70,7 @@ def truth_figure(
 
     parameters = assessment.parameters
     state = first("state" if parameters.is_sharpened else "true_state")
-    features = first("features") if assessment.uses_features else None
+    features = first("features")
     found = assessment.predict(state, first("desired_preview"), features)
     is_known = ~is_unknown(found.belief, parameters.initial_uncertainty)
     # Where it does not know, the probability is zero.

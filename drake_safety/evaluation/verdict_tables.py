@@ -31,15 +31,6 @@ TRIGGERS = (
     Column("trigger_after_impact_s", "after impact", "ms", digits=0),
     Column("trigger_before_fall_s", "lead time to the fall", "s", digits=2),
 )
-ALARMS = (
-    Column("detected", "detection rate", "%", 1, 1),
-    Column("lead_to_leaving_s", "lead time to leaving", "s", 1, 2),
-    Column("falls_detected", "detection rate of falls", "%", 1, 1),
-    Column("lead_to_fall_s", "lead time to the fall", "s", 1, 2),
-    Column("false_alarms_per_hour", "false-alarm rate", "/h", -1, 0),
-    Column("undisturbed_false_alarms_per_hour", "false-alarm rate, undisturbed", "/h", -1, 0),
-    _AUC,
-)
 CALIBRATIONS = (
     Column("promised_miss_rate", "promised miss rate", "=%", digits=1),
     Column("miss_rate", "miss rate", "%", digits=1),
@@ -60,14 +51,6 @@ MEANINGS = {
     "falls_missed": "Throws that fall without recovery and have no trigger before the fall.",
     "trigger_after_impact_s": "Median time from the impact to the trigger.",
     "trigger_before_fall_s": "Median time from the trigger to the fall without recovery.",
-    "detected": "Share of the motions that leave the safe set with an alarm after the push, before "
-    "leaving.",
-    "lead_to_leaving_s": "Median time from the alarm to leaving the safe set.",
-    "falls_detected": "Share of the falls with an alarm before.",
-    "lead_to_fall_s": "Median time from the alarm to the fall.",
-    "false_alarms_per_hour": "Alarms per hour of motion that stays in the safe set, at most one a "
-    "motion.",
-    "undisturbed_false_alarms_per_hour": "Alarms per hour of motion before the push.",
     "promised_miss_rate": "Share of the unsafe ones that may be called safe, as calibrated.",
     "miss_rate": "Share of the unsafe ones that are called safe.",
     "unsafe_unknown": 'Share of the unsafe ones with the verdict "don\'t know".',
@@ -75,7 +58,9 @@ MEANINGS = {
     "false_alarm_rate": "Share of the safe ones that are called unsafe.",
 }
 """Definitions of the metrics."""
-_KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
+Kind = tuple[str, str, Sequence[Column]]
+"""Title, explanation and columns of a table."""
+_KINDS: dict[str, Kind] = {
     "segments": (
         "Every segment of the motion",
         "Each segment of fresh motions is classified: does the motion stay safe to its end? "
@@ -93,11 +78,6 @@ _KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
         "Balls are thrown at the robot; each method triggers recovery steps.",
         TRIGGERS,
     ),
-    "monitoring": (
-        "Alarms on pushed motions",
-        "Thresholds are chosen for the same share of false alarms on calibration motions.",
-        ALARMS,
-    ),
     "plans": (
         "Targets before the motion starts",
         "Each target is classified at k = 0; the simulated motion towards it is the reference. "
@@ -110,7 +90,7 @@ _KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
         CALIBRATIONS,
     ),
 }
-"""Title, explanation and columns, by the first part of a set."""
+"""By the first part of a set."""
 _SET_TITLES = {
     "plans": "all targets",
     "plans.fair": "fair targets",
@@ -126,12 +106,14 @@ def set_title(set: str) -> str:
     return _SET_TITLES.get(set, spoken(set.partition(".")[2] or set).replace(".", ", "))
 
 
-def verdict_table(results: Results, set: str, *, corner: str = "method") -> Table:
+def verdict_table(
+    results: Results, set: str, *, corner: str = "method", kind: Kind | None = None
+) -> Table:
     """The table of a judged set: a row for each method, with the columns of its kind.
 
     A method without the second column, such as a difference of two methods, has no row.
     """
-    title, meaning, columns = _KINDS[set.partition(".")[0]]
+    title, meaning, columns = kind or _KINDS[set.partition(".")[0]]
     methods = [row.method for row in results.select(set=set, metric=columns[1].key) if row.method]
     if set in _SET_TITLES:
         title = f"{title}: {set_title(set)}"

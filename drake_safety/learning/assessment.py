@@ -113,9 +113,11 @@ class SafetyAssessment:
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
-            ValueError: The horizons differ, or the episodes give too few segments.
+            ValueError: The horizons differ, a parameter is not an expected value, or the episodes
+                give too few segments.
         """
         require_extra("train", "SafetyAssessment.fit")
+        self.parameters.check()
         from threadpoolctl import threadpool_limits
 
         # The order of sums depends on the number of threads, and the last bits with it.
@@ -209,6 +211,7 @@ class SafetyAssessment:
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
+        self.parameters.check()
         who = f"SafetyAssessment of '{self.info_.scenario}'"
         method = adaptation.chosen_method(method, has_heads=self.base_logit_ is not None, who=who)
         check_feedback(feedback, self.info_)

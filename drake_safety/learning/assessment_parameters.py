@@ -55,6 +55,14 @@ class AdaptationParameters:
     hidden_std: float = 1.0
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Checks all values, which may have been set since the construction.
+
+        Raises:
+            ValueError: A value is not an expected one.
+        """
         for name in ("least_uncertainty", "first_uncertainty"):
             _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
         for name in ("offset_std", "slope_std", "hidden_std"):
@@ -107,6 +115,14 @@ class PaperReading:
     held_out: float = 0.0
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Checks all values, which may have been set since the construction.
+
+        Raises:
+            ValueError: A value is not an expected one.
+        """
         _expect(self, "stride", self.stride >= 0, ">= 0")
         _expect(self, "loss", self.loss in LOSSES, f"one of {list(LOSSES)}")
         _expect_sizes(self)
@@ -220,6 +236,14 @@ class AssessmentParameters:
     adaptation: AdaptationParameters = field(default_factory=AdaptationParameters)
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Checks all values, which may have been set since the construction.
+
+        Raises:
+            ValueError: A value is not an expected one.
+        """
         if self.mode not in MODES:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
@@ -277,6 +301,8 @@ class AssessmentParameters:
             len(self.margin_range) == 2 and self.margin_range[0] < self.margin_range[1],
             "[lowest, highest]",
         )
+        self.paper.check()
+        self.adaptation.check()
 
     @property
     def is_sharpened(self) -> bool:

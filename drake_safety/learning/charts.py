@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 FALSE_ALARMS_PER_HOUR = 0.02
@@ -12,21 +10,6 @@ _TRIMMED = 0.1  # Share of the largest errors left out of their covariance, such
 _TRIMMINGS = 4
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL = 0.1  # Share of the blocks in the tail.
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Chart:
-    """A multivariate chart of the exponentially weighted mean of whitened innovations (MEWMA).
-
-    Attributes:
-        time_constant_s: Memory [s].
-        whitening: Whitens the mean on the nominal plant, (n_s, n_s).
-        limit: Largest norm of the whitened mean; infinite if training had too little motion.
-    """
-
-    time_constant_s: float
-    whitening: np.ndarray
-    limit: float
 
 
 def whitening_of(values: np.ndarray, *, is_centred: bool = False) -> tuple[np.ndarray, np.ndarray]:

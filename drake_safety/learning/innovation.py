@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from drake_safety.learning.charts import (
-    Chart,
-    averaged,
-    limit_of,
-    trimmed_whitening_of,
-    whitening_of,
-)
+from drake_safety.learning.charts import averaged, limit_of, trimmed_whitening_of, whitening_of
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.state_predictor import HIDDEN_SIZES, Predictor
 
 TIME_CONSTANTS_S = (0.8, 4.0)
-"""Memory of the charts."""
+"""Memory of the two charts of the mean, a fast and a slow one."""
 KINDS = ("", "frozen", "distance", "scatter", "fast", "slow")
 """What raises an alarm, "" for none: repeated inputs, the distance of x, the norm of the
 innovations, and their two charts."""
@@ -29,49 +25,62 @@ _ALLOWANCE = 0.5  # Of the sums, in standard deviations.
 _LARGEST_STEP = 5.0  # Of the sums, in standard deviations.
 _LEAST_ROWS = 10  # Rows for each state, below which there is no alarm.
 _FREE_REPEATS = 2  # Beyond the longest run of repeated inputs in training.
+_OF_PREDICTOR = ("mean", "scale", "linear", "bias")
+_OWN = ("offset", "whitening", "sums", "chart_limits", "chart_whitenings")
+_T = TypeVar("_T")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Innovation:
     """The error of predicting the next measured state, on the nominal plant and since.
 
     A plant that changed cannot be seen in one input: it lies among those of training. It is seen in
     how the state follows from the last one. The innovation is whitened, limited in norm, and
-    averaged by two charts with memory. Two further charts sum the distance of x and the norm of the
-    innovation (CUSUM), another counts inputs that repeat the last one to the last bit. It is
-    learned from the nominal episodes that stay safe, and needs no failure. The object is immutable.
+    averaged by two charts with memory (MEWMA). Two further charts sum the distance of x and the
+    norm of the innovation (CUSUM), another counts inputs that repeat the last one to the last bit.
+    It is learned from the nominal episodes that stay safe, and needs no failure.
 
-    Args:
+    Attributes:
         predictor: The prediction.
         offset: Mean of its errors, (n_s,).
         whitening: Whitens them, (n_s, n_s).
         clip: Largest norm of a whitened innovation.
-        charts: The charts, a fast and a slow one.
+        chart_whitenings: Whiten the charts' means on the nominal plant, (2, n_s, n_s).
+        chart_limits: Largest norms of the whitened means; infinite if training had too little
+            motion, (2,).
         sums: Mean, standard deviation and limit of the CUSUM of the distance of x, and of the norm
             of the innovation, (2, 3).
         longest_repeat: Longest known run of repeated inputs.
         step_s: Time between two inputs [s].
     """
 
-    def __init__(
-        self,
-        *,
-        predictor: Predictor,
-        offset: np.ndarray,
-        whitening: np.ndarray,
-        clip: float,
-        charts: Sequence[Chart],
-        sums: np.ndarray,
-        longest_repeat: int,
-        step_s: float,
-    ):
-        self.predictor, self.offset, self.whitening = predictor, offset, whitening
-        self.clip, self.charts, self.sums = float(clip), tuple(charts), np.asarray(sums)
-        self.longest_repeat, self.step_s = int(longest_repeat), float(step_s)
-        self.num_inputs, self.num_states = len(predictor.mean), len(offset)
-        self.rates = tuple(min(1.0, step_s / chart.time_constant_s) for chart in self.charts)
+    predictor: Predictor
+    offset: np.ndarray
+    whitening: np.ndarray
+    clip: float
+    chart_whitenings: np.ndarray
+    chart_limits: np.ndarray
+    sums: np.ndarray
+    longest_repeat: int
+    step_s: float
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Innovation:
         return self
+
+    @property
+    def num_inputs(self) -> int:
+        """n_x."""
+        return len(self.predictor.mean)
+
+    @property
+    def num_states(self) -> int:
+        """n_s."""
+        return len(self.offset)
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Weight of the newest innovation in each chart's mean."""
+        return tuple(min(1.0, self.step_s / constant_s) for constant_s in TIME_CONSTANTS_S)
 
     @classmethod
     def fit(
@@ -88,53 +97,47 @@ class Innovation:
         x = [one for one in x if len(one) > 1]
         if not x:
             raise ValueError("Innovation: no motion has two inputs")
-        errors: list[np.ndarray] = [np.empty(0)] * len(x)
-        distances = list(errors)
-        for part in range(_NUM_FOLDS):
-            own = range(part, len(x), _NUM_FOLDS)
-            others = [one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x
-            predictor = Predictor.fit(*_steps(others, num_states))
-            known = Novelty(
-                training=Moments.of(np.concatenate(others)),
-                limits=novelty.limits,
-                plan=novelty.plan,
-            )
-            for i in own:
-                errors[i] = _errors(predictor, x[i], num_states)
-                distances[i] = known.of(x[i][1:])
+
+        def predictor_of(motions: Sequence[np.ndarray]) -> Predictor:
+            return Predictor.fit(*_steps(motions, num_states))
+
+        def novelty_of(motions: Sequence[np.ndarray]) -> Novelty:
+            training = Moments.of(np.concatenate(motions))
+            return Novelty(training=training, limits=novelty.limits, plan=novelty.plan)
+
+        errors = _judged_by_others(x, predictor_of, _errors)
+        distances = _judged_by_others(x, novelty_of, lambda known, one: known.of(one[1:]))
         whole = np.concatenate(errors)
         offset, whitening = trimmed_whitening_of(whole)
         norm = np.linalg.norm((whole - offset) @ whitening, axis=1)
-        distance = np.concatenate(distances)
-        summed = np.stack([distance, np.minimum(norm, np.quantile(norm, _CLIP_SHARE))])
+        clip = float(np.quantile(norm, _CLIP_SHARE))
+        summed = np.stack([np.concatenate(distances), np.minimum(norm, clip)])
         spreads = np.maximum(summed.std(axis=1), 1e-6)
         unlimited = cls(
-            predictor=Predictor.fit(*_steps(x, num_states)),
+            predictor=predictor_of(x),
             offset=offset,
             whitening=whitening,
-            clip=float(np.quantile(norm, _CLIP_SHARE)),
-            charts=[
-                Chart(time_constant_s=t, whitening=np.eye(num_states), limit=np.inf)
-                for t in TIME_CONSTANTS_S
-            ],
+            clip=clip,
+            chart_whitenings=np.stack([np.eye(num_states)] * len(TIME_CONSTANTS_S)),
+            chart_limits=np.full(len(TIME_CONSTANTS_S), np.inf),
             sums=np.stack([summed.mean(axis=1), spreads, np.full(2, np.inf)], axis=1),
-            longest_repeat=max(_longest_repeat(one) for one in x) + _FREE_REPEATS,
-            step_s=step_s,
+            longest_repeat=max(map(_longest_repeat, x)) + _FREE_REPEATS,
+            step_s=float(step_s),
         )
         if len(whole) < _LEAST_ROWS * num_states:
             return unlimited
         order = np.random.default_rng(0).permutation(len(x))
         limited = unlimited.limited(np.concatenate([errors[i] for i in order]))
-        charts = []
-        for rate, chart in zip(unlimited.rates, unlimited.charts, strict=True):
-            means = averaged(limited, rate)
-            whitening = whitening_of(means, is_centred=True)[1]
-            limit = limit_of(np.linalg.norm(means @ whitening, axis=1), step_s)
-            charts.append(
-                Chart(time_constant_s=chart.time_constant_s, whitening=whitening, limit=limit)
-            )
-        distance = np.concatenate([distances[i] for i in order])
-        return unlimited._with(charts, unlimited._sums_with_limits(distance, limited))
+        means = [averaged(limited, rate) for rate in unlimited.rates]
+        whitened = replace(
+            unlimited,
+            chart_whitenings=np.stack([whitening_of(one, is_centred=True)[1] for one in means]),
+        )
+        return replace(
+            whitened,
+            chart_limits=whitened._limits(limited),
+            sums=whitened._limited_sums(np.concatenate([distances[i] for i in order]), limited),
+        )
 
     def with_feedback(self, x: Sequence[np.ndarray], novelty: Novelty) -> Innovation:
         """Returns the innovation of an actual robot: corrected prediction, no lower limits.
@@ -146,41 +149,39 @@ class Innovation:
         x = [one for one in x if len(one) > 1]
         if not x:
             return self
-        errors: list[np.ndarray] = [np.empty(0)] * len(x)
-        for part in range(_NUM_FOLDS):
-            others = [one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x
-            predictor = self.predictor.corrected(*_steps(others, self.num_states))
-            for i in range(part, len(x), _NUM_FOLDS):
-                errors[i] = _errors(predictor, x[i], self.num_states)
-        limited = self.limited(np.concatenate(errors))
-        charts = []
-        for rate, chart in zip(self.rates, self.charts, strict=True):
-            norm = np.linalg.norm(averaged(limited, rate) @ chart.whitening, axis=1)
-            limit = max(chart.limit, limit_of(norm, self.step_s))
-            charts.append(
-                Chart(time_constant_s=chart.time_constant_s, whitening=chart.whitening, limit=limit)
-            )
+
+        def predictor_of(motions: Sequence[np.ndarray]) -> Predictor:
+            return self.predictor.corrected(*_steps(motions, self.num_states))
+
+        limited = self.limited(np.concatenate(_judged_by_others(x, predictor_of, _errors)))
         distance = np.concatenate([novelty.of(one[1:]) for one in x])
         summed = np.stack([distance, np.linalg.norm(limited, axis=1)])
         sums = self.sums.copy()
         sums[:, 0] = np.maximum(sums[:, 0], summed.mean(axis=1))
         sums[:, 1] = np.maximum(sums[:, 1], summed.std(axis=1))
-        adapted = Innovation(
-            predictor=self.predictor.corrected(*_steps(x, self.num_states)),
-            offset=self.offset,
-            whitening=self.whitening,
-            clip=self.clip,
-            charts=charts,
+        adapted = replace(
+            self,
+            predictor=predictor_of(x),
+            chart_limits=np.maximum(self.chart_limits, self._limits(limited)),
             sums=sums,
             longest_repeat=max(self.longest_repeat, *map(_longest_repeat, x)),
-            step_s=self.step_s,
         )
-        limited_sums = adapted._sums_with_limits(distance, limited)
-        limited_sums[:, 2] = np.maximum(limited_sums[:, 2], self.sums[:, 2])
-        return adapted._with(charts, limited_sums)
+        sums = adapted._limited_sums(distance, limited)
+        sums[:, 2] = np.maximum(sums[:, 2], self.sums[:, 2])
+        return replace(adapted, sums=sums)
 
-    def _sums_with_limits(self, distance: np.ndarray, limited: np.ndarray) -> np.ndarray:
-        norm = np.linalg.norm(limited, axis=1)
+    def _chart_norms(self, innovations: np.ndarray) -> list[np.ndarray]:
+        """Norms of both charts' whitened means of consecutive innovations, (N,) each."""
+        return [
+            np.linalg.norm(averaged(innovations, rate) @ whitening, axis=1)
+            for rate, whitening in zip(self.rates, self.chart_whitenings, strict=True)
+        ]
+
+    def _limits(self, innovations: np.ndarray) -> np.ndarray:
+        return np.array([limit_of(norm, self.step_s) for norm in self._chart_norms(innovations)])
+
+    def _limited_sums(self, distance: np.ndarray, innovations: np.ndarray) -> np.ndarray:
+        norm = np.linalg.norm(innovations, axis=1)
         limits = [
             limit_of(self._summed(i, one), self.step_s) for i, one in enumerate((distance, norm))
         ]
@@ -188,20 +189,10 @@ class Innovation:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        predictor = self.predictor
-        found = {
-            "mean": predictor.mean,
-            "scale": predictor.scale,
-            "linear": predictor.linear,
-            "bias": predictor.bias,
-            "offset": self.offset,
-            "whitening": self.whitening,
-            "sums": self.sums,
-            "chart_limits": np.array([chart.limit for chart in self.charts]),
-            "chart_whitenings": np.stack([chart.whitening for chart in self.charts]),
-            "settings": np.array([self.clip, self.longest_repeat, self.step_s]),
-        }
-        for i, (weight, bias) in enumerate(predictor.layers):
+        found = {name: getattr(self.predictor, name) for name in _OF_PREDICTOR}
+        found |= {name: getattr(self, name) for name in _OWN}
+        found["settings"] = np.array([self.clip, self.longest_repeat, self.step_s])
+        for i, (weight, bias) in enumerate(self.predictor.layers):
             found |= {f"layer.{i}.weight": weight, f"layer.{i}.bias": bias}
         return found
 
@@ -218,70 +209,40 @@ class Innovation:
 
         Raises:
             KeyError: One is missing.
-            ValueError: A shape is wrong, or a number is not finite.
+            ValueError: A shape is wrong.
         """
-        widths = (num_inputs, *HIDDEN_SIZES, num_states)
-        square, n_charts = (num_states, num_states), len(TIME_CONSTANTS_S)
+        n_s, n_charts = num_states, len(TIME_CONSTANTS_S)
         shapes: dict[str, tuple[int, ...]] = {
             "mean": (num_inputs,),
             "scale": (num_inputs,),
-            "linear": (num_inputs, num_states),
-            "bias": (num_states,),
-            "offset": (num_states,),
-            "whitening": square,
+            "linear": (num_inputs, n_s),
+            "bias": (n_s,),
+            "offset": (n_s,),
+            "whitening": (n_s, n_s),
             "sums": (2, 3),
             "chart_limits": (n_charts,),
-            "chart_whitenings": (n_charts, *square),
+            "chart_whitenings": (n_charts, n_s, n_s),
             "settings": (3,),
         }
-        for i in range(len(HIDDEN_SIZES) + 1):
-            shapes[f"layer.{i}.weight"] = (widths[i], widths[i + 1])
-            shapes[f"layer.{i}.bias"] = (widths[i + 1],)
+        widths = (num_inputs, *HIDDEN_SIZES, n_s)
+        for i, (width, next_width) in enumerate(itertools.pairwise(widths)):
+            shapes |= {f"layer.{i}.weight": (width, next_width), f"layer.{i}.bias": (next_width,)}
         for name, shape in shapes.items():
-            array = arrays[name]
-            # A limit may be infinite.
-            if array.shape != shape or np.isnan(array).any():
+            if arrays[name].shape != shape:
                 raise ValueError(
-                    f"the shape of its innovation.{name} is {array.shape}, expected {shape} of "
-                    "numbers"
+                    f"the shape of its innovation.{name} is {arrays[name].shape}, expected {shape}"
                 )
-        layers = [
+        layers = tuple(
             (arrays[f"layer.{i}.weight"], arrays[f"layer.{i}.bias"])
             for i in range(len(HIDDEN_SIZES) + 1)
-        ]
-        clip, longest_repeat, step_s = arrays["settings"]
+        )
+        clip, longest_repeat, step_s = arrays["settings"].tolist()
         return cls(
-            predictor=Predictor(
-                layers=tuple(layers),
-                **{name: arrays[name] for name in ("mean", "scale", "linear", "bias")},
-            ),
-            offset=arrays["offset"],
-            whitening=arrays["whitening"],
+            predictor=Predictor(layers=layers, **{name: arrays[name] for name in _OF_PREDICTOR}),
+            **{name: arrays[name] for name in _OWN},
             clip=clip,
-            charts=[
-                Chart(time_constant_s=t, whitening=whitening, limit=float(limit))
-                for t, whitening, limit in zip(
-                    TIME_CONSTANTS_S,
-                    arrays["chart_whitenings"],
-                    arrays["chart_limits"],
-                    strict=True,
-                )
-            ],
-            sums=arrays["sums"],
             longest_repeat=int(longest_repeat),
             step_s=step_s,
-        )
-
-    def _with(self, charts: Sequence[Chart], sums: np.ndarray) -> Innovation:
-        return Innovation(
-            predictor=self.predictor,
-            offset=self.offset,
-            whitening=self.whitening,
-            clip=self.clip,
-            charts=charts,
-            sums=sums,
-            longest_repeat=self.longest_repeat,
-            step_s=self.step_s,
         )
 
     def of(self, x: np.ndarray, next_state: np.ndarray) -> np.ndarray:
@@ -345,11 +306,8 @@ class Innovation:
             watched = (np.concatenate([one[1:] for one in distances]), norm)
             for i, values in enumerate(watched):
                 found[is_step, 1 + i] = self._summed(i, values) / self.sums[i, 2]
-            for column, (chart, rate) in enumerate(zip(self.charts, self.rates, strict=True), 3):
-                averages = averaged(innovations, rate)
-                found[is_step, column] = (
-                    np.linalg.norm(averages @ chart.whitening, axis=1) / chart.limit
-                )
+            for column, means in enumerate(self._chart_norms(innovations), 3):
+                found[is_step, column] = means / self.chart_limits[column - 3]
         # The first row of a motion shows the last values.
         last = np.maximum.accumulate(np.where(is_step, np.arange(len(found)), 0))
         return found[last]
@@ -364,9 +322,9 @@ class Innovation:
         Returns:
             (n_s,), positive where the state grows more than predicted.
         """
-        chart = self.charts[("fast", "slow").index(kind)]
+        chart_whitening = self.chart_whitenings[("fast", "slow").index(kind)]
         unwhitening = np.linalg.inv(self.whitening)
-        root = np.linalg.inv(chart.whitening) @ unwhitening
+        root = np.linalg.inv(chart_whitening) @ unwhitening
         return (average @ unwhitening) / np.linalg.norm(root, axis=0)
 
 
@@ -407,8 +365,22 @@ def _steps(x: Sequence[np.ndarray], num_states: int) -> tuple[np.ndarray, np.nda
     return np.concatenate([one[:-1] for one in x]), np.concatenate(changes)
 
 
-def _errors(predictor: Predictor, x: np.ndarray, num_states: int) -> np.ndarray:
-    return np.diff(x[:, :num_states], axis=0) - predictor(x[:-1])
+def _errors(predictor: Predictor, x: np.ndarray) -> np.ndarray:
+    return np.diff(x[:, : len(predictor.bias)], axis=0) - predictor(x[:-1])
+
+
+def _judged_by_others(
+    x: Sequence[np.ndarray],
+    learn: Callable[[Sequence[np.ndarray]], _T],
+    judge: Callable[[_T, np.ndarray], np.ndarray],
+) -> list[np.ndarray]:
+    """Judges each motion by what is learned from motions of other folds, or from all of few."""
+    found = [np.empty(0)] * len(x)
+    for part in range(_NUM_FOLDS):
+        learned = learn([one for i, one in enumerate(x) if i % _NUM_FOLDS != part] or x)
+        for i in range(part, len(x), _NUM_FOLDS):
+            found[i] = judge(learned, x[i])
+    return found
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:

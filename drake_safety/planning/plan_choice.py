@@ -88,9 +88,7 @@ def choose_plan(
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)
     state, preview, features = plan_inputs(loop, context, plans)
-    probability = assessment.predict(
-        state, preview, features if assessment.uses_features else None
-    ).probability
+    probability = assessment.predict(state, preview, features).probability
     best = int(np.argmax(probability))  # The first of equals: the present plan, if any.
     offering.set_plan(context, plans[best])
     return PlanChoice(index=best, probability=probability, threshold=threshold)

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.segments import RECORDED
+from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
 if TYPE_CHECKING:
     from drake_safety.control.kinematics import RobotKinematics
-    from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.simulation.contract import Finding
     from drake_safety.simulation.episode_start import StatePlane
     from drake_safety.simulation.scenario import Scenario
-    from drake_safety.systems.safety_assessor import SafetyAssessor
 
 RECORDED_PORTS = RECORDED
 """Output ports recorded in episodes."""
@@ -196,22 +196,14 @@ class ClosedLoop(Diagram):
         state: OutputPort,
         desired_preview: OutputPort,
         features: OutputPort,
-        margins: OutputPort | None = None,
+        margins: OutputPort | None,
         hold: OutputPort | None = None,
     ) -> SafetyAssessor | None:
-        """Adds an assessor and a monitor, if there is an assessment, and exports their outputs.
+        """Adds an assessor, if there is an assessment, and exports its outputs.
 
         The names of the ports' entries must have been set. The scenario says what an alarm of the
-        monitor does.
-
-        Args:
-            builder: The diagram's builder.
-            period_s: Time between two evaluations of Γ [s].
-            state: Port of the state.
-            desired_preview: Port of the desired preview.
-            features: Port of the features.
-            margins: Port of the margins of the measured state, outside of which nothing is safe.
-            hold: Port that is 1 while the monitor waits, as during recovery.
+        monitor does. The arguments are those of
+        :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
 
         Returns:
             The assessor; None without an assessment.
@@ -221,12 +213,7 @@ class ClosedLoop(Diagram):
         """
         if self.assessment is None:
             return None
-        from drake_safety.systems.novelty_monitor import NoveltyMonitor
-        from drake_safety.systems.safety_assessor import AddSafetyAssessor
-
         self._check_assessment(self.assessment)
-        monitor = builder.AddNamedSystem("novelty_monitor", NoveltyMonitor(self.assessment))
-        is_binding = self.scenario.on_alarm == "unknown"
         assessor = AddSafetyAssessor(
             builder,
             self.assessment,
@@ -234,20 +221,13 @@ class ClosedLoop(Diagram):
             desired_preview=desired_preview,
             features=features,
             margins=margins,
-            alarm=monitor.GetOutputPort("alarm") if is_binding else None,
+            hold=hold,
             period_s=period_s,
+            on_alarm=self.scenario.on_alarm,
         )
-        watched = {"state": state, "desired_preview": desired_preview, "hold": hold}
-        watched["novelty"] = assessor.GetOutputPort("novelty")
-        if monitor.reads_features:
-            watched["features"] = features
-        for name, port in watched.items():
-            if port is not None:
-                builder.Connect(port, monitor.GetInputPort(name))
-        for system in (assessor, monitor):
-            for i in range(system.num_output_ports()):
-                port = system.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
+        for i in range(assessor.num_output_ports()):
+            port = assessor.get_output_port(i)
+            builder.ExportOutput(port, port.get_name())
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:

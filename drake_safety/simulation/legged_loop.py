@@ -29,6 +29,15 @@ from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
+UPDATE_TICK = 0.25
+"""Time between two systems that update one after the other, as a share of the plant's step.
+
+Drake has no order for events of one kind at one time: all discrete updates see the state before any
+of them. (Unrestricted ones come before, and publishing after; two kinds are too few.) So a system
+whose input is another's new state updates a tick later. Assessor, trigger, step planner and
+controller are the longest chain, done within the plant's step in which it began.
+"""
+
 
 @dataclass(kw_only=True)
 class View:
@@ -85,6 +94,7 @@ class LeggedLoop(PlannedLoop):
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
         view: The camera's pose.
+        tick_s: Time between two systems that update one after the other [s].
     """
 
     view: View = View()
@@ -93,6 +103,7 @@ class LeggedLoop(PlannedLoop):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
+        self.tick_s = UPDATE_TICK * scenario.time_step_s
         self._push_source: PushSource | None = None
 
     @classmethod
@@ -120,10 +131,7 @@ class LeggedLoop(PlannedLoop):
         return physics
 
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
-        """Adds observers of the controller, the assessor and the true state.
-
-        Takes options of `StateObserver`; returns the controller's measured state.
-        """
+        """Adds observers, with options of `StateObserver`; returns the controller's state."""
         noise = self.variation.observation_noise
         self._observers = Observers(
             builder,
@@ -167,20 +175,7 @@ class LeggedLoop(PlannedLoop):
         controller_features: tuple[OutputPort, list[str]] | None = None,
         has_stance: bool = True,
     ) -> None:
-        """Adds monitor and features; see :meth:`_add_safe_set`.
-
-        Features after those of the safe set are gravity in the plane of the feet, with position
-        servos the servos' load, and what the controller tells of itself.
-
-        Args:
-            builder: The diagram's builder.
-            safe_set: The safe set.
-            outlook: Port of the outlook.
-            servo_command: Port of the joints' commanded positions and rates, (2 n_j,); None without
-                servos.
-            controller_features: Port of further features, and their names.
-            has_stance: Whether the feet stand, so that they define a plane.
-        """
+        """Adds monitor and features: the safe set's, gravity, servo loads, the controller's."""
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self._rate_features = safe_set.rate_features
@@ -270,22 +265,20 @@ class LeggedLoop(PlannedLoop):
         self,
         builder: DiagramBuilder,
         *,
-        assessment_period_s: float,
-        desired_output: OutputPort | None = None,
-        desired_preview: OutputPort | None = None,
-        hold: OutputPort | None = None,
+        period_s: float,
         meshcat: Meshcat | None,
+        hold: OutputPort | None = None,
+        **ports: OutputPort,
     ) -> SafetyAssessor | None:
         """Adds the optional assessor and visualiser, and exports ports; see :meth:`_export`."""
         assessor = self._export(
             builder,
-            assessment_period_s=assessment_period_s,
+            period_s=period_s,
+            hold=hold,
             state=self._assessor_observer.GetOutputPort("state"),
             true_state=self._true_observer.GetOutputPort("state"),
             output=self._observer.GetOutputPort("output"),
-            desired_output=desired_output,
-            desired_preview=desired_preview,
-            hold=hold,
+            **ports,
         )
         if self._physics.ball_state is not None:
             builder.ExportOutput(self._physics.ball_state, "ball_state")
@@ -326,11 +319,7 @@ class LeggedLoop(PlannedLoop):
         return start.stance_pose(self.kinematics)
 
     def start_control(self, context: Context) -> None:
-        """Sets the command for a start in the present state; a controller may hold none.
-
-        Args:
-            context: The root Context.
-        """
+        """Sets the command for a start in the present state; a controller may hold none."""
 
     def advance_control(self, context: Context, time_s: float) -> None:
         """Moves a Context to a later time, with the command that the controller holds then.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
-from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.framework import Context
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
@@ -13,24 +15,23 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import feedback_of_windows, run_twins
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
-from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 _KEPT_UPDATES = 8
 
 
 class OnlineAdaptation:
-    """Adapts the assessor of a running diagram; a monitor of Drake's `Simulator`.
+    """Advances a simulation and adapts the assessor of its diagram meanwhile.
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Whenever the recorder has finished windows, their nominal twins are
     simulated; after every k_u windows the prior assessment is adapted to the feedback so far, and
     the assessor adopts the result. The simulation waits meanwhile. The object keeps feedback of one
-    simulation; use another one for another Context.
+    simulation; use another one for another.
 
     ```python
-    adaptation = OnlineAdaptation(scenario, prior, recorder, assessor)
-    simulator.set_monitor(adaptation)
+    online = OnlineAdaptation(scenario, prior, recorder, assessor)
+    online.advance(simulator, 60.0)  # in place of simulator.AdvanceTo(60.0)
     ```
 
     Args:
@@ -38,7 +39,6 @@ class OnlineAdaptation:
         prior: The assessment before feedback.
         recorder: The recorder, a system of the diagram.
         assessor: The assessor, a system of the diagram.
-        monitor: The monitor, if the diagram has one.
         method: Method of `SafetyAssessment.adapt`.
         run: Function that simulates the twins; see `feedback_of_windows`.
         capacity: Largest number of feedback sets kept; the oldest are dropped.
@@ -46,6 +46,7 @@ class OnlineAdaptation:
     Attributes:
         feedback: All feedback so far, up to the capacity.
         adapted: The assessments after the newest eight updates.
+        num_updates: The number of all updates.
     """
 
     def __init__(
@@ -55,7 +56,6 @@ class OnlineAdaptation:
         recorder: FeedbackRecorder,
         assessor: SafetyAssessor,
         *,
-        monitor: NoveltyMonitor | None = None,
         method: str | None = None,
         run: Callable[..., Episodes] = run_twins,
         capacity: int = 400,
@@ -65,17 +65,40 @@ class OnlineAdaptation:
             raise ValueError(f"OnlineAdaptation: capacity is {capacity}, expected >= 1")
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor, self._run = recorder, assessor, run
-        self._monitor = monitor
         self._capacity, self._num_new = capacity, 0
         self.feedback: list[FeedbackSet] = []
         self.adapted: list[SafetyAssessment] = []
+        self.num_updates = 0
 
-    def __call__(self, root_context: Context) -> EventStatus:
+    def advance(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
+        """Advances the simulation as `AdvanceTo` does, with the updates that become due.
+
+        Updates are between two calls of `AdvanceTo`, at the times of the recorder's rows: events
+        and monitors of a simulation must not change its Context.
+
+        Args:
+            simulator: The simulator of the diagram.
+            until_s: The time until which to simulate [s].
+
+        Returns:
+            The status of the last `AdvanceTo`, which may have ended early.
+        """
+        context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
+        while True:
+            next_row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
+            status = simulator.AdvanceTo(min(next_row_s, until_s))
+            is_ended = status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime
+            if is_ended or context.get_time() >= until_s:
+                return status
+            simulator.AdvancePendingEvents()  # The row is recorded.
+            self._update(context)
+
+    def _update(self, root_context: Context) -> None:
         """Takes finished windows and, after every k_u of them, updates the assessor."""
-        # Most steps finish no window; the mutable Context would invalidate caches.
+        # Most rows finish no window; the mutable Context would invalidate caches.
         seen = self._recorder.recording(self._recorder.GetMyContextFromRoot(root_context))
         if not seen.windows:
-            return EventStatus.DidNothing()
+            return
         windows = self._recorder.take_windows(
             self._recorder.GetMyMutableContextFromRoot(root_context)
         )
@@ -83,15 +106,9 @@ class OnlineAdaptation:
         self.feedback = [*self.feedback, *new][-self._capacity :]
         self._num_new += len(new)
         if self._num_new < self._prior.parameters.adaptation.update_interval:
-            return EventStatus.Succeeded()
+            return
         self._num_new = 0
         adapted = self._prior.adapt(self.feedback, method=self._method)
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
-        self._assessor.adopt(
-            self._assessor.GetMyMutableContextFromRoot(root_context), self.adapted[-1]
-        )
-        if self._monitor is not None:
-            own_context = self._monitor.GetMyMutableContextFromRoot(root_context)
-            self._monitor.adopt(own_context, self.adapted[-1])
-            self._monitor.reset(own_context)
-        return EventStatus.Succeeded()
+        self.num_updates += 1
+        self._assessor.adopt(self._assessor.GetMyMutableContextFromRoot(root_context), adapted)

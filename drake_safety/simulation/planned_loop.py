@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
@@ -13,11 +12,9 @@ from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
-
-if TYPE_CHECKING:
-    from drake_safety.systems.safety_assessor import SafetyAssessor
 
 
 class PlannedLoop(ClosedLoop):
@@ -77,16 +74,7 @@ class PlannedLoop(ClosedLoop):
         seen_state: OutputPort | None = None,
         outlook: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features, and sets the names of their outputs.
-
-        Args:
-            builder: The diagram's builder.
-            safe_set: The safe set.
-            sizes: n_q and n_v.
-            plant_state: Port of the true state ``[q; v]``, for the monitor.
-            seen_state: Port of the measured state, for the features; ``plant_state`` by default.
-            outlook: Port of the outlook, for the features; the planner's by default.
-        """
+        """Adds monitor and features; the latter see the state and outlook that are given."""
         self.plant_state_sizes = sizes
         self._plant_state = plant_state
         self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
@@ -111,53 +99,27 @@ class PlannedLoop(ClosedLoop):
         self,
         builder: DiagramBuilder,
         *,
-        assessment_period_s: float,
-        state: OutputPort,
-        true_state: OutputPort | None = None,
-        output: OutputPort,
-        desired_output: OutputPort | None = None,
-        desired_preview: OutputPort | None = None,
+        period_s: float,
         hold: OutputPort | None = None,
+        **ports: OutputPort,
     ) -> SafetyAssessor | None:
-        """Adds the assessor, if there is an assessment, and exports the ports of the contract.
-
-        Args:
-            builder: The diagram's builder.
-            assessment_period_s: Time between two evaluations of Γ [s].
-            state: See the table of :class:`ClosedLoop`, as for all that follow.
-            true_state: ``state`` by default.
-            output: The measured output.
-            desired_output: The planner's by default.
-            desired_preview: The planner's by default.
-            hold: See :meth:`~ClosedLoop.add_assessor`.
-
-        Returns:
-            The assessor; None without an assessment.
-        """
-        features = self._features
-        desired_preview = desired_preview or self._planner.GetOutputPort("desired_preview")
-        assessor = self.add_assessor(
-            builder,
-            period_s=assessment_period_s,
-            state=state,
-            desired_preview=desired_preview,
-            features=features,
-            margins=self._seen_margins,
-            hold=hold,
-        )
-        for name, port in {
-            "state": state,
-            "true_state": true_state or state,
-            "output": output,
-            "desired_output": desired_output or self._planner.GetOutputPort("desired_output"),
-            "desired_preview": desired_preview,
-            "features": features,
+        """Adds the assessor, if any, and exports the contract's ports, by default the planner's."""
+        ports = {
+            "true_state": ports["state"],
+            "desired_output": self._planner.GetOutputPort("desired_output"),
+            "desired_preview": self._planner.GetOutputPort("desired_preview"),
+            "features": self._features,
             "margins": self._monitor.GetOutputPort("margins"),
             "safe": self._monitor.GetOutputPort("safe"),
             "plant_state": self._plant_state,
-        }.items():
+            **ports,
+        }
+        for name, port in ports.items():
             builder.ExportOutput(port, name)
-        return assessor
+        seen = {name: ports[name] for name in ("state", "desired_preview", "features")}
+        return self.add_assessor(
+            builder, period_s=period_s, margins=self._seen_margins, hold=hold, **seen
+        )
 
     def finish(self, builder: DiagramBuilder) -> None:
         """Builds the diagram and checks its ports."""

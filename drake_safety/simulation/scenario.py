@@ -22,6 +22,7 @@ from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.systems.safety_assessor import ON_ALARM
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from drake_safety.learning.assessment import SafetyAssessment
 
 
-ON_ALARM = ("unknown", "report")
-"""What an alarm of the monitor may do."""
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 
 

@@ -121,7 +121,7 @@ class CommandGuard(LeafSystem):
         return self._assessment.predict(
             np.tile(state, (len(commands), 1)),
             np.tile(commands, self._horizon),
-            self._with_commands(features, commands) if self._assessment.uses_features else None,
+            self._with_commands(features, commands),
         ).probability
 
     def candidates(self, asked: np.ndarray) -> np.ndarray:

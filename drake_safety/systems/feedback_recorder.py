@@ -50,6 +50,10 @@ class Recording:
     def __deepcopy__(self, memo: dict[int, Any]) -> Recording:
         return self
 
+    def closed(self) -> Recording:
+        """The recording without its open window."""
+        return replace(self, rows=(), times_s=(), plant_state=None)
+
 
 class FeedbackRecorder(LeafSystem):
     """Records windows of a running robot's motion; the label of each is how it ended.
@@ -169,23 +173,22 @@ class FeedbackRecorder(LeafSystem):
         if recording.times_s:
             lapse_s = time_s - recording.times_s[-1]
             if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
-                recording = replace(recording, rows=(), times_s=(), plant_state=None)
+                recording = recording.closed()
         row = self._row(context)
         if self._recovery_port.HasValue(context) and self._recovery_port.Eval(context)[0] != 0.0:
-            recording = replace(recording, rows=(), times_s=(), plant_state=None)
+            recording = recording.closed()
         elif has_left:
             if recording.rows:
                 if was_left:
                     margins = np.minimum(row[-1], latch[1:])
                     row = (*row[:-1], margins)
                 recording = self._finished(self._extended(context, recording, row), is_safe=False)
-            recording = replace(recording, rows=(), times_s=(), plant_state=None)
+            recording = recording.closed()
         else:
             recording = self._extended(context, recording, row)
             if len(recording.rows) == self._num_steps + 1:
-                recording = self._finished(recording, is_safe=True)
-                empty = replace(recording, rows=(), times_s=(), plant_state=None)
-                recording = self._extended(context, empty, row)
+                recording = self._finished(recording, is_safe=True).closed()
+                recording = self._extended(context, recording, row)
         state.get_mutable_discrete_state().set_value(self._closed_latch)
         state.get_mutable_abstract_state(int(self._index)).set_value(recording)
 

@@ -10,7 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
-from drake_safety.learning.innovation import KINDS, describe
+from drake_safety.learning.innovation import KINDS, Innovation, describe
+from drake_safety.learning.novelty import Novelty
 
 LEVELS = KINDS[1:]
 """What the monitor watches, in the order of its port ``levels``."""
@@ -26,7 +27,6 @@ class NoveltyMonitor(LeafSystem):
         - state
         - desired_preview
         - features (read in the sharpened mode only)
-        - novelty (optional)
         - hold (optional)
         output_ports:
         - alarm
@@ -36,11 +36,9 @@ class NoveltyMonitor(LeafSystem):
     Every step of training it predicts the state from the last inputs, and updates the charts of
     :class:`~drake_safety.learning.innovation.Innovation`. ``levels`` has five numbers in units of
     their limits: repeated inputs, the sums of the distance of x and of the innovation's norm, the
-    fast and the slow chart. When
-    one exceeds 1, ``alarm`` becomes 1 and stays so until the Context is reset, and ``alarm_cause``
-    says what was seen. ``novelty`` is that of a
-    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`. While ``hold`` is above 0.5, as
-    during a recovery step that training does not have, the charts wait. The innovation is a
+    fast and the slow chart. When one exceeds 1, ``alarm`` becomes 1 and stays so until the Context
+    is reset, and ``alarm_cause`` says what was seen. While ``hold`` is above 0.5, as during a
+    recovery step that training does not have, the charts wait. Innovation and novelty are a
     parameter of the Context, see :meth:`adopt`.
 
     Args:
@@ -53,7 +51,7 @@ class NoveltyMonitor(LeafSystem):
         self._assessment = assessment
         self.reads_features = assessment.uses_features and bool(info.feature_names)
         self._state_names = assessment.state_names
-        self._parameter = self.DeclareAbstractParameter(Value(innovation))
+        self._learned = self.DeclareAbstractParameter(Value(_learned(assessment)))
         self._inputs = {
             "state": self.DeclareVectorInputPort("state", len(info.state_names)),
             "desired_preview": self.DeclareVectorInputPort(
@@ -61,7 +59,6 @@ class NoveltyMonitor(LeafSystem):
             ),
             "features": self.DeclareVectorInputPort("features", len(info.feature_names)),
         }
-        self._novelty_port = self.DeclareVectorInputPort("novelty", 1)
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
         n_s, sizes = innovation.num_states, {}
         sizes["x"] = innovation.num_inputs
@@ -84,13 +81,13 @@ class NoveltyMonitor(LeafSystem):
         )
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over the innovation of an assessment adapted from this system's own.
+        """Takes over innovation and novelty of an assessment adapted from this system's own.
 
         Args:
             context: This system's Context.
             adapted: The result of ``adapt``.
         """
-        context.get_mutable_abstract_parameter(self._parameter).set_value(adapted.innovation_)
+        context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
 
     def reset(self, context: Context) -> None:
         """Ends the alarm and empties the charts.
@@ -105,7 +102,7 @@ class NoveltyMonitor(LeafSystem):
 
     @one_blas_thread
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        innovation = context.get_abstract_parameter(self._parameter).get_value()
+        innovation, novelty = context.get_abstract_parameter(self._learned).get_value()
         values = context.get_discrete_state_vector().get_value().copy()
         part = {name: values[place] for name, place in self._places.items()}  # Views.
         x = self._assessment.inputs_of(
@@ -123,19 +120,14 @@ class NoveltyMonitor(LeafSystem):
             part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
             error = innovation.of(previous[None], x[None, : innovation.num_states])[0]
             levels = part["levels"]
-            for i, (chart, rate) in enumerate(
-                zip(innovation.charts, innovation.rates, strict=True), LEVELS.index("fast")
-            ):
-                average = part[LEVELS[i]]
+            for i, rate in enumerate(innovation.rates):
+                average = part[("fast", "slow")[i]]
                 average += rate * (error - average)
-                whitened = average @ chart.whitening
-                levels[i] = math.sqrt(whitened @ whitened) / chart.limit
-            novelty = (
-                float(self._novelty_port.Eval(context)[0])
-                if self._novelty_port.HasValue(context)
-                else 0.0
-            )
-            part["sums"][:] = innovation.next_sums(part["sums"], novelty, error)
+                whitened = average @ innovation.chart_whitenings[i]
+                norm = math.sqrt(whitened @ whitened)
+                levels[LEVELS.index("fast") + i] = norm / innovation.chart_limits[i]
+            distance = novelty.of(x[None])[0]
+            part["sums"][:] = innovation.next_sums(part["sums"], distance, error)
             levels[LEVELS.index("frozen")] = part["repeats"][0] / innovation.longest_repeat
             first = LEVELS.index("distance")
             levels[first : first + 2] = part["sums"] / innovation.sums[:, 2]
@@ -159,3 +151,7 @@ class NoveltyMonitor(LeafSystem):
     def _calc_alarm_cause(self, context: Context, output: Value) -> None:
         kind = KINDS[int(self._of(context, "kind")[0])]
         output.set_value(describe(kind, self._of(context, "seen"), self._state_names))
+
+
+def _learned(assessment: SafetyAssessment) -> tuple[Innovation, Novelty]:
+    return assessment.innovation_, assessment.novelty_

@@ -45,7 +45,8 @@ class RecoverySwitch(Diagram):
         initial_uncertainty: See there.
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after the assessor, and of the step planner after the
-            trigger [s]. Simultaneous discrete updates would add a period of delay each.
+            trigger [s]. Discrete updates of one time see the state before all of them, so each
+            would be a period late.
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """

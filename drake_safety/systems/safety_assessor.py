@@ -1,31 +1,19 @@
-"""SafetyAssessor: a fitted assessment as a system."""
+"""SafetyAssessor: a fitted assessment with its monitor, as a diagram."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import fields
-
-import numpy as np
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import EMPTY
-from drake_safety.learning.prediction import Correction
+from drake_safety.systems.belief_evaluator import BeliefEvaluator
+from drake_safety.systems.novelty_monitor import NoveltyMonitor
 
-_LARGEST_NOVELTY = 1e6
-_CORRECTION = tuple(field.name for field in fields(Correction))
+ON_ALARM = ("unknown", "report")
+"""What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
 
 
-class SafetyAssessor(LeafSystem):
-    """Evaluates Γ on the measured state and the upcoming desired trajectory.
+class SafetyAssessor(Diagram):
+    """Γ in a diagram: a :class:`BeliefEvaluator` and a :class:`NoveltyMonitor`, connected.
 
     .. pydrake_system::
 
@@ -34,8 +22,8 @@ class SafetyAssessor(LeafSystem):
         - state
         - desired_preview
         - features (read in the sharpened mode only)
-        - margins (optional)
-        - alarm (optional)
+        - margins
+        - hold (optional)
         output_ports:
         - safety_probability
         - belief
@@ -43,168 +31,88 @@ class SafetyAssessor(LeafSystem):
         - embedding
         - predicted_margins
         - novelty
+        - alarm
+        - levels
+        - alarm_cause
 
-    Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
-    ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
-    ``safety_probability`` is the probability of staying safe, by the maps' heads with the
-    correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
-    is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
-    training, novel above 1. The belief of inputs that are novel or not finite is (0, 0, 1), and so
-    is the belief before the first evaluation, and every belief while ``alarm`` is above 0.5, as
-    that of a
-    :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. With ``margins``, those of the
-    measured state, no belief is safe while one is negative: its mass for "safe" then counts as
-    unsafe by the most violated constraint. The beliefs of the grid, the correction and the novelty
-    are parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
-    between simulations and during them. The embedding is immutable.
+    The ports are those of its two systems.
 
     Args:
         assessment: A fitted assessment.
-        period_s: Time between two evaluations [s].
+        period_s: Time between two evaluations [s]; the step of the training episodes by default.
+        checks_margins: Whether nothing is safe outside the safe set; otherwise there is no port
+            ``margins``.
+        on_alarm: What an alarm of the monitor does, one of ``ON_ALARM``; None for no monitor, and
+            none of its ports.
+
+    Attributes:
+        evaluator: The BeliefEvaluator.
+        monitor: The NoveltyMonitor, or None.
+
+    Raises:
+        ValueError: Another ``on_alarm``.
     """
 
-    def __init__(self, assessment: SafetyAssessment, *, period_s: float):
+    def __init__(
+        self,
+        assessment: SafetyAssessment,
+        *,
+        period_s: float | None = None,
+        checks_margins: bool = True,
+        on_alarm: str | None = "unknown",
+    ):
         super().__init__()
-        info = assessment.info_
-        self._assessment = assessment
-        self._shape = assessment.beliefs_.shape
-        # A diagram without features has no port to connect.
-        self.reads_features = assessment.uses_features and bool(info.feature_names)
-        self._no_features = np.empty(0) if assessment.uses_features else None
-        self.constraint_names = list(info.constraint_names)
-        n_c = len(self.constraint_names)
-        self._belief_index = self.DeclareNumericParameter(
-            BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
-        )
-        correction = assessment.correction_
-        self._correction_shapes = [getattr(correction, name).shape for name in _CORRECTION]
-        self._correction_index = self.DeclareNumericParameter(BasicVector(_packed(correction)))
-        self._novelty_index = self.DeclareAbstractParameter(Value(assessment.novelty_))
-        # Without heads there is no logit to correct.
-        self._has_heads = assessment.base_logit_ is not None
-        self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
-        self._preview_port = self.DeclareVectorInputPort(
-            "desired_preview", info.horizon * len(info.output_names)
-        )
-        self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
-        self._margins_port = self.DeclareVectorInputPort("margins", n_c)
-        self._alarm_port = self.DeclareVectorInputPort("alarm", 1)
-        sizes = {
-            "safety_probability": 1,
-            "belief": 3,
-            "cause_probability": n_c,
-            "embedding": 2,
-            "predicted_margins": n_c,
-            "novelty": 1,
-        }
-        first = np.concatenate(
-            [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
-        )
-        state = self.DeclareDiscreteState(first)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
-        start = 0
-        for name, size in sizes.items():
-            rows = slice(start, start + size)
-            start += size
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(size),
-                lambda context, output, rows=rows: output.SetFromVector(
-                    context.get_discrete_state_vector().get_value()[rows]
-                ),
-                {self.discrete_state_ticket(state)},
+        if on_alarm not in (*ON_ALARM, None):
+            raise ValueError(
+                f"safety assessor: on_alarm is {on_alarm!r}, expected one of {list(ON_ALARM)} or "
+                "None for no monitor"
             )
-
-    def get_beliefs(self, context: Context) -> np.ndarray:
-        """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
-        return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
-
-    def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
-        """Replaces the beliefs of every cell.
-
-        Args:
-            context: This system's Context.
-            beliefs: Shaped as the assessment's ``beliefs_``.
-
-        Raises:
-            ValueError: The beliefs have another shape.
-        """
-        _check_shape("beliefs", beliefs, self._shape)
-        _replace(context, self._belief_index, beliefs)
-
-    def get_correction(self, context: Context) -> Correction:
-        """Returns the correction in a Context."""
-        values = context.get_numeric_parameter(self._correction_index).get_value()
-        parts, start = [], 0
-        for shape in self._correction_shapes:
-            stop = start + math.prod(shape)
-            parts.append(values[start:stop].reshape(shape))
-            start = stop
-        return Correction(*parts)
-
-    def set_correction(self, context: Context, correction: Correction) -> None:
-        """Replaces the correction of the maps' logit.
-
-        Args:
-            context: This system's Context.
-            correction: Its arrays are shaped as those of the assessment.
-
-        Raises:
-            ValueError: An array has another shape; nothing is replaced.
-        """
-        for name, shape in zip(_CORRECTION, self._correction_shapes, strict=True):
-            _check_shape(f"the correction's {name}", getattr(correction, name), shape)
-        _replace(context, self._correction_index, _packed(correction))
+        builder = DiagramBuilder()
+        self.evaluator: BeliefEvaluator = builder.AddNamedSystem(
+            "belief_evaluator",
+            BeliefEvaluator(
+                assessment,
+                period_s=assessment.info_.step_s if period_s is None else period_s,
+                checks_margins=checks_margins,
+                heeds_alarm=on_alarm == "unknown",
+            ),
+        )
+        self.monitor: NoveltyMonitor | None = None
+        inputs = ["state", "desired_preview", "features"]
+        for name in [*inputs, "margins"] if checks_margins else inputs:
+            builder.ExportInput(self.evaluator.GetInputPort(name), name)
+        if on_alarm is not None:
+            self.monitor = builder.AddNamedSystem("novelty_monitor", NoveltyMonitor(assessment))
+            for name in inputs:
+                builder.ConnectInput(name, self.monitor.GetInputPort(name))
+            builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")
+        if self.monitor is not None and on_alarm == "unknown":
+            builder.Connect(
+                self.monitor.GetOutputPort("alarm"), self.evaluator.GetInputPort("alarm")
+            )
+        for system in filter(None, (self.evaluator, self.monitor)):
+            for i in range(system.num_output_ports()):
+                port = system.get_output_port(i)
+                builder.ExportOutput(port, port.get_name())
+        builder.BuildInto(self)
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned.
 
+        The monitor begins anew: its alarm was about the robot before the adaptation.
+
         Args:
-            context: This system's Context.
+            context: This diagram's Context.
             adapted: The result of ``adapt``.
 
         Raises:
             ValueError: The adapted assessment has other maps.
         """
-        if adapted.embedding_ is not self._assessment.embedding_ and not (
-            adapted.embedding_.is_same(self._assessment.embedding_)
-        ):
-            raise ValueError(
-                "safety assessor: the assessment to adopt has other maps; build the diagram anew"
-            )
-        self.set_beliefs(context, adapted.beliefs_)
-        self.set_correction(context, adapted.correction_)
-        context.get_mutable_abstract_parameter(self._novelty_index).set_value(adapted.novelty_)
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        prediction = self._assessment.predict_one(
-            self._state_port.Eval(context),
-            self._preview_port.Eval(context),
-            self._features_port.Eval(context) if self.reads_features else self._no_features,
-            beliefs=self.get_beliefs(context),
-            correction=self.get_correction(context) if self._has_heads else None,
-            novelty=context.get_abstract_parameter(self._novelty_index).get_value(),
-        )
-        if self._alarm_port.HasValue(context) and self._alarm_port.Eval(context)[0] > 0.5:
-            prediction = prediction.unknown()
-        elif self._margins_port.HasValue(context):
-            margins = self._margins_port.Eval(context)
-            if margins.min(initial=0.0) < 0.0:
-                prediction = prediction.outside(int(np.argmin(margins)))
-        # In the order of the ports.
-        discrete_state.set_value(
-            np.concatenate(
-                [
-                    (prediction.probability,),
-                    prediction.belief,
-                    prediction.cause_probability,
-                    prediction.embedding,
-                    prediction.predicted_margins,
-                    (min(prediction.novelty, _LARGEST_NOVELTY),),
-                ]
-            )
-        )
+        self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
+        if self.monitor is not None:
+            own_context = self.GetMutableSubsystemContext(self.monitor, context)
+            self.monitor.adopt(own_context, adapted)
+            self.monitor.reset(own_context)
 
 
 def AddSafetyAssessor(
@@ -213,10 +121,11 @@ def AddSafetyAssessor(
     *,
     state: OutputPort,
     desired_preview: OutputPort,
+    margins: OutputPort | None,
     features: OutputPort | None = None,
-    margins: OutputPort | None = None,
-    alarm: OutputPort | None = None,
+    hold: OutputPort | None = None,
     period_s: float | None = None,
+    on_alarm: str | None = "unknown",
 ) -> SafetyAssessor:
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
 
@@ -225,10 +134,11 @@ def AddSafetyAssessor(
         assessment: A fitted assessment.
         state: Port of the state, as in the training episodes.
         desired_preview: Port of the desired preview, as in the training episodes.
+        margins: Port of the measured state's margins; None if nothing checks them.
         features: Port of the features; not needed if the assessment reads none.
-        margins: Port of the measured state's margins, if any.
-        alarm: Port of an alarm that makes every belief unknown, if any.
-        period_s: Time between two evaluations [s]; the step of the training episodes by default.
+        hold: Port that is 1 while the monitor waits, as during recovery.
+        period_s: See :class:`SafetyAssessor`.
+        on_alarm: See :class:`SafetyAssessor`.
 
     Returns:
         The assessor, with its outputs unconnected.
@@ -237,20 +147,21 @@ def AddSafetyAssessor(
         ValueError: The assessment reads features and there is no port for them, or a port has
             another size than in the training episodes.
     """
-    info = assessment.info_
-    assessor = SafetyAssessor(assessment, period_s=info.step_s if period_s is None else period_s)
+    assessor = SafetyAssessor(
+        assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
+    )
     given = {
         "state": state,
         "desired_preview": desired_preview,
         "features": features,
         "margins": margins,
-        "alarm": alarm,
+        "hold": hold,
     }
     ports = {name: port for name, port in given.items() if port is not None}
-    if assessor.reads_features and features is None:
+    if assessor.evaluator.reads_features and features is None:
         raise ValueError(
-            f"AddSafetyAssessor: the assessment was fitted with features {info.feature_names}; "
-            "give the port that carries them"
+            "AddSafetyAssessor: the assessment was fitted with features "
+            f"{assessment.info_.feature_names}; give the port that carries them"
         )
     for name, port in ports.items():
         if port.size() != (size := assessor.GetInputPort(name).size()):
@@ -262,17 +173,3 @@ def AddSafetyAssessor(
     for name, port in ports.items():
         builder.Connect(port, assessor.GetInputPort(name))
     return assessor
-
-
-def _packed(correction: Correction) -> np.ndarray:
-    return np.concatenate([np.ravel(getattr(correction, name)) for name in _CORRECTION])
-
-
-def _check_shape(what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
-    if np.shape(values) != shape:
-        raise ValueError(f"safety assessor: {what} must have shape {shape}; got {np.shape(values)}")
-
-
-def _replace(context: Context, index: int, values: np.ndarray) -> None:
-    values = np.asarray(values, dtype=float)
-    context.get_mutable_numeric_parameter(index).SetFromVector(values.ravel())

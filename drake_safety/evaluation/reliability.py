@@ -1,0 +1,157 @@
+"""Reliability: predicted probabilities beside outcomes, and stored thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_safety.evaluation.figure_style import (
+    FAINT_INK,
+    SERIES_COLOURS,
+    SERIES_DASHES,
+    drawing_style,
+    new_figure,
+)
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, share
+from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE, Calibration
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BOOTSTRAP = Bootstrap(num_resamples=100)
+
+
+def verdict_shares(
+    calibration: Calibration, unsafe_score: np.ndarray, is_unsafe: np.ndarray
+) -> dict[str, Estimate]:
+    """Shares of the verdicts of stored thresholds on fresh episodes.
+
+    Args:
+        calibration: The calibration.
+        unsafe_score: 1 - probability of each episode, (N,), for the kind of the calibration.
+        is_unsafe: Whether each ended unsafely, (N,).
+
+    Returns:
+        `promised_miss_rate`; `miss_rate` and `unsafe_unknown`, shares of the unsafe episodes;
+        `safe_recall`, `safe_unknown` and `false_alarm_rate`, shares of the safe ones.
+    """
+    verdict = calibration.verdicts(1.0 - np.asarray(unsafe_score, dtype=float))
+    label = np.asarray(is_unsafe, dtype=bool)
+
+    def share_of(rows: np.ndarray, expected: str) -> Estimate:
+        return proportion(int(np.sum(verdict[rows] == expected)), int(rows.sum()))
+
+    return {
+        "promised_miss_rate": Estimate.exact(calibration.miss_rate, calibration.num_unsafe),
+        "miss_rate": share_of(label, SAFE),
+        "unsafe_unknown": share_of(label, UNKNOWN),
+        "safe_recall": share_of(~label, SAFE),
+        "safe_unknown": share_of(~label, UNKNOWN),
+        "false_alarm_rate": share_of(~label, UNSAFE),
+    }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reliability:
+    """Predicted probabilities against observed frequencies, in bins of equal numbers of rows.
+
+    Attributes:
+        expected: Mean predicted probability of an unsafe end, (B,).
+        observed: Share of unsafe ends, by bin.
+        error: Expected calibration error, the mean distance between the two over all rows.
+    """
+
+    expected: np.ndarray
+    observed: list[Estimate]
+    error: Estimate
+
+
+def reliability(
+    unsafe_probability: np.ndarray,
+    is_unsafe: np.ndarray,
+    episode: np.ndarray,
+    *,
+    num_bins: int = 10,
+    bootstrap: Bootstrap = _BOOTSTRAP,
+) -> Reliability:
+    """Compares probabilities with outcomes.
+
+    Args:
+        unsafe_probability: 1 - probability of each row, (N,), in [0, 1]; NaN counts as one.
+        is_unsafe: Whether the row's episode ended unsafely, (N,).
+        episode: Index of each row's episode, (N,).
+        num_bins: Number of bins; fewer if rows share probabilities.
+        bootstrap: Settings of the intervals, which are over episodes.
+
+    Raises:
+        ValueError: There is no row, or a probability outside [0, 1].
+    """
+    p = np.asarray(unsafe_probability, dtype=float)
+    p = np.where(np.isnan(p), 1.0, p)
+    label = np.asarray(is_unsafe, dtype=bool)
+    if p.size == 0 or not np.all((p >= 0.0) & (p <= 1.0)):
+        raise ValueError(
+            f"reliability: expected probabilities in [0, 1], got {p.size} of them"
+            + (f" in {p.min()}..{p.max()}" if p.size else "")
+        )
+
+    def error(weight: np.ndarray) -> float:
+        drawn = np.repeat(np.arange(len(p)), weight.astype(int))
+        bins = _bins(p[drawn], num_bins)
+        distances = [abs(p[drawn[b]].mean() - label[drawn[b]].mean()) for b in bins]
+        return float([len(b) for b in bins] @ np.array(distances) / len(drawn))
+
+    bins = _bins(p, num_bins)
+    return Reliability(
+        expected=np.array([p[b].mean() for b in bins]),
+        observed=[share(label[b], episode[b], bootstrap=bootstrap) for b in bins],
+        error=bootstrap.over_episodes(error, episode),
+    )
+
+
+def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
+    # Edges are occurring values, so that equal probabilities share a bin.
+    edges = np.unique(np.quantile(p, np.linspace(0, 1, num_bins + 1)[1:-1], method="nearest"))
+    members = np.searchsorted(edges, p, side="right")
+    return [np.flatnonzero(members == i) for i in np.unique(members)]
+
+
+def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
+    """Plots the observed share of unsafe ends over the predicted probability.
+
+    Args:
+        curves: Reliability by name.
+    """
+    with drawing_style():
+        fig = new_figure(5.4, 6.0)
+        axes = fig.subplots()
+        axes.plot([0, 1], [0, 1], color=FAINT_INK, linewidth=0.8)
+        for i, (name, one) in enumerate(curves.items()):
+            value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
+            axes.errorbar(
+                one.expected,
+                value,
+                yerr=np.clip([value - low, high - value], 0.0, None),
+                color=SERIES_COLOURS[i % len(SERIES_COLOURS)],
+                linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
+                marker="o",
+                markersize=5,
+                linewidth=1.4,
+                elinewidth=0.8,
+                label=f"{name}   {one.error.value:.3f}",
+            )
+        axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title="Reliability")
+        axes.set_xlabel("predicted probability of an unsafe end")
+        axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")
+        axes.grid(color="#eceef0", linewidth=0.7)
+        # Outside: intervals may be anywhere in the axes.
+        fig.legend(
+            loc="outside lower center",
+            ncols=2,
+            title="expected calibration error",
+            alignment="left",
+        )
+    return fig

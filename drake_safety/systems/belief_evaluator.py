@@ -1,0 +1,190 @@
+"""BeliefEvaluator: a fitted assessment as a system."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+)
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.novelty import Novelty
+from drake_safety.learning.prediction import Correction
+
+_LARGEST_NOVELTY = 1e6
+
+
+class BeliefEvaluator(LeafSystem):
+    """Evaluates Γ on the measured state and the upcoming desired trajectory.
+
+    .. pydrake_system::
+
+        name: BeliefEvaluator
+        input_ports:
+        - state
+        - desired_preview
+        - features (read in the sharpened mode only)
+        - margins (with ``checks_margins``)
+        - alarm (with ``heeds_alarm``)
+        output_ports:
+        - safety_probability
+        - belief
+        - cause_probability
+        - embedding
+        - predicted_margins
+        - novelty
+
+    Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
+    ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
+    ``safety_probability`` is the probability of staying safe, by the maps' heads with the
+    correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
+    is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
+    training, novel above 1. The belief of inputs that are novel or not finite is (0, 0, 1), and so
+    is the belief before the first evaluation, and every belief while ``alarm`` is above 0.5, as
+    that of a :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. While one of
+    ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
+    counts as unsafe by the most violated constraint. The beliefs of the grid, the correction and
+    the novelty are parameters of the Context: :meth:`adopt` replaces them by those of an adapted
+    assessment, between simulations and during them. The embedding is immutable.
+
+    Args:
+        assessment: A fitted assessment.
+        period_s: Time between two evaluations [s].
+        checks_margins: Whether no belief is safe outside the safe set.
+        heeds_alarm: Whether every belief is unknown during an alarm.
+    """
+
+    def __init__(
+        self,
+        assessment: SafetyAssessment,
+        *,
+        period_s: float,
+        checks_margins: bool = True,
+        heeds_alarm: bool = True,
+    ):
+        super().__init__()
+        info = assessment.info_
+        self._assessment = assessment
+        self._shape = assessment.beliefs_.shape
+        # A diagram without features has no port to connect.
+        self.reads_features = assessment.uses_features and bool(info.feature_names)
+        n_c = len(info.constraint_names)
+        self._belief_index = self.DeclareNumericParameter(
+            BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
+        )
+        self._learned = self.DeclareAbstractParameter(Value(_learned(assessment)))
+        self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
+        self._preview_port = self.DeclareVectorInputPort(
+            "desired_preview", info.horizon * len(info.output_names)
+        )
+        self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._margins_port = self._alarm_port = None
+        if checks_margins:
+            self._margins_port = self.DeclareVectorInputPort("margins", n_c)
+        if heeds_alarm:
+            self._alarm_port = self.DeclareVectorInputPort("alarm", 1)
+        sizes = {
+            "safety_probability": 1,
+            "belief": 3,
+            "cause_probability": n_c,
+            "embedding": 2,
+            "predicted_margins": n_c,
+            "novelty": 1,
+        }
+        first = np.concatenate(
+            [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
+        )
+        state = self.DeclareDiscreteState(first)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
+        start = 0
+        for name, size in sizes.items():
+            rows = slice(start, start + size)
+            start += size
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(size),
+                lambda context, output, rows=rows: output.SetFromVector(
+                    context.get_discrete_state_vector().get_value()[rows]
+                ),
+                {self.discrete_state_ticket(state)},
+            )
+
+    def get_beliefs(self, context: Context) -> np.ndarray:
+        """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
+        return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
+
+    def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
+        """Replaces the beliefs of every cell.
+
+        Args:
+            context: This system's Context.
+            beliefs: Shaped as the assessment's ``beliefs_``.
+
+        Raises:
+            ValueError: The beliefs have another shape.
+        """
+        beliefs = np.asarray(beliefs, dtype=float)
+        if beliefs.shape != self._shape:
+            raise ValueError(
+                f"belief evaluator: beliefs must have shape {self._shape}; got {beliefs.shape}"
+            )
+        context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
+
+    def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
+        """Takes over what an assessment adapted from this system's own has learned.
+
+        Args:
+            context: This system's Context.
+            adapted: The result of ``adapt``.
+
+        Raises:
+            ValueError: The adapted assessment has other maps.
+        """
+        if adapted.embedding_ is not self._assessment.embedding_ and not (
+            adapted.embedding_.is_same(self._assessment.embedding_)
+        ):
+            raise ValueError(
+                "belief evaluator: the assessment to adopt has other maps; build the diagram anew"
+            )
+        self.set_beliefs(context, adapted.beliefs_)
+        context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        correction, novelty = context.get_abstract_parameter(self._learned).get_value()
+        prediction = self._assessment.predict_one(
+            self._state_port.Eval(context),
+            self._preview_port.Eval(context),
+            self._features_port.Eval(context) if self.reads_features else None,
+            beliefs=self.get_beliefs(context),
+            correction=correction,
+            novelty=novelty,
+        )
+        if self._alarm_port is not None and self._alarm_port.Eval(context)[0] > 0.5:
+            prediction = prediction.unknown()
+        elif self._margins_port is not None:
+            margins = self._margins_port.Eval(context)
+            if margins.min(initial=0.0) < 0.0:
+                prediction = prediction.outside(int(np.argmin(margins)))
+        # In the order of the ports.
+        discrete_state.set_value(
+            np.concatenate(
+                [
+                    (prediction.probability,),
+                    prediction.belief,
+                    prediction.cause_probability,
+                    prediction.embedding,
+                    prediction.predicted_margins,
+                    (min(prediction.novelty, _LARGEST_NOVELTY),),
+                ]
+            )
+        )
+
+
+def _learned(assessment: SafetyAssessment) -> tuple[Correction, Novelty]:
+    return assessment.correction_, assessment.novelty_

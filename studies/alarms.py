@@ -1,0 +1,298 @@
+"""Alarms on pushed motions: detection rate, lead time and false alarms.
+
+An alarm is a monitored value, larger where the robot is safer, that falls below a threshold. In a
+motion that stays in the safe set every alarm is false, and so is any before the push. A detection
+is an alarm between the push and the instant at which the robot leaves the safe set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.shift_study import SEEN
+from drake_safety.evaluation.tables import Column
+from drake_safety.evaluation.verdict_tables import Kind
+from drake_safety.simulation.goal_motion import GoalMotion, Mishap
+from drake_safety.simulation.throws import ThrowLog
+
+FALSE_ALARM_SHARE = 0.05
+"""Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
+NUM_ROWS = 2
+"""Successive rows that give an alarm: a blow itself can make one row "don't know"."""
+ALARMS: Kind = (
+    "Alarms on pushed motions",
+    "Thresholds are chosen for the same share of false alarms on calibration motions.",
+    (
+        Column("detected", "detection rate", "%", 1, 1),
+        Column("lead_to_leaving_s", "lead time to leaving", "s", 1, 2),
+        Column("falls_detected", "detection rate of falls", "%", 1, 1),
+        Column("lead_to_fall_s", "lead time to the fall", "s", 1, 2),
+        Column("false_alarms_per_hour", "false-alarm rate", "/h", -1, 0),
+        Column("undisturbed_false_alarms_per_hour", "false-alarm rate, undisturbed", "/h", -1, 0),
+        Column("auc", "AUC", "", 1),
+    ),
+)
+"""The table of the set "monitoring"."""
+_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+_TRACKING = "tracking_error_"
+_SLACK_S = 1e-9
+
+
+@dataclass(kw_only=True, eq=False)
+class WatchedMotion(Mishap):
+    """One motion, pushed or not: the monitor's inputs and the outcome.
+
+    Attributes:
+        index: Number of the motion in its set; an undisturbed and a pushed one share it.
+        push_time_s: Start of the push [s]; infinite without one.
+        time_s: [s], (N,).
+        state: (N, n_s), the assessor's input.
+        desired_preview: (N, H n_z).
+        features: (N, n_f).
+        margins: (N, n_c), of the true state.
+    """
+
+    index: int
+    push_time_s: float
+    time_s: np.ndarray
+    state: np.ndarray
+    desired_preview: np.ndarray
+    features: np.ndarray
+    margins: np.ndarray
+
+    @classmethod
+    def of_throw(cls, log: ThrowLog) -> WatchedMotion:
+        """Makes a motion of a throw without recovery; the push is the ball's impact."""
+        names = ("index", "time_s", *SEEN, "margins", "leave_time_s", "fall_time_s")
+        values = {name: getattr(log, name) for name in names}
+        return cls(push_time_s=log.throw.time_s, **values)
+
+    @classmethod
+    def of_goal_motion(cls, index: int, motion: GoalMotion) -> WatchedMotion:
+        """Makes a motion of a motion to a goal that was logged with the ports ``SEEN``."""
+        return cls(
+            index=index,
+            push_time_s=math.inf if motion.push is None else motion.push.time_s,
+            time_s=motion.time_s,
+            margins=motion.margins,
+            leave_time_s=motion.leave_time_s,
+            fall_time_s=motion.fall_time_s,
+            **{name: motion.extra[name] for name in SEEN},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """A monitored value.
+
+    Attributes:
+        name: Its key in tables.
+        value: Maps a motion to the value of each row, (N,); NaN means "don't know", an alarm.
+    """
+
+    name: str
+    value: Callable[[WatchedMotion], np.ndarray]
+
+
+def scorer_alarm(scorer: Scorer) -> Alarm:
+    """An alarm on the safety probability of a scorer."""
+    return Alarm(
+        name=scorer.name,
+        value=lambda one: scorer.probability(one.state, one.desired_preview, one.features),
+    )
+
+
+def threshold_alarms(
+    state_names: Sequence[str], feature_names: Sequence[str], watched: Mapping[str, str]
+) -> list[Alarm]:
+    """Baseline alarms on recorded quantities.
+
+    They are the features that the task names, such as the margins of base and capture point to the
+    edge of the support polygon; the tracking error; the base's tilt; and the smallest margin of the
+    safe set. The last uses the true state, which cannot be measured, and so has an advantage.
+
+    Args:
+        state_names: Columns of the state.
+        feature_names: Columns of the features.
+        watched: Monitored features, by the name of the alarm.
+    """
+    features, states = list(feature_names), list(state_names)
+
+    def of_feature(column: int) -> Callable[[WatchedMotion], np.ndarray]:
+        return lambda motion: motion.features[:, column]
+
+    alarms = [
+        Alarm(name=name, value=of_feature(features.index(feature)))
+        for name, feature in watched.items()
+    ]
+    tracking = [i for i, name in enumerate(features) if name.startswith(_TRACKING)]
+    if tracking:
+        alarms.append(
+            Alarm(
+                name="tracking_error",
+                value=lambda motion: -np.linalg.norm(motion.features[:, tracking], axis=1),
+            )
+        )
+    if set(_ROTATION) <= set(states):
+        rotation = [states.index(name) for name in _ROTATION]
+        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion.state[:, rotation])))
+    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion.margins.min(axis=1)))
+    return alarms
+
+
+def tilt(rotation: np.ndarray) -> np.ndarray:
+    """Angle between a body's z axis and the vertical [rad], (N,), of rotation vectors (N, 3)."""
+    angle = np.linalg.norm(rotation, axis=1)
+    share = np.divide(
+        rotation[:, 2], angle, out=np.ones_like(angle), where=(angle > 0) | np.isnan(angle)
+    )
+    # R_zz of Rodrigues' formula.
+    cosine = np.cos(angle)
+    return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))
+
+
+def accepted(
+    motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
+) -> list[WatchedMotion]:
+    """The motions whose first row has at least this probability, so that the robot begins them."""
+    if not motions:
+        return []
+    first_rows = (np.stack([getattr(motion, name)[0] for motion in motions]) for name in SEEN)
+    is_accepted = scorer.probability(*first_rows) >= threshold
+    return [motion for motion, begins in zip(motions, is_accepted, strict=True) if begins]
+
+
+def first_alarm(
+    motion: WatchedMotion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
+) -> float:
+    """Time of the first value below a threshold [s]; infinite if there is none.
+
+    Args:
+        motion: The motion.
+        value: Value of each row, (N,); NaN is below every threshold.
+        threshold: The threshold.
+        since_s: Earliest time that counts [s].
+    """
+    is_alarm = ~(value >= threshold) & (motion.time_s >= since_s - _SLACK_S)
+    return float(motion.time_s[int(np.argmax(is_alarm))]) if is_alarm.any() else math.inf
+
+
+def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
+    """The lowest value (N,) of a motion; if it leaves the safe set, from the push until then."""
+    value = np.where(np.isnan(value), -math.inf, value)
+    if motion.has_left:
+        time = motion.time_s
+        value = value[
+            (time >= motion.push_time_s - _SLACK_S) & (time < motion.leave_time_s - _SLACK_S)
+        ]
+    return float(value.min(initial=math.inf))
+
+
+def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
+    """The largest of each value and those before it, `num_rows` in all, (N,)."""
+    value = np.where(np.isnan(value), -math.inf, value)
+    padded = np.concatenate([np.full(num_rows - 1, math.inf), value])
+    return np.lib.stride_tricks.sliding_window_view(padded, num_rows).max(axis=1)
+
+
+def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
+    """The highest threshold with which at most a share of motions has an alarm.
+
+    Args:
+        lowest: Lowest value of each motion that stays safe, (N,).
+        share: The share, in [0, 1).
+
+    Raises:
+        ValueError: There is no motion.
+    """
+    if len(lowest) == 0:
+        raise ValueError("alarms: no calibration motion stays in the safe set")
+    return float(np.sort(lowest)[math.floor(share * len(lowest))])
+
+
+def evaluate_alarms(
+    alarms: Sequence[Alarm],
+    calibration: Sequence[WatchedMotion],
+    test: Sequence[WatchedMotion],
+    *,
+    false_alarm_share: float = FALSE_ALARM_SHARE,
+    num_rows: int = NUM_ROWS,
+) -> dict[str, Estimate]:
+    """Compares alarms at the same share of false alarms on calibration motions.
+
+    Motions that leave the safe set before the push are left out.
+
+    Args:
+        alarms: The alarms.
+        calibration: Motions on which thresholds are chosen.
+        test: Fresh motions.
+        false_alarm_share: Allowed share of safe calibration motions with a false alarm.
+        num_rows: Successive rows below the threshold that give an alarm.
+    """
+    calm = [motion for motion in calibration if not motion.has_left]
+    judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
+    is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
+    index = np.array([motion.index for motion in judged])
+    estimates = _motion_estimates(judged, len(test))
+    for alarm in alarms:
+        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
+        threshold = equal_share_threshold(lowest, false_alarm_share)
+        values = [persisting(alarm.value(motion), num_rows) for motion in judged]
+        score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
+        found = _alarm_estimates(judged, values, threshold)
+        found["auc"] = auc(score, is_unsafe, index)
+        found["threshold"] = Estimate.exact(threshold, len(calm))
+        estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
+    return estimates
+
+
+def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Estimate]:
+    left = [motion for motion in judged if motion.has_left]
+    hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
+    return {
+        "monitoring.motions.left_out": proportion(num_test - len(judged), num_test),
+        "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
+        "monitoring.motions.fall": proportion(sum(m.has_fallen for m in left), len(judged)),
+        "monitoring.motions.safe_hours": Estimate.exact(hours, len(judged) - len(left)),
+        "monitoring.motions.push_to_leaving_s": median(
+            np.array([motion.leave_time_s - motion.push_time_s for motion in left])
+        ),
+    }
+
+
+def _alarm_estimates(
+    judged: Sequence[WatchedMotion], values: Sequence[np.ndarray], threshold: float
+) -> dict[str, Estimate]:
+    watched = list(zip(judged, values, strict=True))
+    safe = [(motion, value) for motion, value in watched if not motion.has_left]
+    left = [(motion, value) for motion, value in watched if motion.has_left]
+    false = sum(math.isfinite(first_alarm(motion, value, threshold)) for motion, value in safe)
+    early = sum(
+        first_alarm(motion, value, threshold) < motion.push_time_s - _SLACK_S
+        for motion, value in watched
+    )
+    safe_s = sum(float(motion.time_s[-1]) for motion, _ in safe)
+    undisturbed_s = sum(min(motion.push_time_s, float(motion.time_s[-1])) for motion in judged)
+    alarm_s = np.array([first_alarm(m, v, threshold, since_s=m.push_time_s) for m, v in left])
+    leave = np.array([motion.leave_time_s for motion, _ in left])
+    pushed = np.array([motion.push_time_s for motion, _ in left])
+    fall = np.array([motion.fall_time_s for motion, _ in left])
+    has_fallen = np.isfinite(fall)
+    return {
+        "detected": proportion(int(np.sum(alarm_s < leave - _SLACK_S)), len(left)),
+        "lead_to_leaving_s": median(leave - alarm_s),
+        "falls_detected": proportion(
+            int(np.sum(alarm_s[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
+        ),
+        "lead_to_fall_s": median(fall[has_fallen] - alarm_s[has_fallen]),
+        "after_push_s": median(alarm_s - pushed),
+        "false_alarm_share": proportion(false, len(safe)),
+        "false_alarms_per_hour": rate_per_hour(false, safe_s, len(safe)),
+        "undisturbed_false_alarms_per_hour": rate_per_hour(early, undisturbed_s, len(judged)),
+    }

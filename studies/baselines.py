@@ -1,0 +1,217 @@
+"""Baseline classifiers: direct classification of the inputs of the assessment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.seeds import UsedEpisodes
+from drake_safety.learning.segments import Episodes, Segments, split
+
+KINDS = ("gradient_boosting", "mlp")
+_VALIDATION_SHARE = 0.1
+_MLP_EPOCHS = 60
+_MLP_PATIENCE = 20
+
+
+class DirectClassifier:
+    """Predicts from x whether an episode ends unsafely, without embedding or beliefs.
+
+    It learns from the segments that the assessment learns from (every start row, labelled by the
+    end of its episode), with early stopping on a held-out tenth of the *episodes*. It runs on one
+    thread, so that the same seed gives the same bits.
+
+    Args:
+        kind: "gradient_boosting" (scikit-learn's HistGradientBoostingClassifier) or "mlp" (its
+            MLPClassifier on standardised inputs).
+        uses_features: Whether x includes the features, as in the sharpened mode of the assessment.
+        seed: Seed of the held-out episodes and of the training.
+        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        *,
+        uses_features: bool = True,
+        seed: int = 0,
+        shortest: int | None = None,
+    ):
+        self.kind = kind
+        self.uses_features = uses_features
+        self.seed = seed
+        self.shortest = shortest
+
+    def fit(self, episodes: Episodes) -> DirectClassifier:
+        """Fits the classifier to episodes, at least two of either kind, and returns it."""
+        from threadpoolctl import threadpool_limits
+
+        segments = split(episodes, stride=1, discount=1.0, shortest=self.shortest)
+        x = self._inputs(segments.state, segments.desired_preview, segments.features)
+        is_held_out = self._held_out(segments)
+        with threadpool_limits(1):
+            train = self._boost if self.kind == "gradient_boosting" else self._train_mlp
+            train(
+                x[~is_held_out],
+                segments.is_unsafe[~is_held_out],
+                x[is_held_out],
+                segments.is_unsafe[is_held_out],
+            )
+        return self
+
+    def predict_unsafe(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Probability of an unsafe end.
+
+        Args:
+            state: States as the assessor sees them, (N, n_s).
+            desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
+            features: Features, (N, n_f).
+
+        Returns:
+            The probabilities, (N,); NaN for an input that is not finite.
+        """
+        from threadpoolctl import threadpool_limits
+
+        x = self._inputs(state, desired_preview, features)
+        probability = np.full(len(x), np.nan)
+        is_finite = np.isfinite(x).all(axis=1)
+        if is_finite.any():
+            known = x[is_finite]
+            if self.kind == "mlp":
+                known = self._standardised(known)
+            with threadpool_limits(1):
+                probability[is_finite] = self.model_.predict_proba(known)[:, 1]
+        return probability
+
+    def _inputs(
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
+    ) -> np.ndarray:
+        parts = [state, desired_preview]
+        if self.uses_features and features is not None:
+            parts.append(features)
+        return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
+
+    def _held_out(self, segments: Segments) -> np.ndarray:
+        """Mask of the segments of held-out episodes, (N,)."""
+        rng = np.random.default_rng(self.seed)
+        chosen = []
+        for is_class in (~segments.is_unsafe, segments.is_unsafe):
+            members = np.unique(segments.episode[is_class])
+            count = max(1, round(_VALIDATION_SHARE * len(members)))
+            chosen.append(rng.choice(members, size=count, replace=False))
+        return np.isin(segments.episode, np.concatenate(chosen))
+
+    def _boost(
+        self, x: np.ndarray, label: np.ndarray, x_held_out: np.ndarray, label_held_out: np.ndarray
+    ) -> None:
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        model = HistGradientBoostingClassifier(
+            learning_rate=0.1,
+            max_iter=400,
+            min_samples_leaf=40,
+            l2_regularization=1.0,
+            max_features=0.5,
+            early_stopping=True,
+            n_iter_no_change=20,
+            random_state=self.seed,
+        )
+        self.model_: Any = model.fit(x, label, X_val=x_held_out, y_val=label_held_out)
+
+    def _train_mlp(
+        self, x: np.ndarray, label: np.ndarray, x_held_out: np.ndarray, label_held_out: np.ndarray
+    ) -> None:
+        from sklearn.neural_network import MLPClassifier
+
+        spread = x.std(axis=0, dtype=float)
+        self.mean_ = x.mean(axis=0, dtype=float)
+        # A column that is constant in training must not be scaled up elsewhere.
+        self.scale_ = np.where(spread > 1e-9, spread, 1.0)
+        x, x_held_out = self._standardised(x), self._standardised(x_held_out)
+        model = MLPClassifier(
+            hidden_layer_sizes=(128, 128),
+            alpha=0.3,
+            batch_size=min(256, len(x)),
+            learning_rate_init=1e-3,
+            random_state=self.seed,
+        )
+        best, smallest_error, waited = None, np.inf, 0
+        for _ in range(_MLP_EPOCHS):
+            model.partial_fit(x, label, classes=[False, True])
+            # The log loss would stop an overconfident net whose ranking still improves.
+            error = np.mean((model.predict_proba(x_held_out)[:, 1] - label_held_out) ** 2)
+            waited += 1
+            if error < smallest_error:
+                smallest_error, waited = error, 0
+                best = [w.copy() for w in (*model.coefs_, *model.intercepts_)]
+            if waited == _MLP_PATIENCE:
+                break
+        if best is not None:
+            num_layers = len(model.coefs_)
+            model.coefs_, model.intercepts_ = best[:num_layers], best[num_layers:]
+        self.model_ = model
+
+    def _standardised(self, x: np.ndarray) -> np.ndarray:
+        # Double precision: the penalty drives unused weights into slow subnormal float32.
+        return (x - self.mean_) / self.scale_
+
+
+def classifier_scorers(
+    episodes: Episodes, progress: StageProgress, *, shortest: int | None = None
+) -> list[Scorer]:
+    """The baseline classifiers, trained on the training episodes of the assessment.
+
+    Args:
+        episodes: Training episodes.
+        progress: Called with a stage, the number done and the number wanted.
+        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
+    """
+    scorers = []
+    for i, kind in enumerate(KINDS):
+        progress("baseline classifiers", i, len(KINDS))
+        classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
+
+        def probability(
+            *inputs: np.ndarray, predict_unsafe: Any = classifier.predict_unsafe
+        ) -> np.ndarray:
+            return 1.0 - predict_unsafe(*inputs)
+
+        used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
+        scorers.append(Scorer(name=kind, probability=probability, used=used))
+    progress("baseline classifiers", len(KINDS), len(KINDS))
+    return scorers
+
+
+def auc_difference(
+    unsafe_score: np.ndarray,
+    other_score: np.ndarray,
+    is_unsafe: np.ndarray,
+    episode: np.ndarray,
+    *,
+    bootstrap: Bootstrap | None = None,
+) -> Estimate:
+    """The AUC of one scorer minus that of another on the same samples, from paired resamples.
+
+    Args:
+        unsafe_score: Unsafe scores of the first, (N,).
+        other_score: Unsafe scores of the second, (N,).
+        is_unsafe: Labels, (N,).
+        episode: Index of each sample's episode, (N,).
+        bootstrap: Settings of the interval.
+    """
+
+    def difference(weight: np.ndarray) -> float:
+        return area_under_curve(unsafe_score, is_unsafe, weight) - area_under_curve(
+            other_score, is_unsafe, weight
+        )
+
+    return (bootstrap or Bootstrap()).over_episodes(difference, episode)

@@ -1,0 +1,217 @@
+"""Tables in README, docs and cards, from stored results and the templates beside this file.
+
+The text between ``<!-- KIND: NAME -->`` and ``<!-- end -->`` is made by ``templates/KIND.md`` from
+``docs/results/NAME.json`` alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jinja2 import Environment, FileSystemLoader
+
+from drake_safety.evaluation.figure_style import label_of
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.shift_study import CONFIDENT
+from drake_safety.evaluation.tables import Column, Row, Table
+from drake_safety.evaluation.verdict_tables import INPUTS, verdict_table
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import SCHEMA_VERSION
+from drake_safety.robots.robot import PlantVariation
+from drake_safety.simulation.scenario import Scenario
+from studies.plans import SAFE_RECALL, UNSAFE_RECALL
+
+RESULTS_FOLDER = Path("docs/results")
+EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
+"""Of a shipped folder."""
+_TEMPLATES = Path(__file__).with_name("templates")
+_KINDS = "results|summary|readings|converged|shifts|walking"
+_OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
+_BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
+_FORMATS = {
+    "share": {},
+    "plain": {"digits": 2},
+    "value": {"unit": "=", "digits": 2},
+    "seconds": {"unit": "=", "digits": 1},
+    "percent": {"unit": "%", "digits": 1},
+    "points": {"unit": "points", "digits": 1},
+}
+"""How columns write an estimate, by name."""
+
+
+def render(kind: str, results: Results, **more: Any) -> str:
+    """The text of a template.
+
+    Args:
+        kind: Name of the template.
+        results: The results.
+        **more: What else the template uses.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES), trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
+    environment.filters["gain"] = _gain
+    environment.filters["today"] = partial(today, results)
+    environment.globals |= {
+        "r": results,
+        "entries": results.entries,
+        "has": results.has,
+        "label_of": label_of,
+        "table": lambda corner, rows, columns: _table(results, corner, rows, columns),
+        "verdicts": lambda set, corner: verdict_table(results, set, corner=corner),
+        "INPUTS": INPUTS,
+        "SAFE_RECALL": SAFE_RECALL,
+        "UNSAFE_RECALL": UNSAFE_RECALL,
+    }
+    text = environment.get_template(f"{kind}.md").render(**more)
+    return re.sub(r"\n{3,}", "\n\n", text).strip()
+
+
+def today(results: Results, command: str) -> str:
+    """A stored command by its present name: the studies evaluate beside baselines."""
+    is_beside = any(row.method == "gradient_boosting" for row in results.values())
+    old = "drake-safety evaluate "
+    return command.replace(old, "python -m studies evaluate ") if is_beside else command
+
+
+def _column(key: str, title: str, format: str = "share") -> Column:
+    return Column(key, title, **_FORMATS[format])  # type: ignore[arg-type]
+
+
+def _table(
+    results: Results,
+    corner: str,
+    rows: Mapping[str, str | Sequence[str]],
+    columns: Sequence[tuple[str, ...]],
+) -> str:
+    """Markdown of a table; rows and columns without any result are left out.
+
+    Args:
+        results: The results.
+        corner: Heading of the row labels.
+        rows: By label, set and method of the row, or those of each of its columns.
+        columns: Metric, title and format of each.
+    """
+    made = [_column(*column) for column in columns]
+    cells = []
+    for label, prefixes in rows.items():
+        of_columns = [prefixes] * len(made) if isinstance(prefixes, str) else prefixes
+        keys = [f"{p}.{column.key}" for p, column in zip(of_columns, made, strict=True)]
+        if any(key in results for key in keys):
+            cells.append(Row(label, label, [results.get(key) for key in keys]))
+    shown = [i for i in range(len(made)) if any(row.estimates[i] for row in cells)]
+    return Table(
+        corner=corner,
+        columns=[made[i] for i in shown],
+        rows=[Row(row.key, row.label, [row.estimates[i] for i in shown]) for row in cells],
+    ).to_markdown()
+
+
+def _gain(loss: Estimate) -> str:
+    """Minus a loss, in points of percent."""
+    value, low, high = (f"{0.0 - 100.0 * x:+.1f}" for x in (loss.value, loss.high, loss.low))
+    return f"{value} ({low} to {high})"
+
+
+def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
+    """Replaces every block of results in a text by the stored ones.
+
+    Args:
+        text: The Markdown.
+        folder: Folder of the stored results.
+
+    Raises:
+        ValueError: There is no block, a block does not end, or results are missing.
+    """
+    blocks = [match["name"] for match in _BLOCK.finditer(text)]
+    opened = [match["name"] for match in re.finditer(_OPEN, text)]
+    if not blocks:
+        raise ValueError(
+            "no block of results: put <!-- results: NAME --> and <!-- end --> where those of "
+            f"{RESULTS_FOLDER}/NAME.json belong"
+        )
+    if blocks != opened:
+        raise ValueError(f"results begin for {opened}, but <!-- end --> comes only after {blocks}")
+
+    def block(match: re.Match[str]) -> str:
+        file = folder / f"{match['name']}.json"
+        if not file.is_file():
+            there = sorted(path.stem for path in folder.glob("*.json"))
+            raise ValueError(
+                f"there are no results '{match['name']}' in {folder}; there are {there}: "
+                "`python -m studies store RUN` writes them"
+            )
+        return f"{match['start']}{render(match['kind'], Results.read(file))}\n{match['end']}"
+
+    return _BLOCK.sub(block, text)
+
+
+def card_text(folder: Path, scenario: Scenario) -> str:
+    """The card of a shipped folder, as Markdown.
+
+    Args:
+        folder: Folder with the assessments and their evaluation.
+        scenario: The scenario.
+    """
+    results = Results.read(folder / EVALUATION_FILE)
+    assessments = {
+        mode: SafetyAssessment.load(folder / f"{mode}.safetensors")
+        for mode in results.entries["assessment_sha256"]
+    }
+    info, default = assessments["sharpened"].info_, asdict(PlantVariation())
+    plant = asdict(scenario.variation(info.variation)).items()
+    changed = {key: value for key, value in plant if value != default[key]}
+    text = render(
+        "card",
+        results,
+        scenario=scenario,
+        assessments=assessments,
+        calibrations={
+            (mode, kind): calibration
+            for mode, assessment in assessments.items()
+            for kind, calibration in assessment.calibrations_.items()
+        },
+        info=info,
+        differences=yaml.safe_dump(changed, default_flow_style=True, width=1000).strip(),
+        commands=_commands(results, assessments),
+        SCHEMA_VERSION=SCHEMA_VERSION,
+        CONFIDENT=CONFIDENT,
+    )
+    return f"{text}\n"
+
+
+def _commands(results: Results, assessments: Mapping[str, SafetyAssessment]) -> list[str]:
+    """The commands that make a shipped folder, as far as its files tell."""
+    entries = results.entries
+    name, evaluate = entries["scenario"], entries["command"]
+    (folder,) = re.findall(r"--assessment[ =](\S+)", evaluate)
+    training = {
+        mode: f"--episodes {one.num_episodes} --seed {one.seed} --out {folder}"
+        for mode, assessment in assessments.items()
+        for one in assessment.used_
+        if one.purpose == "training"
+    }
+    is_one = len(set(training.values())) == 1
+    commands = [
+        f"drake-safety train {name} {'' if is_one else f'--mode {mode} '}{options}"
+        for mode, options in training.items()
+    ]
+    for assessment in assessments.values():
+        for one in assessment.calibrations_.values():
+            confidence = "" if one.confidence is None else f"--confidence {one.confidence:g} "
+            commands.append(
+                f"drake-safety calibrate {name} --assessment {folder} --miss-rate "
+                f"{one.miss_rate:g} --false-alarm-rate {one.false_alarm_rate:g} {confidence}"
+                f"--episodes {one.num_unsafe + one.num_safe} --seed {one.seed}"
+            )
+    commands += [evaluate, *([entries["shifts"]["command"]] if "shifts" in entries else [])]
+    commands = [today(results, command) for command in dict.fromkeys(commands)]
+    return [*commands, f"python -m studies ship --assessment {folder}"]

@@ -1,0 +1,286 @@
+"""``python -m studies evaluate``: `drake-safety evaluate` beside baselines, with what docs show.
+
+Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, baseline classifiers,
+inverse kinematics, the other hand, the reachable region, and alarms on pushed motions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from drake_safety.cli.console import (
+    ClusterOption,
+    ScenarioArgument,
+    TrainingOption,
+    WorkersOption,
+    command_line,
+)
+from drake_safety.cli.evaluate import (
+    SHIFTS_FILE,
+    Evaluation,
+    add_reliability,
+    add_throws,
+    add_verdicts,
+    begun,
+    write,
+)
+from drake_safety.cli.training_folder import (
+    check_writable,
+    episodes_folder,
+)
+from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.shift_study import shifts_tables
+from drake_safety.evaluation.tables import Table
+from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
+from drake_safety.learning.seeds import EVALUATION, SHIFTS
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    HasBall,
+    HasGoals,
+    goal_words,
+    require,
+)
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.scenario import load_scenario
+from drake_safety.simulation.throws import run_throws
+from studies.alarms import (
+    ALARMS,
+    WatchedMotion,
+    accepted,
+    evaluate_alarms,
+    scorer_alarm,
+    threshold_alarms,
+)
+from studies.baselines import KINDS, auc_difference, classifier_scorers
+from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
+from studies.pushed_motions import run_pushed_motions
+from studies.reachability import BASELINES, Reachability
+from studies.reachable_region import reachable_region, region_figure
+from studies.shifts import add_all_shifts
+from studies.throws import classifier_rules
+
+_PLANT = "actual"
+
+
+def evaluate(
+    scenario: ScenarioArgument,
+    assessment: TrainingOption,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other nominal episodes, for thresholds.", min=20)
+    ] = 300,
+    calibration_throws: Annotated[
+        int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
+    ] = 200,
+    other_hand: Annotated[
+        int, typer.Option(help="Targets: number mirrored to the other hand.", min=0)
+    ] = 0,
+    plane_x: Annotated[
+        float | None, typer.Option(help="Targets: x of the reachable region's plane [m].")
+    ] = None,
+    plane_step: Annotated[
+        float, typer.Option(help="Targets: spacing on it [m]; 0 to leave it out.", min=0)
+    ] = 0.0,
+    pushes: Annotated[
+        int, typer.Option(help="Targets: pushed motions, and as many for thresholds.", min=0)
+    ] = 0,
+    shifts: Annotated[
+        int, typer.Option(help="Motions of each shift, instead of all else.", min=0)
+    ] = 0,
+    seed: Annotated[int | None, typer.Option(help="First of the seeds.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; ASSESSMENT's by default.")] = None,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+) -> None:
+    """Evaluate Γ beside baselines, trained on the same episodes, for README and docs."""
+    loaded, folder = load_scenario(scenario), out or assessment
+    check_writable(assessment, folder)
+    if shifts:
+        with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
+            entries = add_all_shifts(evaluation, shifts, episodes)
+        write(evaluation, SHIFTS_FILE, command_line("python -m studies"), shifts_tables, entries)
+        return
+    loop = loaded.make_loop()
+    if throws:
+        require(loop, HasBall)
+    if pushes:
+        require(loop, CanBePushed)
+    training = load_episodes(episodes_folder(assessment))
+    with begun(loaded, assessment, EVALUATION, seed, folder, workers) as evaluation:
+        test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
+        other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
+        shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
+        classifiers = classifier_scorers(training, evaluation.stages, shortest=shortest)
+        if isinstance(loop, HasGoals):
+            sets = plans_of(loop, other), plans_of(loop, test)
+            limit = _add_plans(
+                evaluation, loop, classifiers, *sets, other_hand, plane_x, plane_step
+            )
+            if pushes:
+                _add_pushes(evaluation, loop, classifiers, pushes, 1.0 - limit)
+        else:
+            _add_differences(evaluation, classifiers, other, test)
+        add_reliability(evaluation, test)
+        if throws:
+            _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
+    made_by = command_line("python -m studies")
+    entries = {"calibration_episodes": calibration_episodes}
+    write(evaluation, "evaluation.json", made_by, _tables, entries)
+
+
+def _tables(results: Results) -> list[Table]:
+    alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
+    return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
+
+
+def _add_differences(
+    evaluation: Evaluation, classifiers: Sequence[Scorer], other: Episodes, test: Episodes
+) -> None:
+    """Verdicts, and the AUC of Γ minus that of the better classifier."""
+    scores, segments = add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
+    found = evaluation.estimates
+    everywhere = np.ones(len(segments), dtype=bool)
+    for kind, rows in (("segments", everywhere), ("episodes", segments.is_first)):
+        best = max(KINDS, key=lambda name: found[f"{kind}.{name}.auc"].value)
+        found[f"{kind}.sharpened_minus_best_classifier.auc"] = auc_difference(
+            scores["sharpened"][rows],
+            scores[best][rows],
+            segments.is_unsafe[rows],
+            segments.episode[rows],
+        )
+
+
+def _add_plans(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    calibration: Plans,
+    test: Plans,
+    num_other: int,
+    plane_x: float | None,
+    plane_step: float,
+) -> float:
+    """Verdicts on all, fair and mirrored targets; returns the threshold of the unsafe score."""
+    scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
+    sets = {"plans": test}
+    if num_other:
+        mirror = loop.mirror_options
+        # The same random draws, mirrored.
+        episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
+        mirrored = scenario.make_loop(**type(loop).judging_options, **mirror)
+        sets["plans.other_hand"] = plans_of(mirrored, episodes)
+    rules: dict[str, Rule] = {
+        one.name: scorer_rule(one) for one in (*evaluation.scorers, *classifiers)
+    }
+    thresholds = evaluation.plan_thresholds
+    hands = [plans.hand for plans in sets.values() if plans.hand is not None]
+    if hands:
+        robot = loop.robot
+        for name, is_free in BASELINES.items():
+            reach = {hand: Reachability(robot, hand, is_base_free=is_free) for hand in hands}
+            rules[name] = reachability_rule(reach)
+            thresholds[name] = 0.5
+    found, limits = evaluate_plans(
+        rules,
+        thresholds,
+        gamma,
+        calibration,
+        sets,
+        [key for key in sets if key != "plans"],
+    )
+    evaluation.add(found)
+    if plane_step and goal_words(require(loop, HasGoals)).is_point:
+        region = reachable_region(
+            scenario,
+            gamma,
+            evaluation.stages,
+            threshold=1.0 - limits["sharpened"],
+            x_m=plane_x,
+            step_m=plane_step,
+            num_workers=evaluation.workers,
+        )
+        figure = region_figure(region, list(loop.constraint_names))
+        estimates = {f"plans.plane.{key}": one for key, one in region.estimates().items()}
+        evaluation.add(estimates, reachable_region=figure)
+    return limits["sharpened"]
+
+
+def _add_throws(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    num_throws: int,
+    num_calibration: int,
+) -> None:
+    calibration = run_throws(
+        evaluation.scenario,
+        list(range(num_calibration)),
+        seed=evaluation.seeds["disturbance thresholds"],
+        variation=_PLANT,
+        num_workers=evaluation.workers,
+        progress=partial(evaluation.stages, "calibration throws"),
+    )
+    persistence_s = evaluation.scenario.parameters.recovery.persistence_s
+    rules = classifier_rules(classifiers, calibration, persistence_s)
+    logs = add_throws(evaluation, num_throws, rules)
+    sets = ([WatchedMotion.of_throw(log) for log in one] for one in (calibration, logs))
+    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, *sets))
+
+
+def _add_pushes(
+    evaluation: Evaluation,
+    loop: ClosedLoop,
+    classifiers: Sequence[Scorer],
+    num_motions: int,
+    threshold: float,
+) -> None:
+    """Alarms on pushed motions to accepted goals that are safe without a push."""
+    calibration, test = (
+        run_pushed_motions(
+            evaluation.scenario,
+            num_motions,
+            seed=evaluation.seeds[purpose],
+            variation=_PLANT,
+            num_workers=evaluation.workers,
+            progress=partial(evaluation.stages, what),
+        )
+        for what, purpose in (
+            ("calibration pushes", "disturbance thresholds"),
+            ("pushes", "disturbances"),
+        )
+    )
+    verdict = evaluation.scorers[0]
+    kept, others = (accepted(one, verdict, threshold) for one in (test, calibration))
+    refused = proportion(len(test) - len(kept), len(test))
+    evaluation.add({"monitoring.motions.refused": refused})
+    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, others, kept))
+
+
+def _alarm_estimates(
+    evaluation: Evaluation,
+    loop: Any,
+    classifiers: Sequence[Scorer],
+    calibration: Sequence[WatchedMotion],
+    test: Sequence[WatchedMotion],
+) -> dict[str, Estimate]:
+    if all(motion.has_left for motion in calibration):
+        return {}  # Thresholds need motions that stay safe.
+    watched = loop.watched_features if isinstance(loop, CanFall) else {}
+    alarms = [
+        *(scorer_alarm(scorer) for scorer in evaluation.scorers),
+        *(scorer_alarm(scorer) for scorer in classifiers),
+        *threshold_alarms(loop.state_names, loop.feature_names, watched),
+    ]
+    return evaluate_alarms(alarms, calibration, test)

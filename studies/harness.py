@@ -1,0 +1,216 @@
+"""What all studies share: their options, fresh episodes, kept work, and how rows become files.
+
+A study gives rows of the table of results: set, method, metric and an estimate. Work that takes
+long is kept in the folder of the training as it finishes: a stopped study continues.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from drake_safety.cli.console import (
+    command_line,
+    console,
+    open_stages,
+    print_path,
+    versions,
+)
+from drake_safety.cli.training_folder import check_fresh, load_assessment, run_fresh_episodes
+from drake_safety.evaluation.figure_style import label_of, save, spoken
+from drake_safety.evaluation.interval_figure import interval_figure
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Result, Results
+from drake_safety.evaluation.tables import Column, Table, rows_of
+from drake_safety.files.atomic import replacing
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.seeds import EVALUATION
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.worker_processes import Progress, parallel_map
+
+EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)]
+CalibrationOption = Annotated[int, typer.Option(help="Other ones, for thresholds.", min=20)]
+SeedOption = Annotated[
+    int, typer.Option(help="First seed of the fresh ones: that of `evaluate` by default.")
+]
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(kw_only=True)
+class Study:
+    """A running study.
+
+    Attributes:
+        name: Its name, and that of its files.
+        scenario: The scenario.
+        folder: Folder of the training.
+        seed: First seed of the fresh episodes.
+        workers: Number of worker processes; None for one a core.
+        stages: Shows progress.
+        entries: What the file says besides rows.
+        rows: The rows, by set, method and metric: "segments.paper.auc".
+    """
+
+    name: str
+    scenario: Scenario
+    folder: Path
+    seed: int
+    workers: int | None
+    stages: StageProgress
+    entries: dict[str, Any] = field(default_factory=dict)
+    rows: dict[str, Estimate] = field(default_factory=dict)
+
+    def add(self, prefix: str, estimates: Mapping[str, Estimate]) -> None:
+        """Adds rows by the part of their keys after the prefix, which is set and method."""
+        self.rows |= {f"{prefix}.{metric}": one for metric, one in estimates.items()}
+
+    @property
+    def seeds(self) -> dict[str, int]:
+        """Seeds of fresh episodes by purpose."""
+        return EVALUATION.seeds(self.seed)
+
+    def load(self, mode: str, seeds: Iterable[int] | None = None) -> SafetyAssessment:
+        """The assessment of a mode, which has not used these seeds; those of `evaluate` if None."""
+        assessment = load_assessment(self.folder, mode)
+        check_fresh(assessment, self.scenario, self.seeds.values() if seeds is None else seeds)
+        return assessment
+
+    def fresh(self, count: int, purpose: str = "evaluation") -> Episodes:
+        """Fresh nominal episodes, shared with `evaluate`."""
+        seed = self.seeds[purpose]
+        progress = partial(self.stages, f"episodes, {purpose}")
+        episodes = run_fresh_episodes(
+            self.scenario, self.folder, count, seed, progress, self.workers
+        )
+        return episodes[:count]
+
+    def results(self) -> Results:
+        """The rows, and what made them."""
+        made = {
+            "command": command_line("python -m studies"),
+            "scenario": self.scenario.name,
+            "scenario_hash": self.scenario.simulation_hash(),
+            "seed": self.seed,
+            "versions": versions(),
+        }
+        return Results(self.rows, made | self.entries)
+
+
+@contextmanager
+def open_study(
+    name: str,
+    scenario: str,
+    folder: Path,
+    *,
+    seed: int = EVALUATION.first,
+    workers: int | None = None,
+    out: Path | None = None,
+    plotted: Callable[[Result], bool] | None = None,
+) -> Iterator[Study]:
+    """Runs a study in the block; afterwards its rows are written, printed and plotted.
+
+    Args:
+        name: Name of the study and of its files.
+        scenario: Name or path of the scenario.
+        folder: Folder of the training.
+        seed: First seed of the fresh episodes.
+        workers: Number of worker processes; None for one a core.
+        out: Folder of the files; that of the training by default.
+        plotted: Whether a row is in the plot; there is none by default.
+    """
+    loaded = load_scenario(scenario)
+    with open_stages() as stages:
+        study = Study(
+            name=name, scenario=loaded, folder=folder, seed=seed, workers=workers, stages=stages
+        )
+        yield study
+    file = (out or folder) / f"{name}.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    results = study.results()
+    results.write(file)
+    for set_ in dict.fromkeys(row.set for row in results.values()):
+        rows = results.select(set=set_)
+        columns = [Column(key, spoken(key)) for key in dict.fromkeys(row.metric for row in rows)]
+        labels = {f"{set_}.{row.method}".strip("."): label_of(row.method) for row in rows}
+        table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
+        console.print(table.to_rich())
+    print_path("figures", file)
+    drawn = list(filter(plotted, results.values())) if plotted else []
+    for picture in save(interval_figure(drawn), file) if drawn else ():
+        print_path("picture", picture)
+
+
+def kept(
+    folder: Path,
+    work: Mapping[str, tuple],
+    function: Callable[..., Arrays],
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Arrays]:
+    """Calls a function of arrays for every part in worker processes, and keeps what it returns.
+
+    Args:
+        folder: The folder, named after all that the parts depend on; one file a part.
+        work: Arguments by name of the part; parts that are there are not called again.
+        function: A function at module level.
+        workers: Number of worker processes; None for one a core.
+        progress: Called with the number done and the number wanted.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {name: folder / f"{name}.npz" for name in work}
+    missing = [name for name, file in files.items() if not file.is_file()]
+    done = len(work) - len(missing)
+    if progress is not None:
+        progress(done, len(work))
+    arguments = [(name, function, work[name]) for name in missing]
+    for name, arrays in parallel_map(_called, arguments, workers):
+        with replacing(files[name]) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
+        done += 1
+        if progress is not None:
+            progress(done, len(work))
+    return {name: _loaded(file) for name, file in files.items()}
+
+
+def _called(name: str, function: Callable[..., Arrays], arguments: tuple) -> tuple[str, Arrays]:
+    return name, function(*arguments)
+
+
+def _loaded(file: Path) -> Arrays:
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file} is damaged ({error!r}): remove it") from error
+
+
+def fingerprint(*things: Any) -> str:
+    """Hash of what determines a result; dataclasses count by their fields."""
+    plain = [asdict(one) if is_dataclass(one) else one for one in things]  # type: ignore[arg-type]
+    text = json.dumps(plain, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def parse_sizes(text: str) -> tuple[int, ...]:
+    """The numbers in '512,1024'.
+
+    Raises:
+        ValueError: The text is no list of integers.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        raise ValueError(f"--sizes '{text}': give numbers, such as 512,1024,2048") from None

@@ -1,0 +1,202 @@
+"""Alarms on motions worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.scorers import Scorer
+from drake_safety.evaluation.verdict_tables import verdict_table
+from studies.alarms import (
+    ALARMS,
+    Alarm,
+    WatchedMotion,
+    accepted,
+    equal_share_threshold,
+    evaluate_alarms,
+    first_alarm,
+    lowest_value,
+    threshold_alarms,
+    tilt,
+)
+
+PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
+
+
+def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
+    """What is seen of it is one number: `values` by the time from which it holds."""
+    end_s = FALL_S if falls else END_S
+    time_s = np.round(np.arange(0.0, end_s + 0.05, 0.1), 9)
+    state = np.ones((len(time_s), 1))
+    for start_s, value in values.items():
+        state[time_s >= start_s - 1e-9] = value
+    rows = np.zeros((len(time_s), 1))
+    return WatchedMotion(
+        index=index,
+        push_time_s=push_time_s,
+        time_s=time_s,
+        state=state,
+        desired_preview=rows,
+        features=rows,
+        margins=rows,
+        leave_time_s=LEAVE_S if leaves else math.inf,
+        fall_time_s=FALL_S if falls else math.inf,
+    )
+
+
+def seen(name="sharpened", delay_rows=0):
+    def value(motion):
+        calm = motion.state[:, 0]
+        return np.concatenate([np.ones(delay_rows), calm[: len(calm) - delay_rows]])
+
+    return Alarm(name=name, value=value)
+
+
+CALM = [motion_of(i, {1.1: 0.9 - 0.01 * i}) for i in range(20)]
+TEST = [
+    motion_of(0, {1.1: 0.2}, leaves=True, falls=True),
+    motion_of(1, {1.3: 0.2}, leaves=True),
+    motion_of(2, {1.5: 0.2}, leaves=True, falls=True),
+    motion_of(3, {0.3: 0.2, 0.5: 1.0}, leaves=True),
+    motion_of(4, {2.0: 0.2}),
+    motion_of(5, {}),
+]
+
+
+def figures_of(alarm, **options):
+    return evaluate_alarms([alarm], CALM, TEST, num_rows=1, **options)
+
+
+def test_what_is_noticed_is_noticed_between_push_and_leaving():
+    estimates = figures_of(seen())
+    # The first two in time, the third too late but before the fall, the fourth only too early.
+    assert estimates["monitoring.sharpened.detected"].value == 2 / 4
+    assert estimates["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
+    assert estimates["monitoring.sharpened.falls_detected"].value == 2 / 2
+    assert estimates["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
+    assert estimates["monitoring.motions.leave_safe_set"].value == 4 / 6
+    assert estimates["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
+
+
+def test_who_sees_the_same_later_has_that_much_less_time():
+    late = figures_of(seen(delay_rows=2))
+    prompt = figures_of(seen())
+    lead = [f["monitoring.sharpened.lead_to_fall_s"].value for f in (prompt, late)]
+    assert lead[0] - lead[1] == pytest.approx(0.2)
+    assert late["monitoring.sharpened.detected"].value == 1 / 4
+
+
+def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
+    blow = [motion_of(0, {1.0: np.nan, 1.1: 1.0})]
+    one, two = (evaluate_alarms([seen()], CALM, [*TEST, *blow], num_rows=n) for n in (1, 2))
+    leads = [found["monitoring.sharpened.lead_to_fall_s"].value for found in (one, two)]
+    assert leads[0] - leads[1] == pytest.approx(0.1)
+    false = [found["monitoring.sharpened.false_alarm_share"].value for found in (one, two)]
+    assert false == [2 / 3, 1 / 3]
+
+
+def test_false_alarms_are_counted_once_a_motion_over_all_hours():
+    estimates = figures_of(seen())
+    assert estimates["monitoring.sharpened.false_alarm_share"].value == 1 / 2
+    # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
+    assert estimates["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
+    rate = estimates["monitoring.sharpened.undisturbed_false_alarms_per_hour"]
+    assert rate.value == pytest.approx(600)
+    assert estimates["monitoring.motions.safe_hours"].value == pytest.approx(0.002)
+
+
+def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
+    for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
+        for scale in (1.0, -3.0 + 4.0):
+            alarm = Alarm(name="one", value=lambda m, scale=scale: scale * m.state[:, 0] - 5.0)
+            found = figures_of(alarm, false_alarm_share=share)
+            threshold = found["monitoring.one.threshold"].value
+            cries = [math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM]
+            assert sum(cries) == count
+            # No higher threshold would do.
+            higher = threshold + 0.011
+            assert sum(math.isfinite(first_alarm(m, alarm.value(m), higher)) for m in CALM) > count
+
+
+def test_an_alarm_is_the_same_in_whatever_unit_it_is_measured():
+    metres = figures_of(seen())
+    inches = figures_of(Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0))
+    for key in metres.keys() - {"monitoring.sharpened.threshold"}:
+        np.testing.assert_equal(metres[key], inches[key])
+
+
+def test_who_does_not_know_cries():
+    motion = motion_of(0, {2.0: np.nan})
+    value = motion.state[:, 0]
+    assert first_alarm(motion, value, -1e9) == 2.0
+    assert first_alarm(motion, value, 0.5, since_s=2.25) == pytest.approx(2.3)
+    assert lowest_value(motion, value) == -math.inf
+    assert first_alarm(motion_of(0, {}), np.ones(37), 1.0) == math.inf
+
+
+def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
+    motion = motion_of(0, {0.2: 0.0, 0.4: 0.8, 1.3: 0.5, 1.4: 0.1}, leaves=True)
+    assert lowest_value(motion, motion.state[:, 0]) == 0.5
+    at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
+    assert lowest_value(at_once, at_once.state[:, 0]) == math.inf
+
+
+def test_motions_that_leave_before_the_push_are_left_out():
+    early = motion_of(6, {}, leaves=True, push_time_s=2.0)
+    unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
+    found = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
+    assert found["monitoring.motions.left_out"].value == 2 / 8
+    assert found["monitoring.sharpened.auc"].n == 6
+
+
+def test_a_threshold_that_cannot_be_chosen_is_refused():
+    with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
+        equal_share_threshold(np.array([]), 0.1)
+
+
+def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
+    about_x = np.array([0.3, 0.0, 0.0])
+    yaw = np.array([0.0, 0.0, 2.0])
+    # Half a turn about a horizontal axis, and about one at 45 degrees.
+    upside_down = np.pi * np.array([0.6, 0.8, 0.0])
+    sideways = np.pi * np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+    angles = tilt(np.array([about_x, yaw, upside_down, sideways, np.zeros(3)]))
+    assert angles == pytest.approx([0.3, 0.0, np.pi, np.pi / 2, 0.0], abs=1e-7)
+    assert np.isnan(tilt(np.full((1, 3), np.nan))).all()
+
+
+def test_what_an_engineer_would_watch_is_found_by_name():
+    names = ["edge", "tracking_error_x", "tracking_error_y"]
+    alarms = threshold_alarms(
+        ["rotation_x", "rotation_y", "rotation_z"], names, {"support_margin": "edge"}
+    )
+    motion = motion_of(0, {})
+    motion.features = np.array([[0.1, 3.0, -4.0]])
+    motion.state = np.array([[0.0, -0.2, 0.0]])
+    motion.margins = np.array([[0.5, -0.1]])
+    values = {alarm.name: alarm.value(motion)[0] for alarm in alarms}
+    assert values == pytest.approx(
+        {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
+    )
+    assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
+
+
+def test_the_table_says_where_another_alarm_is_ahead():
+    found = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST, num_rows=1)
+    table = verdict_table(Results(found), "monitoring", kind=ALARMS)
+    assert [row.key for row in table.rows] == ["sharpened", "tilt"]
+    (first, *_) = table.better_baselines()
+    assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
+
+
+def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():
+    scorer = Scorer(name="x", probability=lambda state, preview, features: state[:, 0])
+    motions = [
+        motion_of(0, {0.0: 0.7, 1.0: 0.1}),
+        motion_of(1, {0.0: 0.5}, leaves=True),
+        motion_of(2, {0.0: 0.49, 0.1: 1.0}),
+        motion_of(3, {0.0: math.nan, 0.1: 1.0}),
+    ]
+    assert [motion.index for motion in accepted(motions, scorer, 0.5)] == [0, 1]
+    assert accepted([], scorer, 0.5) == []

@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
+from drake_safety.learning.calibration import PLAN, calibrate
+
+
+def episodes(rng, n=1000):
+    label = rng.random(n) < 0.5
+    return 1.0 / (1.0 + np.exp(-(rng.normal(size=n) + 3.0 * (label - 0.5)))), label
+
+
+def once(p, label, **options):
+    return reliability(p, label, np.arange(len(p)), **options)
+
+
+def test_every_episode_has_one_verdict():
+    found = calibrate(*episodes(np.random.default_rng(2)), kind=PLAN, miss_rate=0.05)
+    score, label = episodes(np.random.default_rng(3), n=400)
+    shares = {name: one.value for name, one in verdict_shares(found, score, label).items()}
+    assert shares["promised_miss_rate"] == 0.05
+    of_safe = shares["safe_recall"] + shares["safe_unknown"] + shares["false_alarm_rate"]
+    assert of_safe == pytest.approx(1.0)
+    assert shares["miss_rate"] == np.mean(score[label] <= 1.0 - found.threshold)
+    assert shares["unsafe_unknown"] > 0.0
+
+
+def test_probabilities_that_come_true_lie_on_the_diagonal_and_overconfident_ones_do_not():
+    rng = np.random.default_rng(4)
+    p = rng.random(20000)
+    label = rng.random(20000) < p
+    true = once(p, label)
+    assert true.error.value < 0.02
+    for expected, observed in zip(true.expected, true.observed, strict=True):
+        assert observed.low <= expected <= observed.high
+    # As far from one half again as it should be, where that is possible: off by |p - 1/2|.
+    bold = once(np.clip(2.0 * p - 0.5, 0.0, 1.0), label)
+    assert bold.error.value == pytest.approx(0.125, abs=0.02)
+    assert bold.error.low < bold.error.value < bold.error.high
+
+
+def test_equal_probabilities_share_a_bin_and_not_knowing_is_certainty():
+    one = once(np.array([0.2, 0.2, 0.2, np.nan]), np.array([True, False, False, True]))
+    np.testing.assert_allclose(one.expected, [0.2, 1.0])
+    assert one.observed == [proportion(1, 3), proportion(1, 1)]
+    assert one.error.value == pytest.approx(3 / 4 * (1 / 3 - 0.2))
+
+
+def test_repeating_the_rows_of_an_episode_adds_no_certainty():
+    score, label = episodes(np.random.default_rng(5), n=200)
+    rows = (np.repeat(score, 20), np.repeat(label, 20))
+    often = reliability(*rows, np.repeat(np.arange(200), 20), num_bins=2)
+    independent = reliability(*rows, np.arange(4000), num_bins=2)
+    single = once(score, label, num_bins=2)
+    for many, alone, few in zip(often.observed, independent.observed, single.observed, strict=True):
+        assert many.n == few.n == alone.n / 20
+        assert many.high - many.low > 3.0 * (alone.high - alone.low)
+        assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.3)
+    assert often.error.value == pytest.approx(single.error.value)
+
+
+def test_what_is_no_probability_is_refused():
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got 1 of them in 2.0..2.0"):
+        once(np.array([2.0]), np.array([True]))
+
+
+@pytest.mark.train
+def test_the_diagram_shows_each_curve_with_its_error():
+    label = np.array([True, False] * 20)
+    one = once(np.linspace(0, 1, 40), label)
+    fig = reliability_figure({"sharpened": one, "paper": one})
+    (legend,) = fig.legends
+    told = [text.get_text() for text in legend.get_texts()]
+    assert told == [f"{name}   {one.error.value:.3f}" for name in ("sharpened", "paper")]

@@ -1,0 +1,82 @@
+"""What studies share: work that is kept, and rows that become a file, a table and a plot."""
+
+import numpy as np
+import pytest
+
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Results
+from drake_safety.learning.assessment import AssessmentParameters
+from studies.harness import fingerprint, kept, open_study, parse_sizes
+
+CALLS = []
+
+
+def squared(number):
+    CALLS.append(number)
+    return {"square": np.array(number**2), "text": np.array("why")}
+
+
+def test_what_is_kept_is_not_called_again_and_a_stopped_study_goes_on(tmp_path):
+    CALLS.clear()
+    work = {f"{i}": (i,) for i in range(4)}
+
+    def stop(done, total):
+        assert total == 4
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        kept(tmp_path, work, squared, workers=1, progress=stop)
+    assert CALLS == [0, 1]
+    reports = []
+    found = kept(
+        tmp_path, work, squared, workers=1, progress=lambda *report: reports.append(report)
+    )
+    assert CALLS == [0, 1, 2, 3]
+    assert reports == [(2, 4), (3, 4), (4, 4)]
+    assert [int(found[name]["square"]) for name in work] == [0, 1, 4, 9]
+    assert str(found["3"]["text"]) == "why"
+    # No half-written file, and a damaged one is told of.
+    assert sorted(file.name for file in tmp_path.iterdir()) == [f"{i}.npz" for i in range(4)]
+    (tmp_path / "0.npz").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"0\.npz is damaged .*: remove it"):
+        kept(tmp_path, work, squared, workers=1)
+
+
+def test_a_fingerprint_is_that_of_every_field():
+    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
+    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
+    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3
+
+
+def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
+    with open_study(
+        "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda row: row.metric == "auc"
+    ) as study:
+        study.entries["pairs"] = 3
+        study.add("segments.paper", {"auc": Estimate(0.5, 0.25, 0.75, 40)})
+        study.add("segments.sharpened", {"auc": Estimate(0.9, 0.8, 1.0, 40)})
+        study.rows["pushes.fallen"] = Estimate(0.125, 0.0, 0.5, 8)
+    found = Results.read(tmp_path / "out/tried.json")
+    assert dict(found) == dict(study.results())
+    assert found["segments.paper.auc"].n == 40
+    assert found.entries["scenario"] == "pendulum" and found.entries["pairs"] == 3
+    assert found.entries["command"].startswith("python -m studies")
+    printed = capsys.readouterr().out
+    for words in ("0.500 (0.250–0.750)", "0.900 (0.800–1.000)", "fallen", "0.125 (0.000–0.500)"):
+        assert words in printed
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".json", ".png", ".svg"}
+
+
+def test_a_study_that_fails_writes_nothing(tmp_path):
+    with pytest.raises(RuntimeError), open_study("tried", "pendulum", tmp_path) as study:
+        study.rows["pushes.fallen"] = Estimate(0.125, 0.0, 0.5, 8)
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sizes_are_numbers_between_commas():
+    assert parse_sizes("512,1024") == (512, 1024)
+    assert parse_sizes("") == ()
+    with pytest.raises(ValueError, match="--sizes 'many': give numbers"):
+        parse_sizes("many")
