@@ -52,11 +52,24 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     hash_ = load_scenario(file).simulation_hash()
     kept = [fresh_episodes_folder(folder, hash_, seed, {}) for seed in (100, 103)]
     assert [len(completed(path)) for path in kept] == [30, 20]
-    # Once all are there, even a simulation that always fails is not needed.
-    monkeypatch.setattr(rollouts, "run_episode", None)
+    # Once all are there, one of each set is simulated again, to know the set.
+    again = count_episodes(monkeypatch)
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    assert len(again) == 2
     assert dict(Results.read(folder / "evaluation.json")) == dict(first)
+
+
+def count_episodes(monkeypatch):
+    """A list that grows by an index whenever an episode is simulated."""
+    indices, run_episode = [], rollouts.run_episode
+
+    def counted(loop, index, **options):
+        indices.append(index)
+        return run_episode(loop, index, **options)
+
+    monkeypatch.setattr(rollouts, "run_episode", counted)
+    return indices
 
 
 def study(monkeypatch, *arguments):
@@ -149,11 +162,12 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
         assert stored[mode].keys() == {"plan", "motion"}
         assert stored[mode]["plan"].miss_rate == 0.1
         assert stored[mode]["plan"].num_unsafe + stored[mode]["plan"].num_safe == 120
-    # The episodes are kept: another promise simulates nothing.
-    monkeypatch.setattr(rollouts, "run_episode", None)
+    # The episodes are kept: another promise simulates one, to know them.
+    again = count_episodes(monkeypatch)
     assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.01) == 2
     assert "needs at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
     assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
+    assert len(again) == 1
     monkeypatch.undo()
     monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, run) in (0, None)
