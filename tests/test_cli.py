@@ -114,7 +114,7 @@ def stopped(monkeypatch):
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drake_safety.simulation.rollouts.run_episodes", stop)
+    monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
 
 
 @pytest.mark.train
@@ -209,7 +209,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
 
 @pytest.mark.train
 def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("drake_safety.simulation.dataset.completed", lambda path: {0, 1, 2})
+    monkeypatch.setattr("drake_safety.cli.train.completed", lambda path: {0, 1, 2})
     (tmp_path / "episodes").mkdir()
     assert call(monkeypatch, "train", "laikago_balancing", "--out", tmp_path) == 2
     assert "already holds 3 episodes: pass --resume" in capsys.readouterr().out

@@ -21,7 +21,6 @@ from drake_safety.cli.console import (
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.live.page import serve_page
 from drake_safety.live.session import LiveSession
 from drake_safety.live.task_sessions import LiveCommands, LiveEpisodes, LiveGoals, LiveThrows
 from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
@@ -55,6 +54,8 @@ def play(
     push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
     verdict are shown.
     """
+    from drake_safety.live.page import serve_page  # Of the extra "live".
+
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment)
     gamma = load_assessment(folder.path, mode)
