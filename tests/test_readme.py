@@ -14,7 +14,7 @@ import pytest
 import typer
 import yaml
 
-from drake_safety.cli import app
+from drake_safety.cli import make_app
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.simulation.scenario import load_scenario, parse_scenario, task_names
@@ -80,7 +80,7 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
 
 
 def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():
-    for program, commands in (("drake-safety", app), ("python -m studies", studies)):
+    for program, commands in (("drake-safety", make_app()), ("python -m studies", studies)):
         group = typer.main.get_command(commands)
         calls = shell_commands(program, README + COMMANDS + CARDS)
         assert {call[0] for call in calls} == set(group.commands)
