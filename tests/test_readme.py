@@ -149,7 +149,7 @@ def test_a_key_that_does_not_exist_is_answered_with_those_that_do(own_robot):
 
 def test_the_numbers_in_the_readmes_prose_are_the_programs_defaults():
     recovery = load_scenario("laikago_balancing").parameters.recovery
-    assert f"below a threshold ({recovery.threshold:g} in Laikago's scenario)" in README
+    assert f"({recovery.threshold:g} in Laikago's scenario)" in README
     parameters = AssessmentParameters()
     assert f"{parameters.resolution} × {parameters.resolution} cells" in README
     assert parameters.ensemble_size == 3
