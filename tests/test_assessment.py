@@ -175,7 +175,7 @@ def test_the_same_seed_learns_the_same_assessment(episodes):
 def test_progress_runs_through_the_stages(episodes):
     seen = []
     SafetyAssessment(AssessmentParameters(**{**QUICK, "epochs": 1})).fit(
-        episodes[:60], lambda stage, fraction: seen.append((stage, fraction))
+        episodes[:60], lambda stage, done, total: seen.append((stage, done / total))
     )
     assert list(dict.fromkeys(stage for stage, _ in seen)) == [
         "distances",
