@@ -212,7 +212,7 @@ def test_a_task_whose_plans_have_no_goal_is_not_asked():
     class Wandering(ClosedLoop):
         pass
 
-    loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
+    loop = Wandering(SimpleNamespace(variation=str, control_period_s=0.01), "nominal", None)
     with pytest.raises(ValueError, match="'Wandering' has no plans with a goal"):
         assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)
 
