@@ -203,7 +203,8 @@ def train_shuttle(folder):
     file = folder / "shuttling.yaml"
     file.write_text(SCENARIO)
     scenario = load_scenario(file)
-    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder))
+    extra = {"command": "drake-safety train shuttling --out /somebodys/own"}
+    episodes = run_episodes(scenario, 60, num_workers=1, path=episodes_folder(folder), extra=extra)
     for mode in MODES:
         scenario.assessment.mode = mode
         SafetyAssessment(scenario.assessment).fit(episodes).save(assessment_file(folder, mode))
