@@ -1,5 +1,3 @@
-"""Balancing: any legged robot stands, sees what its variation says, and steps when it must."""
-
 import functools
 import math
 from pathlib import Path
@@ -143,7 +141,6 @@ def test_dry_friction_is_no_part_of_the_nominal_plant():
 
 
 def test_every_servo_follows_its_own_joint():
-    """The set points of one joint move that joint and no other."""
     for variation in ("nominal", "rough"):
         loop = standing_loop("biped", variation)
         simulator, context = started(loop)
@@ -234,7 +231,6 @@ def test_starts_are_inside_the_ranges_that_the_scenario_gives():
 
 
 def test_feet_are_at_rest_in_a_moving_start():
-    """0 = J v: what the base does, the legs allow for."""
     scenario = scenario_of(PACKAGED)
     text = yaml.safe_load(scenario.to_yaml())
     text["parameters"]["start"] |= {

@@ -1,5 +1,3 @@
-"""Recovery of the balancing task: the robot steps when Γ falls, and hands over again."""
-
 import functools
 import math
 from dataclasses import replace

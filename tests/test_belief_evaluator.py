@@ -1,5 +1,3 @@
-"""BeliefEvaluator: Γ inside a diagram, evaluated on time, with beliefs that live in the Context."""
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""What a task can do is told by its members; what it cannot, by one message with what it can."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""ClosedLoop: the contract is checked when a task is built, not when someone trips over it."""
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,5 +1,3 @@
-"""Simulation on a cluster: a scheduler and workers in processes of their own."""
-
 import contextlib
 import json
 import os

@@ -1,5 +1,3 @@
-"""CommandGuard: passes on accepted commands, and the nearest accepted one in place of others."""
-
 from types import SimpleNamespace
 
 import numpy as np

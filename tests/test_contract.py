@@ -1,5 +1,3 @@
-"""check_contract: what a diagram lacks is told, item by item, and how to fix it."""
-
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder

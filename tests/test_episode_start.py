@@ -1,5 +1,3 @@
-"""Episodes that begin with a given state and plan: the twin of what another loop did."""
-
 import copy
 import dataclasses
 import gc

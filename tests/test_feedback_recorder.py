@@ -1,5 +1,3 @@
-"""FeedbackRecorder: windows of a running robot, labelled by how they end."""
-
 import copy
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""InverseKinematicsController: joint commands that carry a base over given feet."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix

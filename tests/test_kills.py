@@ -1,5 +1,3 @@
-"""Killed processes: nothing is left running, what had finished is kept, and resuming is exact."""
-
 import os
 import signal
 import subprocess

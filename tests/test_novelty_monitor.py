@@ -1,5 +1,3 @@
-"""NoveltyMonitor: the charts of the innovation in a diagram, with an alarm that latches."""
-
 from pathlib import Path
 
 import numpy as np

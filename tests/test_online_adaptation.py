@@ -1,5 +1,3 @@
-"""OnlineAdaptation: an update after every k_u feedback sets of a running diagram."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 

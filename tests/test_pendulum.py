@@ -1,5 +1,3 @@
-"""Pendulum: physics worked by hand, the motor's limit, and a true safe set that Γ learns."""
-
 import math
 from dataclasses import replace
 

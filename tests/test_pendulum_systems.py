@@ -1,5 +1,3 @@
-"""The pendulum's systems on their own: ports, values worked by hand, the motor's limit."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""PlanFeatures: the safe set's features of the measured state and the plan ahead."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform

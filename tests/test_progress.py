@@ -1,5 +1,3 @@
-"""Progress: lines where there is no terminal, and True in place of a callback."""
-
 import io
 import time
 

@@ -1,5 +1,3 @@
-"""A push changes a body's momentum by force times time, and nothing else."""
-
 import numpy as np
 import pytest
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph

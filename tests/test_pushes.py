@@ -1,5 +1,3 @@
-"""Pushes say where, how hard and when; random ones are as often and as hard as they shall."""
-
 import numpy as np
 import pytest
 

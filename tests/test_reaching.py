@@ -1,5 +1,3 @@
-"""Reaching: starts, targets and ports of any robot with hands, and what is refused."""
-
 import numpy as np
 import pytest
 import yaml
@@ -77,7 +75,6 @@ def test_ports_tell_of_the_plant(make_loop):
 
 @pytest.mark.parametrize("variation", ["nominal", "noisy"])
 def test_what_is_asked_at_plan_time_is_what_an_episode_begins_with(variation):
-    """Without a step of simulation."""
     loop = porter(variation)
     context = loop.CreateDefaultContext()
     loop.reset(context, episode_rng(0, 0), EASY)
@@ -216,7 +213,6 @@ def test_the_same_generator_draws_the_mirror_image_for_the_other_hand(make_loop)
 
 
 def test_the_assessor_sees_the_other_hand_as_the_trained_one_in_the_mirror(make_loop):
-    """In scenes that are symmetric, as both are."""
     left, right = make_loop(), make_loop(hand="right")
     # The torso that Atlas was published with is not quite symmetric: its centre of mass lies some
     # millimetres to one side, and a far reach ends some hundredths of a radian otherwise.

@@ -1,5 +1,3 @@
-"""Reaching in motion: any robot reaches, sees what its variation says, and is judged by Γ."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator

@@ -1,5 +1,3 @@
-"""What a scenario may say of reaching, and what it may not."""
-
 import pytest
 
 from drake_safety.diagrams.reaching_parameters import ReachingParameters

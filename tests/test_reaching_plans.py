@@ -1,5 +1,3 @@
-"""What reaching announces of its plans: goals, fair targets, the other hand, failures."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""What a reaching episode draws: postures in the safe set, targets and detours; what is refused."""
-
 import math
 
 import numpy as np

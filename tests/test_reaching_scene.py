@@ -1,5 +1,3 @@
-"""The scene of the packaged reaching task: things stand on boards, and named targets touch them."""
-
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, Role

@@ -1,5 +1,3 @@
-"""Episodes of diagrams of one's own: the same guarantees as for the package's tasks."""
-
 import logging
 import os
 import subprocess
@@ -262,7 +260,6 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
 
 @pytest.mark.train
 def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
-    """Its functions, the systems that they make, and what pydrake binds without a module."""
     script = tmp_path / "mine.py"
     script.write_text(
         Path(quadrotor_file.__file__).read_text()

@@ -1,5 +1,3 @@
-"""Footholds and swing curves: Raibert's neutral point, within reach, on the foot's own side."""
-
 import math
 
 import numpy as np

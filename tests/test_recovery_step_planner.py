@@ -1,5 +1,3 @@
-"""RecoveryStepPlanner: rests, swings its feet in groups, returns the base, and says when done."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix

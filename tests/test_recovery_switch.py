@@ -1,5 +1,3 @@
-"""RecoverySwitch: the nominal set point passes through until Γ falls, and again afterwards."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform

@@ -1,5 +1,3 @@
-"""RecoveryTrigger: fires below the threshold, latches, and lets go when recovery is done."""
-
 import math
 
 import numpy as np

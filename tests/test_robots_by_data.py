@@ -1,5 +1,3 @@
-"""Robots of the extra `robots`: each stands, by its robot.yaml and its scenario alone."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator

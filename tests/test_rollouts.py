@@ -1,5 +1,3 @@
-"""Rollouts: the same bits for any number of workers, after any interruption, whatever diverges."""
-
 import logging
 import re
 from pathlib import Path

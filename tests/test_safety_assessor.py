@@ -1,5 +1,3 @@
-"""SafetyAssessor: Γ with its monitor and the check of the margins, connected."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator

@@ -1,5 +1,3 @@
-"""SafetyMonitor: one while no margin is negative, of this very instant, never fooled by NaN."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator

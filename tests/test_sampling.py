@@ -1,5 +1,3 @@
-"""Starts, plans and throws lie in their ranges, and feet stand still while the base moves."""
-
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion

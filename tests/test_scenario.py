@@ -1,5 +1,3 @@
-"""A scenario is one YAML file; what it misspells is answered with what exists."""
-
 import importlib
 import os
 import subprocess

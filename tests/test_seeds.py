@@ -1,5 +1,3 @@
-"""Sets of episodes that do not overlap, and assessments that know which ones they have used."""
-
 import dataclasses
 import inspect
 from itertools import combinations

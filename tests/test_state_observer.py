@@ -1,5 +1,3 @@
-"""StateObserver: what is measured follows the plant state, with noise only where asked for."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform

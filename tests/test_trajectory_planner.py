@@ -1,5 +1,3 @@
-"""TrajectoryPlanner: the plan in the world now, and in the stance frame for what is coming."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""WholeBodyController: torques at its ticks, robots that stand and reach, failures without harm."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -224,7 +222,6 @@ def test_nothing_of_an_earlier_episode_is_left_after_the_initialisation():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_robots_stand(name):
-    """Under torques alone, at 2 ms with a tick every 4 ms."""
     loop = WholeBodyLoop(robot_model(name))
     start = loop.q
     reference = loop.controller.model.reference(start)
@@ -252,7 +249,6 @@ def test_robots_come_to_rest_after_a_start_in_motion(name):
 
 
 def test_dry_friction_holds_joints_under_torques():
-    """The friction actuators are armed, get no torque, and the robot stands all the same."""
     smooth = WholeBodyLoop(robot_model("laikago"))
     rough = WholeBodyLoop(robot_model("laikago"), variation=PlantVariation(joint_friction_nm=1.0))
     goal = smooth.kinematics.center_of_mass(smooth.q) + [0.03, 0.0, -0.03]

@@ -1,5 +1,3 @@
-"""The whole loop: nominal episodes, Γ learned from them, Γ and recovery steps in a diagram."""
-
 import copy
 
 import numpy as np
