@@ -3,8 +3,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import Assessment, Correction
@@ -87,27 +85,6 @@ def value(evaluator, context, name):
     return evaluator.GetOutputPort(name).Eval(context)
 
 
-def test_its_ports_have_the_sizes_the_assessment_was_learned_with():
-    evaluator = BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
-    outputs = {
-        "safety_probability": 1,
-        "belief": 3,
-        "embedding": 2,
-        "cause_probability": 2,
-        "predicted_margins": 2,
-        "novelty": 1,
-    }
-    assert evaluator.num_input_ports() == len(INPUTS)
-    for name, numbers in INPUTS.items():
-        assert evaluator.GetInputPort(name).size() == len(numbers)
-    assert {n: evaluator.GetOutputPort(n).size() for n in outputs} == outputs
-    assert evaluator.num_output_ports() == len(outputs)
-
-
-def test_no_input_feeds_through():
-    assert not BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S).HasAnyDirectFeedthrough()
-
-
 def test_every_part_of_the_verdict_comes_out_at_its_own_port():
     _, evaluator, simulator, context = running()
     simulator.Initialize()
@@ -147,13 +124,6 @@ def test_an_assessment_without_features_needs_none():
     assert assessment.asked[0][2] is None
 
 
-@pytest.mark.parametrize("name", INPUTS)
-def test_a_port_that_is_needed_and_not_connected_is_named(name):
-    _, _, simulator, _ = running(without=[name])
-    with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}\).*is not connected"):
-        simulator.Initialize()
-
-
 def test_who_wants_neither_check_nor_alarm_says_so():
     evaluator = BeliefEvaluator(
         AssessmentDouble(), period_s=PERIOD_S, checks_margins=False, heeds_alarm=False
@@ -164,16 +134,6 @@ def test_who_wants_neither_check_nor_alarm_says_so():
     fix(evaluator, simulator.get_mutable_context(), without=["margins", "alarm"])
     simulator.Initialize()
     assert value(evaluator, simulator.get_context(), "belief")[0] == 0.25
-
-
-def test_the_verdict_is_held_for_a_period():
-    _, evaluator, simulator, context = running()
-    simulator.AdvanceTo(0.01)
-    evaluator.GetInputPort("state").FixValue(context, [0.75, 0.0])
-    simulator.AdvanceTo(0.039)
-    assert value(evaluator, context, "safety_probability")[0] == 0.25
-    simulator.AdvanceTo(0.041)
-    assert value(evaluator, context, "safety_probability")[0] == 0.75
 
 
 def test_it_is_evaluated_once_a_period():
@@ -223,30 +183,6 @@ def test_beliefs_of_another_shape_are_refused_with_both_named():
     _, evaluator, _, context = running()
     with pytest.raises(ValueError, match=r"must have shape \(1, 6, 5\); got \(6, 5\)"):
         evaluator.set_beliefs(context, np.zeros((6, 5)))
-
-
-@pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_state_that_is_not_finite_is_not_known_to_be_anything(number):
-    _, evaluator, simulator, context = running()
-    evaluator.GetInputPort("state").FixValue(context, [number, 0.0])
-    simulator.Initialize()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0, 0, 1])
-    assert value(evaluator, context, "safety_probability")[0] == 0
-
-
-def test_it_is_usable_alone_in_any_diagram():
-    builder = DiagramBuilder()
-    evaluator = builder.AddNamedSystem(
-        "belief_evaluator", BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
-    )
-    for name, numbers in INPUTS.items():
-        source = builder.AddSystem(ConstantVectorSource(numbers))
-        builder.Connect(source.get_output_port(), evaluator.GetInputPort(name))
-    builder.ExportOutput(evaluator.GetOutputPort("safety_probability"), "safety_probability")
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    simulator.AdvanceTo(0.1)
-    assert diagram.GetOutputPort("safety_probability").Eval(simulator.get_context())[0] == 0.25
 
 
 def test_an_alarm_makes_the_belief_unknown():

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -9,8 +7,6 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.innovation import KINDS
-from drake_safety.simulation.scenario import parse_scenario
-from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
@@ -144,10 +140,6 @@ def test_it_adopts_the_innovation_of_an_adapted_assessment(assessment):
     assert not np.array_equal(*found)
 
 
-def test_no_input_feeds_through(assessment):
-    assert not NoveltyMonitor(assessment).HasAnyDirectFeedthrough()
-
-
 @pytest.mark.parametrize("on_alarm", ["unknown", "report"])
 def test_a_scenario_says_what_an_alarm_does(on_alarm):
     scenario = load_scenario("laikago_balancing")
@@ -157,9 +149,3 @@ def test_a_scenario_says_what_an_alarm_does(on_alarm):
     assert loop.GetOutputPort("levels").size() == len(KINDS) - 1
     evaluator = loop.GetSubsystemByName("safety_assessor").evaluator
     assert evaluator.HasInputPort("alarm") == (on_alarm == "unknown")
-
-
-def test_another_consequence_of_an_alarm_is_refused():
-    text = "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\non_alarm: stop\n"
-    with pytest.raises(ValueError, match=r"on_alarm must be one of .*got 'stop'"):
-        parse_scenario(text, name="mine", folder=Path())

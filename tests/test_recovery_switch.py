@@ -60,29 +60,6 @@ class Bench:
         return steps + self.parameters.return_duration_s + 0.2
 
 
-def test_it_exports_the_promised_ports():
-    switch = Bench().switch
-    inputs = {switch.get_input_port(i).get_name() for i in range(switch.num_input_ports())}
-    outputs = {switch.get_output_port(i).get_name() for i in range(switch.num_output_ports())}
-    assert inputs == {
-        "safety_probability",
-        "belief",
-        "plant_state",
-        "nominal_desired_output",
-        "nominal_desired_preview",
-        "nominal_desired_outlook",
-    }
-    assert outputs == {
-        "desired_output",
-        "desired_preview",
-        "desired_outlook",
-        "desired_foot_positions",
-        "desired_yaw",
-        "stance_pose",
-        "recovery_active",
-    }
-
-
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_while_safe_the_nominal_plan_passes_through_at_once(name):
     bench = Bench(name)

@@ -7,7 +7,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_safety import (
     AddSafetyAssessor,
     AssessmentParameters,
-    NoveltyMonitor,
     SafetyAssessment,
     SafetyAssessor,
 )
@@ -70,15 +69,6 @@ def test_one_call_adds_gamma_the_monitor_and_the_check_of_the_margins(assessment
     assert value(outside, context, "belief")[0] == 0.0
 
 
-def test_its_outputs_are_those_of_its_two_systems(assessment):
-    def names(system):
-        return [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
-
-    assessor = SafetyAssessor(assessment)
-    assert names(assessor) == [*names(assessor.evaluator), *names(NoveltyMonitor(assessment))]
-    assert not assessor.HasAnyDirectFeedthrough()
-
-
 def test_less_is_said_by_an_argument(assessment, inputs):
     assessor, simulator, context = added(assessment, inputs, on_alarm="report")
     simulator.AdvanceTo(NUM_FROZEN * STEP_S)
@@ -97,15 +87,6 @@ def test_less_is_said_by_an_argument(assessment, inputs):
 def test_the_margins_are_not_left_out_by_mistake(assessment, inputs):
     with pytest.raises(TypeError, match="margins"):
         added(assessment, {name: inputs[name] for name in INPUTS[:3]})
-    assessor = SafetyAssessor(assessment)
-    simulator = Simulator(assessor)
-    for name in INPUTS[:3]:
-        assessor.GetInputPort(name).FixValue(simulator.get_mutable_context(), inputs[name])
-    with pytest.raises(RuntimeError, match=r"required InputPort.*\(margins\).*is not connected"):
-        simulator.Initialize()
-
-
-def test_missing_features_and_ports_of_another_size_are_refused(assessment, inputs):
     with pytest.raises(ValueError, match="was fitted with features"):
         added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
     with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
