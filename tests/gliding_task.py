@@ -39,6 +39,10 @@ def declare_outputs(system, ports, read):
         )
 
 
+def evaluated(system, context, name):
+    return system.GetOutputPort(name).Eval(context)
+
+
 class Mass(LeafSystem):
     """x, v of a mass without forces."""
 
@@ -71,7 +75,7 @@ class Mass(LeafSystem):
             if self.parameters.failure == "raise":
                 raise DivergenceError("the solver failed")
             if self.parameters.failure == "bug":
-                raise ValueError("operands could not be broadcast together")
+                raise RuntimeError("operands could not be broadcast together")
             if self.parameters.failure:
                 x = float(self.parameters.failure)
         discrete_state.set_value([x, v])

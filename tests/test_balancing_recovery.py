@@ -12,11 +12,12 @@ def test_a_low_probability_makes_the_robot_step_and_hand_over_again():
     loop = standing_loop(PACKAGED, recovery=True)
     probability = loop.GetInputPort("safety_probability")
     simulator, context = started(loop)
+    probability.FixValue(context, [1.0])
     rows = []
     for step in range(181):
         time = 0.01 * step
-        probability.FixValue(context, [0.0 if abs(time - 0.2) < 0.011 else 1.0])
         simulator.AdvanceTo(time)
+        probability.FixValue(context, [0.0 if abs(time - 0.2) < 0.011 else 1.0])
         x = loop.GetOutputPort("plant_state").Eval(context)
         p_WC = loop.kinematics.contact_positions(x[: loop.kinematics.num_positions])
         active = loop.GetOutputPort("recovery_active").Eval(context)[0]

@@ -7,6 +7,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
+from gliding_task import evaluated
 
 PERIOD_S, NOVELTY = 0.04, 0.7
 STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0, 8.0, 9.0])
@@ -81,10 +82,6 @@ def running(assessment=None, without=()):
     return assessment, evaluator, simulator, context
 
 
-def value(evaluator, context, name):
-    return evaluator.GetOutputPort(name).Eval(context)
-
-
 def test_every_part_of_the_verdict_comes_out_at_its_own_port():
     _, evaluator, simulator, context = running()
     simulator.Initialize()
@@ -97,13 +94,13 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
         "novelty": [NOVELTY],
     }
     for name, numbers in expected.items():
-        np.testing.assert_allclose(value(evaluator, context, name), numbers)
+        np.testing.assert_allclose(evaluated(evaluator, context, name), numbers)
 
 
 def test_before_the_first_evaluation_nothing_is_known():
     _, evaluator, _, context = running()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0.0, 0.0, 1.0])
-    assert value(evaluator, context, "safety_probability") == [0.0]
+    np.testing.assert_array_equal(evaluated(evaluator, context, "belief"), [0.0, 0.0, 1.0])
+    assert evaluated(evaluator, context, "safety_probability") == [0.0]
 
 
 def test_the_assessment_is_asked_with_what_stands_at_the_ports():
@@ -133,7 +130,7 @@ def test_who_wants_neither_check_nor_alarm_says_so():
     simulator = Simulator(evaluator)
     fix(evaluator, simulator.get_mutable_context(), without=["margins", "alarm"])
     simulator.Initialize()
-    assert value(evaluator, simulator.get_context(), "belief")[0] == 0.25
+    assert evaluated(evaluator, simulator.get_context(), "belief")[0] == 0.25
 
 
 def test_it_is_evaluated_once_a_period():
@@ -152,8 +149,8 @@ def test_new_beliefs_change_the_verdict_of_one_context_only():
     evaluator.set_beliefs(context, 2 * assessment.beliefs_)
     simulator.Initialize()
     other.Initialize()
-    assert value(evaluator, context, "safety_probability")[0] == 0.5
-    assert value(evaluator, other_context, "safety_probability")[0] == 0.25
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.5
+    assert evaluated(evaluator, other_context, "safety_probability")[0] == 0.25
     np.testing.assert_array_equal(evaluator.get_beliefs(context), 2 * assessment.beliefs_)
     np.testing.assert_array_equal(evaluator.get_beliefs(other_context), assessment.beliefs_)
 
@@ -166,9 +163,9 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     adapted.beliefs_ = 2 * assessment.beliefs_
     adapted.correction_ = correction(0.125)
     evaluator.adopt(context, adapted)
-    assert value(evaluator, context, "safety_probability")[0] == 0.25
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.25
     simulator.AdvanceTo(PERIOD_S + 0.001)
-    assert value(evaluator, context, "safety_probability")[0] == 0.625
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.625
     assert assessment.novelties[0] is assessment.novelty_
     assert assessment.novelties[-1] is adapted.novelty_
 
@@ -189,10 +186,10 @@ def test_an_alarm_makes_the_belief_unknown():
     _, evaluator, simulator, context = running()
     evaluator.GetInputPort("alarm").FixValue(context, [1.0])
     simulator.Initialize()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(evaluated(evaluator, context, "belief"), [0.0, 0.0, 1.0])
     for name in ("safety_probability", "cause_probability"):
-        assert not value(evaluator, context, name).any()
-    assert value(evaluator, context, "novelty") == NOVELTY
+        assert not evaluated(evaluator, context, name).any()
+    assert evaluated(evaluator, context, "novelty") == NOVELTY
 
 
 @pytest.mark.parametrize("margins", [[0.1, -0.02], [-1.0, -2.0]])
@@ -201,10 +198,10 @@ def test_outside_the_safe_set_nothing_is_safe_until_it_has_been_entered_again(ma
     port = evaluator.GetInputPort("margins")
     port.FixValue(context, margins)
     simulator.Initialize()
-    np.testing.assert_allclose(value(evaluator, context, "belief"), [0.0, 0.9, 0.1])
+    np.testing.assert_allclose(evaluated(evaluator, context, "belief"), [0.0, 0.9, 0.1])
     # The mass goes to the most violated constraint.
-    np.testing.assert_allclose(value(evaluator, context, "cause_probability"), [0.2, 0.55])
-    assert value(evaluator, context, "safety_probability") == 0.0
+    np.testing.assert_allclose(evaluated(evaluator, context, "cause_probability"), [0.2, 0.55])
+    assert evaluated(evaluator, context, "safety_probability") == 0.0
     port.FixValue(context, [0.1, 0.2])
     simulator.AdvanceTo(PERIOD_S)
-    np.testing.assert_allclose(value(evaluator, context, "belief"), [0.25, 0.65, 0.1])
+    np.testing.assert_allclose(evaluated(evaluator, context, "belief"), [0.25, 0.65, 0.1])

@@ -18,10 +18,11 @@ from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episo
 pytestmark = pytest.mark.train
 
 
-def write(path, indices, **options):
-    with EpisodeWriter(path, make_info(), **options) as writer:
-        for index in indices:
-            writer.append(make_episode(index))
+def write(path, episodes, info=None, **options):
+    """Episodes, or indices of made-up ones."""
+    with EpisodeWriter(path, info or make_info(), **options) as writer:
+        for one in episodes:
+            writer.append(make_episode(one) if isinstance(one, int) else one)
 
 
 def names_in(path):
@@ -39,24 +40,20 @@ def test_episodes_come_back_bit_for_bit_and_sorted_by_index(tmp_path):
 def test_nan_infinity_minus_zero_and_the_smallest_number_survive(tmp_path):
     state = np.array([[np.nan, np.inf, -np.inf], [-0.0, 5e-324, 1 / 3]])
     episode = make_episode(1, num_rows=2, state=state, cause="diverged")
-    with EpisodeWriter(tmp_path, make_info()) as writer:
-        writer.append(episode)
+    write(tmp_path, [episode])
     assert_identical(load_episodes(tmp_path), [episode])
 
 
 def test_episodes_of_different_lengths_share_a_shard(tmp_path):
     written = [make_episode(index, num_rows=1 + index) for index in range(4)]
-    with EpisodeWriter(tmp_path, make_info()) as writer:
-        for episode in written:
-            writer.append(episode)
+    write(tmp_path, written)
     assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
     assert_identical(load_episodes(tmp_path), written)
 
 
 def test_arrays_without_columns_come_back_without_columns(tmp_path):
     info = make_info(feature_names=[])
-    with EpisodeWriter(tmp_path, info) as writer:
-        writer.append(make_episode(0, info))
+    write(tmp_path, [make_episode(0, info)], info)
     assert load_episodes(tmp_path)[0].features.shape == (5, 0)
 
 
@@ -188,8 +185,7 @@ def test_another_set_is_refused_with_both_sides_named(tmp_path):
 def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_path, caplog):
     write(tmp_path, [0])
     with caplog.at_level(logging.WARNING, logger="drake_safety"):
-        with EpisodeWriter(tmp_path, make_info(versions={"numpy": "3.0.0"})) as writer:
-            writer.append(make_episode(1))
+        write(tmp_path, [1], make_info(versions={"numpy": "3.0.0"}))
     assert "3.0.0" in caplog.text
     assert read_info(tmp_path)[0].versions == {"numpy": "2.4.6"}
 
@@ -206,8 +202,7 @@ def test_fields_that_an_earlier_version_knew_are_passed_over(tmp_path):
 
 def test_names_given_as_a_tuple_are_the_same_set(tmp_path):
     write(tmp_path, [0])
-    with EpisodeWriter(tmp_path, make_info(state_names=("x", "v", "a"))) as writer:
-        writer.append(make_episode(1))
+    write(tmp_path, [1], make_info(state_names=("x", "v", "a")))
     assert completed(tmp_path) == {0, 1}
 
 
@@ -297,8 +292,7 @@ def test_the_lock_of_a_killed_writer_is_gone(tmp_path):
 )
 def test_a_shard_that_contradicts_the_set_is_refused(tmp_path, info, index, message):
     write(tmp_path / "a", [0])
-    with EpisodeWriter(tmp_path / "b", info) as writer:
-        writer.append(make_episode(index, info, num_rows=4))
+    write(tmp_path / "b", [make_episode(index, info, num_rows=4)], info)
     other = (tmp_path / "b" / "episodes-00000.parquet").read_bytes()
     (tmp_path / "a" / "episodes-00001.parquet").write_bytes(other)
     with pytest.raises(ValueError, match=message):

@@ -22,12 +22,14 @@ def assessment():
     return SafetyAssessment(parameters).fit(make_episodes(240, noise=0.002))
 
 
-def long_motion(num_motions=6, seed=77):
+def long_motion(num_motions=6, seed=77, frozen=slice(0, 0)):
     """Safe motions of the nominal plant, one after another."""
     found = [one for one in make_episodes(60, seed=seed, noise=0.002) if one.is_safe]
-    return {
-        name: np.concatenate([getattr(one, name) for one in found[:num_motions]]) for name in INPUTS
-    }
+    motion = {name: [getattr(one, name) for one in found[:num_motions]] for name in INPUTS}
+    motion = {name: np.concatenate(rows) for name, rows in motion.items()}
+    for rows in motion.values():
+        rows[frozen] = rows[frozen.start]
+    return motion
 
 
 def running(assessment, inputs, hold=None):
@@ -72,9 +74,7 @@ def test_its_levels_are_those_of_the_innovation(assessment):
 
 
 def test_a_frozen_input_raises_an_alarm_that_stays_and_makes_the_belief_unknown(assessment):
-    inputs = long_motion()
-    for rows in inputs.values():
-        rows[30:60] = rows[30]
+    inputs = long_motion(frozen=slice(30, 60))
     _, alarm, cause, belief = history(assessment, inputs)
     first = int(np.argmax(alarm))
     assert 30 < first <= 30 + assessment.innovation_.longest_repeat + 2
@@ -92,9 +92,7 @@ def test_a_steady_push_raises_an_alarm_with_its_cause(assessment):
 
 
 def test_it_waits_while_it_is_held(assessment):
-    inputs = long_motion()
-    for rows in inputs.values():
-        rows[30:60] = rows[30]
+    inputs = long_motion(frozen=slice(30, 60))
     hold = np.zeros((len(inputs["state"]), 1))
     hold[28:62] = 1.0
     _, alarm, _, _ = history(assessment, inputs, hold=hold)
@@ -110,9 +108,7 @@ def test_inputs_that_are_not_finite_are_left_out(assessment):
 
 
 def test_a_reset_ends_the_alarm(assessment):
-    inputs = long_motion()
-    for rows in inputs.values():
-        rows[5:] = rows[5]
+    inputs = long_motion(frozen=slice(5, None))
     simulator, monitor, _ = running(assessment, inputs)
     simulator.AdvanceTo(30 * STEP_S)
     own = monitor.GetMyMutableContextFromRoot(simulator.get_mutable_context())

@@ -8,6 +8,7 @@ from drake_safety.control.policy import GaitClock, ObservationTerm, Policy, Poli
 from drake_safety.control.policy_network import PolicyNetwork
 from drake_safety.robots.robot_model import JointGains
 from drake_safety.systems.policy_controller import ACTING, HELD, PolicyController
+from gliding_task import evaluated
 
 
 class Kinematics:
@@ -39,21 +40,17 @@ def started(system, command=(0.2, 0.4, 0.0), state=None):
     return simulator, context
 
 
-def output(system, context, name):
-    return system.GetOutputPort(name).Eval(context)
-
-
 def test_a_set_point_is_that_of_the_action_until_the_next_period():
     system = controller()
     simulator, context = started(system)
     simulator.AdvanceTo(0.01)
     # Actions 1.2 and 1.4, half a radian each, of the joints b and a.
     expected = np.float32([0.7, 0.6, 0, 0])
-    np.testing.assert_allclose(output(system, context, "desired_joint_state"), expected)
+    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
     simulator.AdvanceTo(0.0199)
-    np.testing.assert_allclose(output(system, context, "desired_joint_state"), expected)
-    assert output(system, context, "status")[0] == ACTING
-    assert len(output(system, context, "action_state")) == len(system.action_names) == 10
+    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
+    assert evaluated(system, context, "status")[0] == ACTING
+    assert len(evaluated(system, context, "action_state")) == len(system.action_names) == 10
 
 
 def test_a_cloned_context_goes_on_from_its_phase():
@@ -65,12 +62,12 @@ def test_a_cloned_context_goes_on_from_its_phase():
         one.AdvanceTo(0.13)
     for name in ("desired_joint_state", "action_state"):
         np.testing.assert_array_equal(
-            output(system, context, name), output(system, other.get_context(), name)
+            evaluated(system, context, name), evaluated(system, other.get_context(), name)
         )
     _, fresh_context = started(system)
     system.set_state(fresh_context, system.state_of(context))
     np.testing.assert_array_equal(
-        output(system, fresh_context, "action_state"), output(system, context, "action_state")
+        evaluated(system, fresh_context, "action_state"), evaluated(system, context, "action_state")
     )
 
 
@@ -84,7 +81,7 @@ def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     system = controller(evaluate)
     simulator, context = started(system)
     simulator.AdvanceTo(0.01)
-    good = output(system, context, "desired_joint_state").copy()
+    good = evaluated(system, context, "desired_joint_state").copy()
     if what == "command":
         system.GetInputPort("command").FixValue(context, [np.inf, 0, 0])
     elif what == "state":
@@ -92,5 +89,5 @@ def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     else:
         broken.append(True)
     simulator.AdvanceTo(0.05)
-    np.testing.assert_array_equal(output(system, context, "desired_joint_state"), good)
-    assert output(system, context, "status")[0] == HELD
+    np.testing.assert_array_equal(evaluated(system, context, "desired_joint_state"), good)
+    assert evaluated(system, context, "status")[0] == HELD

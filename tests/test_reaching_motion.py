@@ -4,12 +4,9 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.kinematic_preview import chain_joints
-from drake_safety.control.whole_body_qp import solve_qp
-from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.reaching_sampling import PostureSampling
-from drake_safety.systems import whole_body_controller
 from reaching_loops import (
     EASY,
     NOISE,
@@ -149,33 +146,6 @@ def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
     assert not episode.is_safe
     assert episode.cause == "support_polygon"
     assert len(episode.time_s) == 1
-
-
-def fail_later(monkeypatch, error):
-    ticks = []
-
-    def fails_later(qp):
-        ticks.append(qp)
-        if len(ticks) > 30:
-            raise error
-        return solve_qp(qp)
-
-    monkeypatch.setattr(whole_body_controller, "solve_qp", fails_later)
-
-
-def test_a_controller_that_raises_is_an_error_and_no_diverged_simulation(monkeypatch):
-    fail_later(monkeypatch, RuntimeError("no memory"))
-    with pytest.raises(EpisodeError, match=r"episode 0 of .* RuntimeError: no memory"):
-        run_episode(porter(), 0, goal=EASY)
-
-
-def test_an_episode_whose_simulation_fails_keeps_its_rows_and_says_so(monkeypatch):
-    whole = easy_episode()
-    fail_later(monkeypatch, DivergenceError("the numbers ran away"))
-    episode = run_episode(porter(), 0, goal=EASY)
-    assert episode.cause == DIVERGED
-    np.testing.assert_array_equal(episode.state, whole.state[: len(episode.time_s)])
-    assert 0 < episode.time_s[-1] <= 31 * porter().scenario.control_period_s
 
 
 @pytest.fixture(scope="module")

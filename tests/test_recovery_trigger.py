@@ -3,8 +3,6 @@ import math
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, PortSwitch
 
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
@@ -110,25 +108,6 @@ def test_a_dip_between_two_looks_is_not_seen():
     bench.simulator.AdvanceTo(0.009)
     bench.set(1.0)
     assert not bench.look(5)
-
-
-def test_its_selector_drives_drakes_port_switch():
-    builder = DiagramBuilder()
-    trigger = builder.AddSystem(RecoveryTrigger(period_s=PERIOD_S))
-    switch = builder.AddSystem(PortSwitch(1))
-    builder.Connect(trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port())
-    for name, number in (("nominal", 10.0), ("recovery", 20.0)):
-        source = builder.AddSystem(ConstantVectorSource([number]))
-        builder.Connect(source.get_output_port(), switch.DeclareInputPort(name))
-    builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
-    builder.ExportOutput(switch.GetOutputPort("value"), "value")
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    context = simulator.get_mutable_context()
-    for time, probability, expected in ((0.05, 0.9, 10.0), (0.1, 0.2, 20.0), (0.15, 0.9, 20.0)):
-        diagram.GetInputPort("safety_probability").FixValue(context, [probability])
-        simulator.AdvanceTo(time)
-        assert diagram.GetOutputPort("value").Eval(context)[0] == expected
 
 
 @pytest.mark.parametrize(

@@ -20,18 +20,11 @@ from legged_robots import write_hexapod
 from shuttle_task import BOX, shuttling
 
 
-def test_rows_are_a_step_apart_from_zero_to_the_end():
-    scenario = gliding(speed_m_s=0.1)
-    episode = run_episode(scenario.make_loop())
-    np.testing.assert_allclose(episode.time_s, scenario.step_s * np.arange(21), atol=1e-12)
-    assert episode.is_safe
-    assert episode.cause == ""
-    for name in ARRAYS:
-        assert len(getattr(episode, name)) == 21
-
-
 def test_a_row_holds_what_the_loops_ports_say():
     episode = run_episode(gliding(speed_m_s=0.5).make_loop(), 3, seed=5)
+    np.testing.assert_allclose(episode.time_s, 0.04 * np.arange(21), atol=1e-12)
+    assert {len(getattr(episode, name)) for name in ARRAYS} == {21}
+    assert (episode.is_safe, episode.cause) == (True, "")
     x, v = episode.state[0]
     np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=0.0101 * abs(v))
     np.testing.assert_array_equal(episode.features[:, 0], 1 - episode.state[:, 0])
@@ -65,12 +58,6 @@ def test_a_loop_can_be_used_again_in_any_order():
     assert_identical(forward, backward[::-1])
 
 
-def test_a_longer_set_begins_with_the_shorter_one():
-    assert_identical(
-        run_episodes(gliding(), 5, num_workers=1), run_episodes(gliding(), 9, num_workers=1)[:5]
-    )
-
-
 def test_seeds_and_variations_are_kept_in_the_info():
     episodes = run_episodes(gliding(), 2, variation="actual", seed=7, num_workers=1)
     assert episodes.info.variation == "actual"
@@ -83,10 +70,10 @@ def test_seeds_and_variations_are_kept_in_the_info():
 
 def test_an_error_in_somebodys_code_is_not_a_diverged_simulation():
     with pytest.raises(
-        EpisodeError, match=r"episode \d+ of 'gliding' \(seed 3\): ValueError: op"
+        EpisodeError, match=r"episode \d+ of 'gliding' \(seed 3\): RuntimeError: op"
     ) as e:
         run_episodes(gliding(failure="bug"), 20, seed=3, num_workers=1)
-    assert isinstance(e.value.__cause__, ValueError)
+    assert isinstance(e.value.__cause__, RuntimeError)
     # And it can be reproduced by what the message says.
     index = int(re.search(r"episode (\d+)", str(e.value))[1])
     with pytest.raises(EpisodeError):
@@ -94,7 +81,7 @@ def test_an_error_in_somebodys_code_is_not_a_diverged_simulation():
 
 
 def test_an_error_in_a_worker_keeps_its_message_and_its_traceback():
-    with pytest.raises(EpisodeError, match=r"\(seed 0\): ValueError: operands") as caught:
+    with pytest.raises(EpisodeError, match=r"\(seed 0\): RuntimeError: operands") as caught:
         run_episodes(gliding(failure="bug"), 20, num_workers=2)
     assert "gliding_task.py" in str(caught.value.__cause__)
 
@@ -188,15 +175,6 @@ def test_a_finished_set_on_disk_is_read_not_simulated(tmp_path):
     )
     assert seen == [6]
     assert_identical(again, first)
-
-
-@pytest.mark.train
-def test_a_folder_of_another_set_is_refused(tmp_path):
-    run_episodes(gliding(), 3, num_workers=1, path=tmp_path)
-    with pytest.raises(ValueError, match="seed"):
-        run_episodes(gliding(), 3, seed=1, num_workers=1, path=tmp_path)
-    with pytest.raises(ValueError, match="scenario_hash"):
-        run_episodes(gliding(speed_m_s=1.0), 3, num_workers=1, path=tmp_path)
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])

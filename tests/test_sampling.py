@@ -76,17 +76,6 @@ def test_feet_at_rest_need_no_joint_rates_when_the_base_is_at_rest():
     np.testing.assert_array_equal(v, 0.0)
 
 
-def test_the_same_generator_gives_the_same_start_and_another_one_another():
-    kinematics = robot_kinematics(ROBOT_NAMES[0])
-    sampling = sampling_for(kinematics)
-    one, same, other = (
-        sampling.sample(kinematics, np.random.default_rng(seed)) for seed in (0, 0, 1)
-    )
-    np.testing.assert_array_equal(one.v, same.v)
-    np.testing.assert_array_equal(one.q, same.q)
-    assert not np.allclose(one.v, other.v)
-
-
 def test_random_throws_lie_in_their_ranges():
     push = PushSampling(offset_m=0.05)
     rng = np.random.default_rng(3)
