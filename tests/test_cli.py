@@ -31,7 +31,7 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
     command = ("train", file, "--episodes", 8, "--workers", 1)
     assert call(monkeypatch, *command, "--out", tmp_path / "a") == 2
     told = capsys.readouterr().out
-    assert "of 'gliding' (seed 0): ValueError: operands could not be broadcast" in told
+    assert "of 'gliding' (seed 0): RuntimeError: operands could not be broadcast" in told
     assert "--debug in the command line shows where" in told
     arguments = ["drake-safety", *map(str, command), "--debug", "--out", str(tmp_path / "b")]
     monkeypatch.setattr(sys, "argv", arguments)

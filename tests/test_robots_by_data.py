@@ -1,5 +1,3 @@
-"""Robots of the extra `robots`: each stands, by its robot.yaml and its scenario alone."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -38,26 +36,17 @@ def heights_standing(name, duration_s):
     return np.array(heights), loop.kinematics.standing_height, violations.counts
 
 
-def check_standing(name, duration_s):
-    heights, standing, violations = heights_standing(name, duration_s)
-    assert np.abs(heights - standing).max() < 0.02
-    assert not any(violations.values()), violations
-
-
 def test_six_quadrupeds_besides_the_packages_own_balance_by_data_alone():
     assert len(BALANCING) >= 6
     assert all(len(load_robot(name).feet) == 4 for name in BALANCING)
 
 
+@pytest.mark.parametrize("duration_s", [2.0, pytest.param(10.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", BALANCING)
-def test_it_stands_for_two_seconds(name):
-    check_standing(name, 2.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", BALANCING)
-def test_it_stands_for_ten_seconds(name):
-    check_standing(name, 10.0)
+def test_it_stands(name, duration_s):
+    heights, standing, violations = heights_standing(name, duration_s)
+    assert np.abs(heights - standing).max() < 0.02
+    assert not any(violations.values()), violations
 
 
 @pytest.mark.parametrize("name", BALANCING)

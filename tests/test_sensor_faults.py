@@ -1,5 +1,3 @@
-"""SensorFaults: faults of a vector, between what measures it and what reads it."""
-
 import re
 from pathlib import Path
 
@@ -41,17 +39,6 @@ class Bench:
 
 def true(time_s):
     return 5.0 + RATES * time_s
-
-
-def test_ports_and_feedthrough():
-    system = SensorFaults(NAMES, period_s=PERIOD_S)
-    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == [
-        "input"
-    ]
-    assert [system.get_output_port(i).get_name() for i in range(system.num_output_ports())] == [
-        "output"
-    ]
-    assert system.HasAnyDirectFeedthrough()
 
 
 @pytest.mark.parametrize(
