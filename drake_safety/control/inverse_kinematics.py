@@ -34,11 +34,8 @@ def solve_inverse_kinematics(
     and every joint stays inside its limits.
 
     Args:
-        kinematics: The robot.
-        X_WB: Base pose.
         p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
         guess: Initial joint positions, (n_j,) [rad].
-        max_iterations: Largest number of Newton steps.
 
     Returns:
         Joint positions (n_j,) [rad].
@@ -57,10 +54,8 @@ def solve_from(
     """As :func:`solve_inverse_kinematics`, and returns the contact Jacobian too.
 
     Args:
-        kinematics: The robot.
         q: Base pose and initial joint positions, (n_q,); the joints are overwritten.
         p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
-        max_iterations: Largest number of Newton steps.
 
     Returns:
         Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last iterate, at

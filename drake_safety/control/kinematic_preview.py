@@ -32,12 +32,6 @@ class KinematicPreview:
 
     These are computed by Gauss-Newton steps: one per sample, more while the hand is off the plan,
     and a few at the last sample.
-
-    Args:
-        model: Tasks and weights of the controller, with a hand.
-
-    Raises:
-        ValueError: The model has no hand.
     """
 
     def __init__(self, model: WholeBodyModel):

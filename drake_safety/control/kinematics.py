@@ -51,12 +51,7 @@ class RobotKinematics:
     method overwrites.
 
     Args:
-        robot: The robot.
         variation: Plant variation of the controller's model; only masses are used.
-
-    Raises:
-        ValueError: The robot has no feet, its base is not the only floating body, or a foot's body
-            or joint does not exist.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -136,11 +131,7 @@ class RobotKinematics:
         return self.positions_at(RigidTransform([0.0, 0.0, self.standing_height]), self.posture)
 
     def set_positions(self, q: np.ndarray) -> None:
-        """Sets the positions of the scratch Context.
-
-        Raises:
-            ValueError: The positions (n_q,) are not finite.
-        """
+        """Sets the positions (n_q,) of the scratch Context."""
         # Drake's plant aborts the process for positions that are not finite.
         if not q.dot(q) < math.inf:
             raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
@@ -202,7 +193,6 @@ class RobotKinematics:
         rows ``0 = g_b + J_bᵀ f``.
 
         Args:
-            q: Positions (n_q,).
             is_stance: Whether each contact point carries weight, (n_c,).
             J: The contact Jacobian at ``q``, if known.
 

@@ -24,13 +24,6 @@ class Mirror:
     Each joint is exchanged with its partner in robot.yaml's ``mirror``. Its sign follows from the
     joints' axes with all joints at zero, as pseudovectors are reflected to (-x, y, -z). The base's
     x-z plane is its plane of symmetry. Reflecting twice is the identity.
-
-    Args:
-        kinematics: The robot.
-
-    Raises:
-        ValueError: ``mirror`` pairs joints that are not reflections of each other, or a joint is
-            neither revolute nor prismatic.
     """
 
     def __init__(self, kinematics: RobotKinematics):
@@ -109,8 +102,6 @@ class Mirror:
         """Reflects positions and velocities through the x-z plane of a stance.
 
         Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,).
             stance_pose: ``[x, y, yaw]`` of the stance; that of ``q`` by default.
 
         Returns:
@@ -145,11 +136,7 @@ class Mirror:
         return mirrored_q, mirrored_v
 
     def hand(self, name: str) -> str:
-        """Returns the name of the mirrored reaching frame.
-
-        Raises:
-            ValueError: The hand does not exist, or no reaching frame has its joints' partners.
-        """
+        """Returns the name of the mirrored reaching frame."""
         robot, names = self._kinematics.robot, self._kinematics.joint_names
         partners = robot.mirror_partners(names)
         wanted = {partners[joint] for joint in robot.reaching_frame(name).joints}

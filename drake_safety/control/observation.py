@@ -45,11 +45,6 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     robot stands. Departure: the paper's s_k has configurations only; without velocities a pushed
     robot cannot be distinguished from one at rest, and the recall of unsafe states collapses.
 
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-
     Returns:
         (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; all NaN if a
         position or velocity is not finite.
@@ -88,11 +83,6 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
     Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
     direction of gravity and the velocities are in the base's frame.
 
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-
     Returns:
         (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; all NaN if
         a position or velocity is not finite.
@@ -105,10 +95,6 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
 
 def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Returns the base's planar velocity in its heading frame, and its yaw rate.
-
-    Args:
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
 
     Returns:
         (v_x, v_y, ω_z) (3,) [m/s, rad/s], the output of a walking robot.
@@ -128,8 +114,6 @@ def gravity_in_foot_plane(
     fitted to the contact points; along a direction in which these do not extend it is level.
 
     Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
         gravity: Gravity in the world, (3,) [m/s²].
 
     Returns:
@@ -156,10 +140,7 @@ def add_noise(
     """Adds measurement noise to a state; noise of the orientation is a small rotation.
 
     Args:
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
         unit_noise: Standard normal samples (2 n_v,) for positions and velocities.
-        noise: Standard deviations.
 
     Returns:
         Noisy positions (n_q,) and velocities (n_v,).

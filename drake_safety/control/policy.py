@@ -164,21 +164,13 @@ class Policy:
     """A network with its observation, for one robot.
 
     Args:
-        parameters: Contents of ``policy.yaml``.
         joint_names: The robot's joints, in the order of its positions.
-        robot: Name of the robot, for messages.
-        folder: Folder of the YAML file.
-
-    Raises:
-        ValueError: A value is missing, a joint or term does not exist, or the network has other
-            widths.
 
     Attributes:
         parameters: Contents of ``policy.yaml``.
         joints: The policy's joints as indices into the robot's, (n_a,).
         default_positions: Of all joints of the robot at zero action, (n_j,) [rad].
         action_scale: (n_a,) [rad].
-        sizes: Width of every term.
     """
 
     def __init__(
@@ -322,8 +314,6 @@ class Policy:
         """Returns the input of the observation terms in a state.
 
         Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,).
             command: (3,) [m/s, rad/s].
             action: The last action, (n_a,).
             phases: (n_p,) [rad].
@@ -344,7 +334,6 @@ class Policy:
         """Returns the network's input.
 
         Args:
-            seen: The present input.
             history: The last input of the network, (n_o,); NaN before the first.
         """
         present = np.concatenate(
@@ -388,12 +377,7 @@ class Policy:
 
 
 def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
-    """Returns the file of a policy's network, named relative to the folder of the YAML file.
-
-    Raises:
-        MissingExtraError: The package that has it is not installed.
-        ValueError: No network is named, or its package is unknown.
-    """
+    """Returns the file of a policy's network, named relative to the folder of the YAML file."""
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
     return model_file(parameters.network, folder, parameters.requires)
@@ -404,21 +388,12 @@ def _wrapped(phases: np.ndarray) -> np.ndarray:
 
 
 def read_policy_file(path: Path) -> PolicyParameters:
-    """Reads a ``policy.yaml``.
-
-    Raises:
-        ValueError: The file does not exist, is not YAML, or does not fit the schema.
-    """
+    """Reads a ``policy.yaml``."""
     return load_typed_file(PolicyParameters, path, f"policy file '{path}'")
 
 
 def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
-    """Loads a policy for a robot.
-
-    Raises:
-        MissingExtraError: The package that has the network is not installed.
-        ValueError: The file does not fit the schema, the robot or the network.
-    """
+    """Loads a policy for a robot."""
     return Policy(
         read_policy_file(path),
         kinematics.joint_names,

@@ -77,12 +77,7 @@ class ReachingSafeSet:
 
     Args:
         model: Tasks and weights of the controller, with the reaching hand.
-        clearance: Distances to the obstacles.
-        limits: The limits.
         is_mirrored: Whether features are mirrored.
-
-    Raises:
-        ValueError: The model has no hand, or the hand no joints.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")
@@ -167,12 +162,7 @@ class ReachingSafeSet:
         return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (4,) of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (4,) of a state, always finite."""
         del v
         return np.array(
             [
@@ -187,8 +177,6 @@ class ReachingSafeSet:
         """Returns the margins now, along the plan, and along a preview of the whole body.
 
         Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
             preview: Desired positions of the hand from now to the goal, in the stance frame,
                 (M, 3) [m].
 

@@ -115,7 +115,6 @@ def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) ->
     """Returns the group to swing first, with the other's stance line nearest the capture point.
 
     Args:
-        groups: See :func:`gait_groups`.
         feet: Foot positions on the ground, (n_feet, 2) [m].
         point: The capture point, (2,) [m].
     """
@@ -143,7 +142,6 @@ def foothold(
         yaw: Yaw of the heading frame [rad].
         hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
-        parameters: Parameters of the step.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     R_WS = np.array([[c, -s], [s, c]])

@@ -80,8 +80,6 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
     In the air it is the negative distance to the centroid of the feet.
 
     Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
         clearance_m: Height below which a contact point is on the ground [m].
     """
     p_WC = kinematics.contact_positions(q)
@@ -102,8 +100,6 @@ def fall_margin(
 
     Args:
         kinematics: The robot, whose standing height is the pendulum's length.
-        q: Positions (n_q,).
-        lowest_height_m: Lowest height of the base.
         cos_fall_tilt: Cosine of the largest angle between the base's z axis and the vertical.
     """
     # Floats are faster than short arrays.
@@ -148,10 +144,6 @@ class BalanceSafeSet:
     - ``height``: distance to the nearer limit of the height [m];
     - ``fall``: the smaller of the height over ``fall_height_m`` and the height that a rigid
       pendulum of the standing height loses before ``fall_tilt_rad`` [m].
-
-    Args:
-        kinematics: The robot.
-        limits: The limits.
     """
 
     names = ("support_polygon", "height", "fall")
@@ -178,12 +170,7 @@ class BalanceSafeSet:
         self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (3,) [m] of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (3,) [m] of a state, always finite."""
         del v
         kinematics, limits = self.kinematics, self.limits
         height, (lowest, highest) = float(q[6]), limits.height_m
@@ -203,8 +190,6 @@ class BalanceSafeSet:
         number of feet.
 
         Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
             preview: Desired base positions from now to the goal, in the stance frame, (M, 3)
                 [m].
 

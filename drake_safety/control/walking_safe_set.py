@@ -58,13 +58,6 @@ class WalkingSafeSet:
     - ``joint_limits``: distance of the joint nearest to a stop, more ``stop_rad`` [rad];
     - ``fall``: the smaller of the height over the fallen height [m] and the tilt left until
       ``fall_tilt_rad``, times the standing height [m].
-
-    Args:
-        kinematics: The robot.
-        limits: The limits.
-
-    Raises:
-        ValueError: A listed body does not exist.
     """
 
     names = ("tilt", "height", "clearance", "joint_limits", "fall")
@@ -130,12 +123,7 @@ class WalkingSafeSet:
         )
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (5,) of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (5,) of a state, always finite."""
         del v
         tilt, height = _tilt(q), float(q[6])
         fallen = min(
@@ -156,8 +144,6 @@ class WalkingSafeSet:
         """Returns the margins now, the coming commands, the tracking error and the capture point.
 
         Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
             preview: Commands from now on, (M, 3) [m/s, rad/s].
 
         Returns:

@@ -94,11 +94,7 @@ class WholeBodyModel:
     """Frames, gains and limits of a robot's whole-body program.
 
     Args:
-        kinematics: The controller's model of the robot.
         hand: Name of the reaching frame; None omits the reaching task.
-
-    Raises:
-        ValueError: The hand does not exist.
     """
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
@@ -163,7 +159,6 @@ class WholeBodyModel:
         orientations of the standing posture with the yaw of the stance, and the hand is at rest.
 
         Args:
-            q: Positions (n_q,).
             posture: Joint positions (n_j,) [rad]; the robot's standing posture by default.
         """
         kinematics = self.kinematics
@@ -186,11 +181,7 @@ class WholeBodyModel:
         return reference
 
     def check_reference(self, reference: WholeBodyReference) -> None:
-        """Checks a reference.
-
-        Raises:
-            ValueError: A part is missing, not finite, or of a wrong size.
-        """
+        """Checks that a reference is complete and finite, and of the right sizes."""
         who = f"robot '{self.kinematics.robot.name}': the whole-body reference"
         for name, entries in (
             ("posture", self.kinematics.joint_names),
@@ -210,11 +201,7 @@ class WholeBodyModel:
             raise ValueError(f"{who}'s posture must be finite; got {reference.posture}")
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
-        """Returns the reaching point in the world, (3,) [m].
-
-        Raises:
-            ValueError: The model has no hand.
-        """
+        """Returns the reaching point in the world, (3,) [m]."""
         kinematics = self.kinematics
         if self.hand is None:
             raise ValueError(

@@ -101,12 +101,6 @@ def build_qp(
 ) -> WholeBodyQP:
     """Builds the quadratic program at one instant.
 
-    Args:
-        model: The model.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-        reference: References of the tasks.
-
     Raises:
         NotFiniteError: A state or a point is not finite or implausibly large.
     """
@@ -211,12 +205,7 @@ def _add_contacts(
 def task_errors(
     model: WholeBodyModel, reference: WholeBodyReference
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest.
-
-    Args:
-        model: The model, at the positions of its scratch Context.
-        reference: References of the tasks.
-    """
+    """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest."""
     kinematics = model.kinematics
     plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
     kv = JacobianWrtVariable.kV
