@@ -62,14 +62,8 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
 
     Args:
-        url: The URL or path.
-        folder: The folder.
         requires: Requirement by which pip installs the package without its dependencies; empty for
             packages of an extra.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-        ValueError: The package is unknown.
     """
     parts = urlparse(url)
     if parts.scheme != "package":

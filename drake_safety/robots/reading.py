@@ -24,7 +24,6 @@ def reading(
     """Context manager in which a file is read: errors become `ValueError` with its name.
 
     Args:
-        path: The file, or the folder of a log.
         what: What the file is, such as "log"; it precedes the name.
         errors: Errors that mean that the file is wrong. Readers of foreign formats raise any.
 
@@ -83,17 +82,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """Parses a YAML document of plain values.
-
-    Args:
-        text: The document.
-        who: Beginning of error messages.
-        loader: A loader for further tags.
-
-    Raises:
-        ValueError: It is not YAML, is nested too deeply, contains itself, or a few aliases stand
-            for more values than a description of a robot or task can have.
-    """
+    """Parses a YAML document of plain values; deep nesting and many aliases are refused."""
     try:
         value = yaml.load(text, Loader=loader)
         _num_values(value, {})

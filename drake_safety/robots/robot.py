@@ -167,18 +167,10 @@ def add_robot(
 
     Args:
         plant: A plant before ``Finalize``.
-        robot: The robot.
-        variation: Differences from the published robot; none by default.
         scene_graph: Assigns the feet's friction here; None keeps the model file's friction.
         servos: Whether the joints get robot.yaml's position servos. Torque control needs False: in
             Drake 1.51 an actuator with gains whose desired state is not connected ignores its
             torque input.
-
-    Returns:
-        The model instance.
-
-    Raises:
-        ValueError: A body or joint in robot.yaml does not exist, or a pattern is ambiguous.
     """
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
@@ -302,11 +294,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
-    """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none.
-
-    Raises:
-        ValueError: A posture pattern matches no joint, or two match one.
-    """
+    """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
     for pattern in robot.posture:
         if not any(re.fullmatch(pattern, name) for name in names):
@@ -327,15 +315,10 @@ def actuation_matrix(
     servos: friction is modelled by a servo, which is inactive otherwise.
 
     Args:
-        plant: The finalised plant.
-        robot: The robot.
         joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
 
     Returns:
         (n_u, n_j), in the order of ``plant.get_actuation_input_port(instance)``.
-
-    Raises:
-        ValueError: An actuated joint is not among the names.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
@@ -351,17 +334,7 @@ def actuation_matrix(
 def apply_masses(
     plant: MultibodyPlant, context: Context, robot: RobotModel, variation: PlantVariation
 ) -> None:
-    """Sets a robot's masses in a plant's Context to those of a variation, with its payload.
-
-    Args:
-        plant: The finalised plant.
-        context: The plant's Context, whose parameters change.
-        robot: The robot.
-        variation: Differences from the published robot.
-
-    Raises:
-        ValueError: The payload's body does not exist.
-    """
+    """Sets a robot's masses in a plant's Context to those of a variation, with its payload."""
     instance = plant.GetModelInstanceByName(robot.name)
     bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
     for body in bodies:

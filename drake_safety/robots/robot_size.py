@@ -29,9 +29,6 @@ class RobotSize:
     def factors(self, reference: "RobotSize") -> dict[str, float]:
         """Returns scale factors by the name of the quantity.
 
-        Args:
-            reference: The robot that the parameters were chosen for.
-
         Returns:
             ``height``, ``length``, ``width`` for lengths along z, x and y; ``duration``;
             ``speed_x``, ``speed_y``, ``speed_z``, ``rate`` for linear and angular speeds; ``mass``;
@@ -67,16 +64,11 @@ def scaled_defaults(
     """Scales the defaults of nested dataclasses.
 
     Args:
-        defaults: The dataclass.
         quantities: Quantity of each scaled field: a name, a list of names for the entries of a
             list, or such a mapping for a dataclass.
-        factors: Scale factors by quantity.
 
     Returns:
         The scaled fields, nested alike.
-
-    Raises:
-        ValueError: The dataclass has no such field.
     """
     known = [entry.name for entry in fields(defaults)]
     scaled: dict[str, Any] = {}

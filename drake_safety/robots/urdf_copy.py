@@ -25,8 +25,6 @@ class UrdfCopy:
     """An editable copy of a URDF file.
 
     Attributes:
-        source: The original file.
-        root: The root element, which is edited.
         notes: Descriptions of the changes, one sentence each.
         left_out: Notes about visuals that were removed.
         lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each;
@@ -116,11 +114,7 @@ class UrdfCopy:
                     visual.remove(material)
 
     def convert_visual_meshes(self) -> None:
-        """Replaces visual meshes that Drake does not render by glTF files in the user's cache.
-
-        Raises:
-            ValueError: A mesh does not exist or cannot be converted.
-        """
+        """Replaces visual meshes that Drake does not render by glTF files in the user's cache."""
         folder = str(self.source.parent)
 
         def shown(url: str, rgba: str) -> str:
@@ -156,9 +150,7 @@ class UrdfCopy:
         """Replaces all collision shapes of a link by spheres.
 
         Args:
-            link_name: The link.
             points: Centres in the link's frame, (n, 3) [m].
-            radius_m: Radius of each.
         """
         link = self.link(link_name)
         _remove(link, "collision")
@@ -222,11 +214,7 @@ class UrdfCopy:
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF as an editable copy.
-
-    Raises:
-        ValueError: The file does not exist, is not a URDF, or has a negative mass.
-    """
+    """Reads a URDF as an editable copy."""
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")
