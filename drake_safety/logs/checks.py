@@ -32,11 +32,7 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
     """Checks that time is finite, increasing, in plausible units and without gaps.
 
     Args:
-        channel: A table or topic.
         max_gap_s: Largest time between two rows [s].
-
-    Raises:
-        ValueError: A check failed; the message names the row.
     """
     check_clock(channel)
     for row in rows_after_gaps(channel, max_gap_s).tolist():
@@ -50,7 +46,6 @@ def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
     """Returns the rows before which a gap is longer than a limit.
 
     Args:
-        channel: A table or topic.
         max_gap_s: Largest time between two rows [s].
     """
     # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
@@ -58,14 +53,7 @@ def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
 
 
 def check_clock(channel: Channel) -> None:
-    """Checks that time is finite, increasing and in plausible units.
-
-    Args:
-        channel: A table or topic.
-
-    Raises:
-        ValueError: A check failed; the message names the row.
-    """
+    """Checks that time is finite, increasing and in plausible units."""
     time = channel.time
     if len(time) < MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
@@ -94,11 +82,7 @@ def check_clock(channel: Channel) -> None:
 
 
 def check_finite(channel: Channel) -> None:
-    """Checks that all values exist, are finite and of a size that quantities in SI units have.
-
-    Raises:
-        ValueError: A value is not; the message names the first row and the column.
-    """
+    """Checks that all values exist, are finite and of a size that quantities in SI units have."""
     bad = bad_values(channel)
     rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
     if rows:
@@ -116,15 +100,7 @@ def bad_values(channel: Channel) -> dict[str, np.ndarray]:
 
 
 def check_norms(channel: Channel, names: list[str]) -> None:
-    """Checks that quaternions have a norm of 1.
-
-    Args:
-        channel: Channel of the quaternion.
-        names: Its four columns.
-
-    Raises:
-        ValueError: A norm differs; the message names the first row.
-    """
+    """Checks that quaternions have a norm of 1."""
     norms = np.linalg.norm(channel.table(names), axis=1)
     is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
     if is_bad.any():
@@ -147,13 +123,7 @@ def check_first_row(
     joints beyond their stops. The error suggests changes of the map that pass the check.
 
     Args:
-        kinematics: The robot.
-        log_map: The map.
         positions: Function that returns the first row's positions (n_q,) for a map.
-        where: Location of the first row.
-
-    Raises:
-        ValueError: The check failed; the message names the reason and plausible maps.
     """
     wrong = _implausible(kinematics, positions(log_map))
     if not wrong:
@@ -188,13 +158,7 @@ def check_stillness(
     but the feet seem to slip twice as far as the base moves.
 
     Args:
-        kinematics: The robot.
-        log_map: The map.
         positions: Function that returns positions (N, n_q) at some rows for a map.
-        where: Location of the rows.
-
-    Raises:
-        ValueError: The check failed; the message has the slip in either order.
     """
     other = copy.deepcopy(log_map)
     (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
@@ -242,13 +206,7 @@ def check_limits(
     """Checks that joints are not far beyond their stops.
 
     Args:
-        kinematics: The robot.
         joints: Joint positions at the channel's rows, (N, n_j) [rad].
-        channel: Channel of the joints.
-        names: The joints' columns.
-
-    Raises:
-        ValueError: A joint is; the message names the first row and the column.
     """
     excess = _beyond_limits(kinematics, joints)
     is_far = excess > _FAR_RAD
@@ -270,12 +228,6 @@ def check_rates(
     Args:
         logged: Velocities in SI units, (N, n).
         derived: Derivatives of the logged positions, (M, n).
-        channel: Channel of the velocities.
-        names: Their columns.
-        unit: Their unit in the map.
-
-    Raises:
-        ValueError: The check failed; the message names the column.
     """
     with np.errstate(over="ignore"):  # An infinite size is implausible too.
         size = np.sqrt(np.mean(logged**2, axis=0))
@@ -297,14 +249,8 @@ def check_desired_output(
     """Checks that the desired output is near the robot.
 
     Args:
-        kinematics: The robot.
         desired: z* of the first row, (3,) [m].
         base: Position of the base in the first row, (3,) [m].
-        where: Location of the row.
-        unit: The unit of z* in the map.
-
-    Raises:
-        ValueError: The check failed; the message has the distance.
     """
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:

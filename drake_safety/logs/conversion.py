@@ -39,8 +39,6 @@ def base_velocities(
     """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s].
 
     Args:
-        velocity: Its entry in the map.
-        channels: The log.
         rotations: Orientation of the base at the velocity topic's times.
     """
     units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
@@ -53,7 +51,6 @@ def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> R
 
     Args:
         time_s: Times of the rotations, increasing, (N,) [s].
-        rotations: The rotations.
         at_s: Interpolation times, (M,) [s], clipped to the range of ``time_s``.
     """
     if len(time_s) == 1:
@@ -90,7 +87,6 @@ def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
 
     Args:
         time_s: Times of at least three rotations, increasing, (N,) [s].
-        rotations: The rotations.
     """
     step_s = np.diff(time_s)[:, None]
     between = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / step_s

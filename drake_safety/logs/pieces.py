@@ -18,15 +18,11 @@ def cut_channels(
     """Cuts tables or topics where a value is missing or a gap in time is too long.
 
     Args:
-        channels: The channels by topic.
         max_gap_s: Largest time between two rows [s].
 
     Returns:
         The channels of each piece in order of time, whose common time is covered by all without a
         cut, and the reasons of the cuts.
-
-    Raises:
-        ValueError: The time of a channel is not finite, does not increase or has another unit.
     """
     pieces: list[dict[str, Channel]] = [{}]
     reasons: list[str] = []

@@ -41,8 +41,6 @@ class RobotLog:
     """Motion of a robot.
 
     Attributes:
-        path: The log.
-        robot: Name of the robot.
         time_s: Time since the first row, increasing, (N,) [s].
         q: Positions: base quaternion (w, x, y, z), base position, joints, (N, n_q).
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
@@ -83,9 +81,7 @@ class LogPieces:
     """What is left of a log that was cut at missing values and gaps.
 
     Attributes:
-        pieces: The pieces, in order of time.
         duration_s: Duration of the whole log [s].
-        cuts: The reasons of the cuts.
     """
 
     pieces: list[RobotLog]
@@ -109,15 +105,6 @@ def read_pieces(
 
     The first piece is checked as a log is, since these checks are about the map: a later one may
     begin in mid-motion, or after a fall.
-
-    Args:
-        path: See :func:`read_log`.
-        log_map: See :func:`read_log`.
-        robot: See :func:`read_log`.
-        step_s: See :func:`read_log`.
-
-    Raises:
-        ValueError: See :func:`read_log`; or nothing is left.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     found, cuts = cut_channels(channels, log_map.max_gap_s)
@@ -166,12 +153,8 @@ def read_log(
     Args:
         path: A ``.csv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a ROS 2 bag.
         log_map: The map of its columns, or the path of a ``columns.yaml``.
-        robot: The robot.
         step_s: Time between two rows of the result [s]; by default the times are those of the
             base's positions.
-
-    Raises:
-        ValueError: A value is missing or implausible; the message names file, row and column.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     for channel in channels.values():
