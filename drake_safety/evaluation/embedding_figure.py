@@ -43,7 +43,6 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
     It shows the first map of an ensemble.
 
     Args:
-        assessment: A fitted assessment.
         episodes: Episodes whose segments are drawn, preferably not the training episodes.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
@@ -117,14 +116,9 @@ def draw_safety(
     """Draws cells coloured by safety, with their numbers of training segments.
 
     Args:
-        fig: The figure.
-        axes: Its axes.
-        grid: The grid.
         safe: Value of each cell, (R*R,).
         is_empty: Whether each cell holds no belief, (R*R,).
         count: Number of segments in each cell, (R*R,).
-        label: Label of the colour bar.
-        most: Upper end of the colour scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize

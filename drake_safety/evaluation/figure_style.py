@@ -105,13 +105,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
-    """Writes a threshold beside its line, outside the axes.
-
-    Args:
-        axes: The axes, whose y axis has the threshold's quantity.
-        threshold: The threshold.
-        colour: Colour of the text.
-    """
+    """Writes a threshold beside its line, outside the axes."""
     axes.annotate(
         f"threshold {threshold:.3g}",
         (1.0, threshold),
@@ -128,7 +122,6 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
     """Writes a figure as PNG, at twice the usual resolution, and as SVG.
 
     Args:
-        fig: The figure.
         path: Path of the files; its suffix is replaced.
 
     Returns:

@@ -22,8 +22,6 @@ class Estimate:
 
     Attributes:
         value: The estimate; NaN without samples.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
         n: Number of independent samples: episodes or throws, never segments.
     """
 
@@ -52,13 +50,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
-    """Bootstrap intervals: percentiles over resamples of the independent samples.
-
-    Attributes:
-        confidence: Confidence of the interval.
-        num_resamples: Number of resamples.
-        seed: Seed of the resamples.
-    """
+    """Bootstrap intervals: percentiles over resamples of the independent samples."""
 
     confidence: float = 0.95
     num_resamples: int = 1000
@@ -99,11 +91,7 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
-
-    Raises:
-        ValueError: `count` is not in 0..n.
-    """
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
     if not 0 <= count <= n:
         raise ValueError(f"proportion: count is {count}, expected 0..{n}")
     from scipy.stats import binomtest
@@ -118,9 +106,6 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values are allowed: a fall that never happens is later than any other.
-
-    Raises:
-        ValueError: A value is NaN.
     """
     values = np.sort(np.asarray(values, dtype=float))
     if np.isnan(values).any():
@@ -229,13 +214,9 @@ def segment_estimates(
         segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
         unsafe_score: Unsafe score of each, (N,), in [0, 1].
         threshold: Score above which a segment is classified unsafe.
-        bootstrap: Settings of the intervals.
 
     Returns:
         `auc`, `safe_recall`, `unsafe_recall` and `brier`.
-
-    Raises:
-        ValueError: The number of scores differs, or one is outside [0, 1].
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode
@@ -258,9 +239,6 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     """The threshold of scores (N,) with the best balanced accuracy, the mean of both recalls.
 
     It is midway between two scores; of equally good ones, it is the middle one.
-
-    Raises:
-        ValueError: One of the classes is missing, or no score is finite.
     """
     score, label = _checked("threshold_at", unsafe_score, is_unsafe)
     num_unsafe = int(label.sum())

@@ -36,11 +36,9 @@ def path_figure(
     As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble.
 
     Args:
-        assessment: The fitted assessment of the motion.
         time_s: Times [s], (N,).
         points: Ψ(x), (N, 2).
         probability: Probability, (N,).
-        threshold: Threshold of triggers.
         events: Times of named events [s]; they are marked and numbered in both panels.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_

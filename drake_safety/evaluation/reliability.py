@@ -30,7 +30,6 @@ def verdict_shares(
     """Shares of the verdicts of stored thresholds on fresh episodes.
 
     Args:
-        calibration: The calibration.
         unsafe_score: 1 - probability of each episode, (N,), for the kind of the calibration.
         is_unsafe: Whether each ended unsafely, (N,).
 
@@ -84,10 +83,6 @@ def reliability(
         is_unsafe: Whether the row's episode ended unsafely, (N,).
         episode: Index of each row's episode, (N,).
         num_bins: Number of bins; fewer if rows share probabilities.
-        bootstrap: Settings of the intervals, which are over episodes.
-
-    Raises:
-        ValueError: There is no row, or a probability outside [0, 1].
     """
     p = np.asarray(unsafe_probability, dtype=float)
     p = np.where(np.isnan(p), 1.0, p)
@@ -120,11 +115,7 @@ def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
 
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
-    """Plots the observed share of unsafe ends over the predicted probability.
-
-    Args:
-        curves: Reliability by name.
-    """
+    """Plots the observed share of unsafe ends over the predicted probability."""
     with drawing_style():
         fig = new_figure(5.4, 6.0)
         axes = fig.subplots()

@@ -29,12 +29,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     `adapt`. Recordings are linked, all else is inside the page.
 
     Args:
-        folder: The folder.
         episodes: Folder of the training episodes, for the command of the training.
-        versions: Versions of the packages that write the page.
-
-    Raises:
-        ValueError: The folder holds neither an assessment nor results, or a damaged one.
     """
     require_extra("report", "report")
     from jinja2 import Environment, StrictUndefined

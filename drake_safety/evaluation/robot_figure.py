@@ -50,11 +50,7 @@ _VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
 
 
 def robot_figure(loop: LeggedLoop) -> Figure:
-    """Draws a robot in its standing posture: as it looks, and as it collides.
-
-    Args:
-        loop: A closed loop with a legged robot.
-    """
+    """Draws a robot in its standing posture: as it looks, and as it collides."""
     context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
     positions = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
@@ -83,10 +79,6 @@ def robot_figure(loop: LeggedLoop) -> Figure:
 
 def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
     """Shows a robot's collision shapes in place of its visuals, coloured by kind.
-
-    Args:
-        loop: A closed loop with a legged robot.
-        context: Its root Context, which changes.
 
     Returns:
         Number of shapes by kind.

@@ -136,8 +136,6 @@ class JudgedShift:
     """The verdicts of all methods on the motions of a shift.
 
     Attributes:
-        motions: The motions.
-        assessment: Γ, with the monitor's innovation.
         verdicts: By method, on all rows of all motions; "gamma" is Γ.
     """
 
@@ -271,10 +269,6 @@ def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Est
     """False alarms of the monitor per hour, on nominal motions one after another.
 
     Motions that end unsafely are left out; the charts begin anew after an alarm.
-
-    Args:
-        motions: Nominal motions.
-        assessment: Γ, with the monitor's innovation.
     """
     innovation = assessment.innovation_
     x = [
@@ -307,9 +301,7 @@ def evaluate_shifts(
     Args:
         sets: By shift, its kind and its motions.
         judges: Methods by name; "gamma" is Γ.
-        assessment: Γ, with the monitor's innovation.
         progress: Called with a stage, the number done and the number wanted.
-        more: Other estimates of a shift of a kind.
     """
     found: dict[str, Estimate] = {}
     for i, (name, (kind, motions)) in enumerate(sets.items()):

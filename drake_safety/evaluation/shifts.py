@@ -39,8 +39,6 @@ class PlantShift:
 
     Attributes:
         kind: "plant" or "sensor".
-        variation: The plant, with its sensors.
-        options: Options of the diagram.
     """
 
     kind: str
@@ -52,7 +50,6 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     """Shifts of plant and sensors, each from the nominal plant, and the scenario's variations.
 
     Args:
-        scenario: The scenario.
         loop: Its diagram; that of a robot with legs has shifts besides the scenario's variations.
 
     Returns:

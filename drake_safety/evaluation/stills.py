@@ -109,9 +109,6 @@ class StillCamera:
 
         Returns:
             RGB, (height, width, 3), uint8.
-
-        Raises:
-            ValueError: The positions are not finite.
         """
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
@@ -175,9 +172,6 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 
     Returns:
         Positions, (N, n_q).
-
-    Raises:
-        ValueError: A model instance with positions is missing, or another is given.
     """
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))

@@ -22,13 +22,7 @@ PAPER_THRESHOLD = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class TriggerRule:
-    """A scorer with a threshold that triggers recovery.
-
-    Attributes:
-        name: Its key in tables.
-        scorer: The scorer.
-        threshold: Γ_thre.
-    """
+    """A scorer with a threshold that triggers recovery."""
 
     name: str
     scorer: Scorer
@@ -41,13 +35,7 @@ def trigger_rules(
     *,
     threshold: float,
 ) -> list[TriggerRule]:
-    """The scenario's rule, named "sharpened", and the paper's.
-
-    Args:
-        sharpened: An assessment in the sharpened mode.
-        paper: An assessment in the paper's mode.
-        threshold: The scenario's Γ_thre.
-    """
+    """The scenario's rule, named "sharpened", and the paper's."""
     own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
@@ -59,8 +47,6 @@ def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -
     """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
 
     Args:
-        log: The log.
-        scorer: The scorer.
         persistence_s: Where nothing is known, the highest probability within this time counts [s];
             before it has passed, 1.
     """
@@ -87,13 +73,7 @@ def evaluate_throws(
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     Args:
-        scenario: The scenario.
-        rules: The rules.
-        num_throws: Number of throws.
-        seed: Their seed.
         persistence_s: Time for which "don't know" must have lasted to trigger [s].
-        variation: Variation of the plant.
-        num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
 
     Returns:

@@ -67,22 +67,13 @@ def timeline_figure(
     Args:
         time_s: Instants [s], (N,).
         probability: Held until the next instant, (N,).
-        threshold: Threshold of triggers or alarms.
-        throws: Balls, marked at the time of impact.
-        pushes: Pushes, marked for their duration.
         trigger_times_s: Times of triggers or alarms [s].
-        trigger_label: Label of these.
         leave_time_s: Time at which the robot leaves the safe set [s]; infinite for never.
         recovery_intervals_s: (start, end) of each recovery [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
-        constraint_names: Names of the columns of `margins`.
         angular_constraints: Constraints whose margins are angles.
-
-    Raises:
-        ValueError: Arrays have different lengths, the number of names is not that of margins, or
-            a still is outside the time range.
     """
     time_s, probability = (np.asarray(one, dtype=float) for one in (time_s, probability))
     for name, values in (("probability", probability), ("belief", belief), ("margins", margins)):
