@@ -49,16 +49,10 @@ class LivePanel:
     The session runs in one thread and the page in another. Each of them replaces whole values,
     which needs no lock; only a click is taken by the one and made by the other.
 
-    Args:
-        title: Title of the page.
-        threshold: Probability at which the threshold line is drawn.
-
     Attributes:
-        status: The text shown.
         probability: The probability; NaN before the first.
         belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
-        sliders: Range of each slider by its name.
         is_stopped: Whether the session has ended.
     """
 

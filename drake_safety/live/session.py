@@ -57,16 +57,6 @@ class LiveSession(ABC):
 
     Args:
         loop: A closed loop built with this Meshcat and with an assessment.
-        meshcat: The Meshcat server.
-        threshold: Threshold of the probability.
-        seed: Seed of starts, noise and pushes.
-
-    Raises:
-        ValueError: The loop was built without an assessment, or lacks a port of the assessor.
-
-    Attributes:
-        pace: Simulated and real time so far.
-        panel: What a page shows, and its controls.
     """
 
     START = "Stand up again"
@@ -115,11 +105,7 @@ class LiveSession(ABC):
         """Shows what the robot does."""
 
     def tick(self) -> bool:
-        """Reacts to the controls, advances by one tick, and shows belief and verdict.
-
-        Returns:
-            Whether anything was simulated.
-        """
+        """Reacts to the controls, advances by one tick, and shows belief and verdict."""
         if self.panel.take_click(self.START) or (self.STARTS_AGAIN and self._is_over):
             self._start()
         self._react()
