@@ -45,11 +45,7 @@ def solve_inverse_kinematics(
 
 
 def solve_from(
-    kinematics: RobotKinematics,
-    q: np.ndarray,
-    p_WC: np.ndarray,
-    *,
-    max_iterations: int = 20,
+    kinematics: RobotKinematics, q: np.ndarray, p_WC: np.ndarray, *, max_iterations: int = 20
 ) -> tuple[np.ndarray, np.ndarray]:
     """As :func:`solve_inverse_kinematics`, and returns the contact Jacobian too.
 

@@ -241,16 +241,10 @@ def yaw_of(R_WB: RotationMatrix) -> float:
 
 
 def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
-    """Fits the planar pose that maps the nominal contact points to the given ones.
+    """The pose ``[x, y, yaw]`` of the stance frame S at contact points (n_c, 3) [m] in the world.
 
-    Least squares in closed form (planar Procrustes).
-
-    Args:
-        p_WC: Contact points in the world, (n_c, 3) [m].
-        nominal_contacts: The standing posture's points relative to their centroid, (n_c, 2) [m].
-
-    Returns:
-        ``[x, y, yaw]`` of the stance frame S in the world (3,).
+    The least-squares fit of the standing posture's points, ``nominal_contacts`` (n_c, 2) relative
+    to their centroid, in closed form (planar Procrustes).
     """
     # Floats are several times faster than arrays for a few points.
     points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()

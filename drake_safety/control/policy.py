@@ -9,11 +9,7 @@ from typing import TypeVar
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    NUM_BASE_VELOCITIES,
-    RobotKinematics,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import (
@@ -311,13 +307,7 @@ class Policy:
         action: np.ndarray,
         phases: np.ndarray,
     ) -> PolicyInput:
-        """Returns the input of the observation terms in a state.
-
-        Args:
-            command: (3,) [m/s, rad/s].
-            action: The last action, (n_a,).
-            phases: (n_p,) [rad].
-        """
+        """The input of the terms, with a command (3,) [m/s, rad/s] and phases (n_p,) [rad]."""
         joints = q[NUM_BASE_POSITIONS:] - self.default_positions
         return PolicyInput(
             R_WB=RotationMatrix(quaternion_of(q)).matrix(),
@@ -331,11 +321,7 @@ class Policy:
         )
 
     def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
-        """Returns the network's input.
-
-        Args:
-            history: The last input of the network, (n_o,); NaN before the first.
-        """
+        """The network's input; ``history`` is its last one, (n_o,), NaN before the first."""
         present = np.concatenate(
             [
                 np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)

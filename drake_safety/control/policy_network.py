@@ -50,9 +50,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
 class PolicyNetwork:
     """A network that maps an observation (n_o,) to an action (n_a,).
 
-    Args:
-        evaluate: Maps a batch (1, n_o) of float32 to (1, n_a).
-        widths: n_o and n_a; None where the file does not say.
+    ``evaluate`` takes a batch (1, n_o) of float32; widths that the file does not say are None.
     """
 
     def __init__(

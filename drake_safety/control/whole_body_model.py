@@ -91,11 +91,7 @@ class StandingFoot:
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of a robot's whole-body program.
-
-    Args:
-        hand: Name of the reaching frame; None omits the reaching task.
-    """
+    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand."""
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
         robot, plant = kinematics.robot, kinematics.plant
@@ -153,13 +149,10 @@ class WholeBodyModel:
         return self._stances[key]
 
     def reference(self, q: np.ndarray, *, posture: np.ndarray | None = None) -> WholeBodyReference:
-        """Returns the reference for standing on the feet of ``q``.
+        """The reference for standing on the feet of ``q`` in a posture (n_j,) [rad].
 
         The centre of mass is over the stance at its height in ``q``, the bodies have the
         orientations of the standing posture with the yaw of the stance, and the hand is at rest.
-
-        Args:
-            posture: Joint positions (n_j,) [rad]; the robot's standing posture by default.
         """
         kinematics = self.kinematics
         x, y, yaw = kinematics.stance_pose(q)

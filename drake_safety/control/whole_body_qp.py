@@ -99,11 +99,7 @@ class _TaskRows:
 def build_qp(
     model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
 ) -> WholeBodyQP:
-    """Builds the quadratic program at one instant.
-
-    Raises:
-        NotFiniteError: A state or a point is not finite or implausibly large.
-    """
+    """Builds the quadratic program at one instant, or raises a `NotFiniteError`."""
     _check_size(model, "the state", q.dot(q) + v.dot(v))
     # Drake's plant aborts the process for a zero quaternion, as for a state that is not finite.
     _check_size(model, "the inverse of the quaternion", 1.0 / max(q[:4].dot(q[:4]), _TINY))
