@@ -57,10 +57,9 @@ def _is_transparent(materials: Path) -> bool:
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:
-    """Returns a mesh that Drake renders: the file itself, or a glTF file in the cache.
+    """The file itself if Drake renders it, or else a glTF file in the cache.
 
-    Args:
-        rgba: Colour of a mesh without materials, "r g b a".
+    ``rgba`` ("r g b a") colours a mesh without materials.
     """
     if is_shown(path):
         return path

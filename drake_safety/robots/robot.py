@@ -7,13 +7,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    ProximityProperties,
-    RoleAssign,
-    SceneGraph,
-    Sphere,
-)
+from pydrake.geometry import AddContactMaterial, ProximityProperties, RoleAssign, SceneGraph, Sphere
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     JointActuator,
@@ -273,9 +267,8 @@ def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> N
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     """Checks that every joint of legs and arms has a motor.
 
-    Raises:
-        ValueError: A joint has no motor. Drake adds one for a transmission with an effort limit in
-            the model file, and :func:`add_robot` for a joint in ``effort_limits``.
+    Drake adds one for a transmission with an effort limit in the model file, and :func:`add_robot`
+    for a joint in ``effort_limits``.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     driven = {
@@ -309,16 +302,10 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
 def actuation_matrix(
     plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
 ) -> np.ndarray:
-    """Returns the map from joint values to the robot's actuators; friction actuators get zero.
+    """The map (n_u, n_j) from joint values to the robot's actuators; friction actuators get zero.
 
     A plant with dry joint friction needs a connected desired state, zero for a robot without
     servos: friction is modelled by a servo, which is inactive otherwise.
-
-    Args:
-        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
-
-    Returns:
-        (n_u, n_j), in the order of ``plant.get_actuation_input_port(instance)``.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]

@@ -30,14 +30,7 @@ _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
 
 
 def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
-    """Adds a robot's bodies, joints and shapes to a plant.
-
-    Args:
-        plant: A plant before ``Finalize``. Without a scene graph, geometry is left out.
-
-    Returns:
-        The model instance, named as the robot.
-    """
+    """Adds a robot's bodies, joints and shapes; without a scene graph, geometry is left out."""
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     urdf = None

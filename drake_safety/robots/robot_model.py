@@ -378,11 +378,7 @@ def _validate(value: Any) -> None:
 
 
 def load_robot_file(path: str | Path) -> RobotModel:
-    """Reads a ``robot.yaml``.
-
-    Returns:
-        The robot, its ``source_dir`` set to the file's folder.
-    """
+    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``."""
     path = Path(path)
     robot = load_typed_file(RobotModel, path, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)

@@ -281,10 +281,7 @@ def _effort_lines(found: NewRobot, names: list[str], unit: float) -> list[str]:
             found.asked.append(f"the largest torque of joint '{name}' [N·m]")
     if not lines:
         return []
-    return [
-        "effort_limits:  # where the URDF has no motor, or none with a limit [N·m]",
-        *lines,
-    ]
+    return ["effort_limits:  # where the URDF has no motor, or none with a limit [N·m]", *lines]
 
 
 def _mirror(names: list[str]) -> dict[str, str]:

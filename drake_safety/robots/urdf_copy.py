@@ -88,13 +88,9 @@ class UrdfCopy:
             _remove(link, "collision")
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
-        """Replaces visual meshes.
+        """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
 
         The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
-
-        Args:
-            shown: Function of a mesh's URL in the URDF and its colour ("r g b a" or "") that
-                returns the new URL, or "" to remove the visual.
         """
         colours = {one.get("name", ""): one for one in self.root.findall("material")}
         for link in self.root.findall("link"):
@@ -147,11 +143,7 @@ class UrdfCopy:
             )
 
     def replace_collisions(self, link_name: str, points: np.ndarray, radius_m: float) -> None:
-        """Replaces all collision shapes of a link by spheres.
-
-        Args:
-            points: Centres in the link's frame, (n, 3) [m].
-        """
+        """Replaces all collision shapes of a link by spheres at points (n, 3) [m] in its frame."""
         link = self.link(link_name)
         _remove(link, "collision")
         for index, point in enumerate(points):

@@ -45,8 +45,7 @@ class Limb:
 class Survey:
     """A URDF in a plant, with the base at the world's origin and all joints at or near zero.
 
-    Args:
-        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each.
+    ``lost_meshes`` has the vertices of removed collision meshes by link, in its frame, (n, 3) [m].
     """
 
     def __init__(self, path: Path, lost_meshes: dict[str, list[np.ndarray]] | None = None):
@@ -157,11 +156,7 @@ class Survey:
         )
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
-        """Returns the limbs that reach lowest, or those that end in the given links.
-
-        Args:
-            feet: Links that touch the ground; found by their height by default.
-        """
+        """Returns the limbs that reach lowest, or those that end in the given links."""
         groups = self.leaves()
         if feet is None:
             lowest = [self._lowest(group) for group in groups]
