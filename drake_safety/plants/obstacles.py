@@ -144,12 +144,9 @@ def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Cont
 
 
 class Clearance:
-    """Signed distances of a robot's arms, and of points, to obstacles.
+    """Signed distances of a robot's arms, and of points, to obstacles, clipped to ``range_m``.
 
     It has its own plant and scene graph, without ground, and one scratch Context a thread.
-
-    Args:
-        range_m: Largest distance; larger ones are clipped [m].
     """
 
     def __init__(self, robot: RobotModel, obstacles: list[Obstacle], *, range_m: float):

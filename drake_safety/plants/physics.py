@@ -12,12 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import (
-    CollisionFilterDeclaration,
-    GeometrySet,
-    HalfSpace,
-    SceneGraph,
-)
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, HalfSpace, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -222,9 +217,7 @@ def add_physics(
 ) -> Physics:
     """Adds a robot on level ground to a diagram, simulated by the variation's engine.
 
-    Args:
-        time_step_s: Step of the discrete plant [s].
-        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
+    The joints have robot.yaml's position servos, or else torque inputs.
     """
     engine = MujocoPhysics if variation.engine == "mujoco" else DrakePhysics
     return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
