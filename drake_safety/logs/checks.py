@@ -29,11 +29,7 @@ _MOVING = 1.0  # Lower velocities are not compared with derivatives.
 
 
 def check_time(channel: Channel, max_gap_s: float) -> None:
-    """Checks that time is finite, increasing, in plausible units and without gaps.
-
-    Args:
-        max_gap_s: Largest time between two rows [s].
-    """
+    """Checks that time is finite, increasing, in plausible units and without gaps."""
     check_clock(channel)
     for row in rows_after_gaps(channel, max_gap_s).tolist():
         raise ValueError(
@@ -43,11 +39,7 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
 
 
 def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
-    """Returns the rows before which a gap is longer than a limit.
-
-    Args:
-        max_gap_s: Largest time between two rows [s].
-    """
+    """Returns the rows before which a gap is longer than ``max_gap_s``."""
     # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
     return np.flatnonzero(channel.steps_s() > max_gap_s * (1 + 1e-6)) + 1
 
@@ -117,13 +109,10 @@ def check_first_row(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Checks that the robot stands on the ground in the first row.
+    """Checks that the robot stands on the ground in the first row, from its positions by map.
 
     A wrong order of the quaternion tilts it; wrong units lift its feet off the ground or move
     joints beyond their stops. The error suggests changes of the map that pass the check.
-
-    Args:
-        positions: Function that returns the first row's positions (n_q,) for a map.
     """
     wrong = _implausible(kinematics, positions(log_map))
     if not wrong:
@@ -152,13 +141,10 @@ def check_stillness(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Checks that the feet do not slip far less with the other order of the quaternion.
+    """Checks that feet at positions (N, n_q) slip no less with the other order of the quaternion.
 
     Reading x y z w as w x y z turns an upright robot by half a turn about the vertical: it stands,
     but the feet seem to slip twice as far as the base moves.
-
-    Args:
-        positions: Function that returns positions (N, n_q) at some rows for a map.
     """
     other = copy.deepcopy(log_map)
     (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
@@ -203,11 +189,7 @@ def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarra
 def check_limits(
     kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
 ) -> None:
-    """Checks that joints are not far beyond their stops.
-
-    Args:
-        joints: Joint positions at the channel's rows, (N, n_j) [rad].
-    """
+    """Checks that joints (N, n_j) [rad] are not far beyond their stops."""
     excess = _beyond_limits(kinematics, joints)
     is_far = excess > _FAR_RAD
     if is_far.any():
@@ -223,12 +205,7 @@ def check_limits(
 def check_rates(
     logged: np.ndarray, derived: np.ndarray, channel: Channel, names: list[str], unit: str
 ) -> None:
-    """Checks that velocities are not far larger than the derivatives of positions.
-
-    Args:
-        logged: Velocities in SI units, (N, n).
-        derived: Derivatives of the logged positions, (M, n).
-    """
+    """Checks that velocities (N, n) are not far larger than the derivatives of positions (M, n)."""
     with np.errstate(over="ignore"):  # An infinite size is implausible too.
         size = np.sqrt(np.mean(logged**2, axis=0))
         expected = np.sqrt(np.mean(derived**2, axis=0))
@@ -246,12 +223,7 @@ def check_rates(
 def check_desired_output(
     kinematics: RobotKinematics, desired: np.ndarray, base: np.ndarray, where: str, unit: str
 ) -> None:
-    """Checks that the desired output is near the robot.
-
-    Args:
-        desired: z* of the first row, (3,) [m].
-        base: Position of the base in the first row, (3,) [m].
-    """
+    """Checks that the desired output (3,) [m] is near the base (3,) [m]."""
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(

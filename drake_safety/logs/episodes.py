@@ -102,11 +102,7 @@ def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:
 def _cut(
     log: RobotLog, loop: LeggedLoop, desired: np.ndarray
 ) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
-    """Episodes and starts of a piece with z* in the world, (N, n_z) [m].
-
-    Returns:
-        These, and whether the robot has left the safe set.
-    """
+    """Episodes and starts of a piece with z* (N, n_z) [m], and whether it leaves the safe set."""
     scenario = loop.scenario
     shortest = shortest_steps(scenario.assessment)
     context = loop.CreateDefaultContext()

@@ -121,9 +121,8 @@ def _channels(
 def field_of(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of a message.
 
-    Args:
-        path: ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
-            index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
+    A path is ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
+    index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
     """
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")

@@ -64,11 +64,7 @@ class RobotLog:
         return float(self.time_s[-1])
 
     def states_at(self, at_s: np.ndarray) -> np.ndarray:
-        """Interpolates plant states [q, v], (M, n_q + n_v): rotations by slerp, others linearly.
-
-        Args:
-            at_s: Times (M,) [s].
-        """
+        """States (M, n_q + n_v) at times (M,) [s]: rotations by slerp, others linearly."""
         rotations = rotations_at(
             self.time_s, Rotation.from_quat(self.q[:, :4], scalar_first=True), at_s
         )
@@ -178,12 +174,7 @@ def _opened(
     if step_s is not None and not step_s > 0:
         raise ValueError(f"read_log: step_s must be positive; got {step_s}")
     kinematics = RobotKinematics(robot)
-    return (
-        path,
-        log_map,
-        kinematics,
-        _read_channels(path, _wanted(log_map, kinematics), log_map),
-    )
+    return path, log_map, kinematics, _read_channels(path, _wanted(log_map, kinematics), log_map)
 
 
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
