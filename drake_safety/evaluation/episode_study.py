@@ -25,11 +25,8 @@ def evaluate_episodes(
     """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
     Thresholds maximise the balanced accuracy on the calibration set, separately for all segments
-    and for k = 0.
-
-    Returns:
-        The estimates by dotted key, the unsafe score of every test segment by scorer, (N,) each,
-        and the test segments.
+    and for k = 0. Returns the estimates by dotted key, the unsafe score of every test segment by
+    scorer, (N,) each, and the test segments.
     """
     _check(scorers, calibration, test)
     segments = split(test, stride=1, discount=1.0)

@@ -91,12 +91,7 @@ def drawing_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Creates an empty figure without a window.
-
-    Args:
-        width: Its width [inches].
-        height: Its height [inches].
-    """
+    """Creates an empty figure without a window; sizes in inches."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(width, height), layout="constrained")
@@ -119,13 +114,9 @@ def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
 
 
 def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
-    """Writes a figure as PNG, at twice the usual resolution, and as SVG.
+    """Writes a figure as PNG, at twice the usual resolution, and as SVG; returns both paths.
 
-    Args:
-        path: Path of the files; its suffix is replaced.
-
-    Returns:
-        The two paths, PNG first.
+    The suffix of the path is replaced.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

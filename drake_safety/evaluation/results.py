@@ -51,11 +51,7 @@ class Result(Estimate):
 
 
 class Results(Mapping[str, Result]):
-    """Rows by key "set.method.metric", in their order, and what made them.
-
-    Args:
-        entries: Command, scenario, seeds, versions and the like, as JSON types.
-    """
+    """Rows by key "set.method.metric", in their order, and what made them, as JSON types."""
 
     def __init__(self, estimates: Mapping[str, Estimate], entries: Mapping[str, Any] | None = None):
         self._rows = {key: Result.of(key, estimate) for key, estimate in estimates.items()}

@@ -78,11 +78,7 @@ def robot_figure(loop: LeggedLoop) -> Figure:
 
 
 def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
-    """Shows a robot's collision shapes in place of its visuals, coloured by kind.
-
-    Returns:
-        Number of shapes by kind.
-    """
+    """Shows a robot's collision shapes, coloured by kind, for its visuals, and counts them."""
     from matplotlib.colors import to_rgb
 
     plant, scene_graph = loop.plant, loop.GetSubsystemByName("scene_graph")

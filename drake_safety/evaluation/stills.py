@@ -102,14 +102,7 @@ class StillCamera:
         self._world = scene_graph.world_frame_id()
 
     def render(self, positions: np.ndarray) -> np.ndarray:
-        """Renders the plant at given positions.
-
-        Args:
-            positions: All positions of the plant, including those of a ball, (n_q,).
-
-        Returns:
-            RGB, (height, width, 3), uint8.
-        """
+        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         target = np.append(base[:2] + self._offset, self._look_at_height)
@@ -164,15 +157,7 @@ class StillCamera:
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """All positions of a plant from the logged states of its model instances.
-
-    Args:
-        loop: A closed loop that has its MultibodyPlant as ``plant``.
-        states: Positions, or positions and velocities, by name of the model instance, (N, n).
-
-    Returns:
-        Positions, (N, n_q).
-    """
+    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances."""
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
@@ -192,15 +177,9 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 def still_times(
     time_s: np.ndarray, events_s: Iterable[float] = (), *, num_stills: int = 2
 ) -> list[float]:
-    """Times of stills of a motion: those of events, and others spread between them.
+    """Logged instants [s] of stills: those of events, and ``num_stills`` others between them.
 
-    Args:
-        time_s: Instants of the log [s], (N,), increasing.
-        events_s: Times of events [s].
-        num_stills: Number of evenly spread times, of which those close to an event are dropped.
-
-    Returns:
-        Logged instants [s], increasing.
+    Of the others, those close to an event are dropped.
     """
     kept = [*events_s]
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():

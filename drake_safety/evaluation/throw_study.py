@@ -30,10 +30,7 @@ class TriggerRule:
 
 
 def trigger_rules(
-    sharpened: SafetyAssessment,
-    paper: SafetyAssessment,
-    *,
-    threshold: float,
+    sharpened: SafetyAssessment, paper: SafetyAssessment, *, threshold: float
 ) -> list[TriggerRule]:
     """The scenario's rule, named "sharpened", and the paper's."""
     own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
