@@ -48,10 +48,7 @@ class RobotKinematics:
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
     ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
-    method overwrites.
-
-    Args:
-        variation: Plant variation of the controller's model; only masses are used.
+    method overwrites. Of a plant variation only the masses are used.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -187,17 +184,10 @@ class RobotKinematics:
     def gravity_torques(
         self, q: np.ndarray, is_stance: np.ndarray, J: np.ndarray | None = None
     ) -> np.ndarray:
-        """Computes joint torques for static equilibrium on the stance points.
+        """Joint torques (n_j,) [N·m] for static equilibrium on the stance points, (n_c,).
 
         The ground forces minimise the sum of squared point forces subject to the six floating-base
-        rows ``0 = g_b + J_bᵀ f``.
-
-        Args:
-            is_stance: Whether each contact point carries weight, (n_c,).
-            J: The contact Jacobian at ``q``, if known.
-
-        Returns:
-            Torques (n_j,) [N·m].
+        rows ``0 = g_b + J_bᵀ f``; J is the contact Jacobian at ``q``, if known.
         """
         if J is None:
             J = self.contact_jacobian(q)  # Sets the positions.

@@ -12,31 +12,10 @@ from pydrake.math import RotationMatrix
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
-from drake_safety.control.policy_terms import (
-    TERMS,
-    PolicyInput,
-    Term,
-    observation_term,
-    registered_terms,
-)
+from drake_safety.control.policy_terms import TERMS, PolicyInput, Term, registered_terms
+from drake_safety.control.policy_terms import observation_term as observation_term
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern, load_typed_file
-
-__all__ = [
-    "CommandLimits",
-    "GaitClock",
-    "ObservationTerm",
-    "Policy",
-    "PolicyInput",
-    "PolicyParameters",
-    "WholeHistory",
-    "load_policy",
-    "network_file",
-    "observation_term",
-    "read_policy_file",
-    "registered_terms",
-    "with_policy",
-]
 
 _Value = TypeVar("_Value")
 
@@ -233,7 +212,9 @@ class Policy:
             _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
         )
         self._terms = self._registered(who)
-        still = self._still()
+        q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
+        v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))
+        still = self.see(q, v, np.zeros(3), np.zeros(len(names)), self.initial_phases)
         widths = [np.asarray(term(still)).size for term, _ in self._terms]
         for (_, spec), width in zip(self._terms, widths, strict=True):
             if not width:
@@ -284,20 +265,6 @@ class Policy:
                 places[i, age] = len(places)
         self._entries = np.array([entry for entry, _ in places], dtype=int)
         self._earlier = np.array([places.get((i, age - 1), -1) for i, age in places], dtype=int)
-
-    def _still(self) -> PolicyInput:
-        n = len(self.joint_names)
-        zero = np.zeros(3)
-        return PolicyInput(
-            R_WB=np.eye(3),
-            w_WB=zero,
-            v_WB=zero,
-            positions=np.zeros(n),
-            rates=np.zeros(n),
-            command=zero,
-            action=np.zeros(n),
-            phases=self.initial_phases,
-        )
 
     def see(
         self,
