@@ -2,7 +2,7 @@
 
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -109,6 +109,14 @@ def _require(robot: RobotModel, what: str, name: str, known: list[str]) -> None:
         raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
+def _require_joints(
+    robot: RobotModel, what: str, patterns: Iterable[str], known: list[str]
+) -> None:
+    for pattern in patterns:
+        if not any(re.fullmatch(pattern, name) for name in known):
+            _require(robot, f"joint for {what}", pattern, known)
+
+
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
     """Returns the names of the robot's one-degree-of-freedom joints.
 
@@ -169,7 +177,7 @@ def add_robot(
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
     if variation.shift is not None:
-        _check_shifted_joints(plant, robot, variation.shift)
+        _require_joints(robot, "shift", variation.shift.joints, servo_joints(plant, robot))
         _add_base_force(plant, robot, variation.shift)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
@@ -235,13 +243,6 @@ def _joint_shift(robot: RobotModel, variation: PlantVariation, joint: str) -> Jo
     return by_pattern(shifts, joint, "shift", robot.name) or JointShift()
 
 
-def _check_shifted_joints(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
-    names = servo_joints(plant, robot)
-    for pattern in shift.joints:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            _require(robot, "joint for shift", pattern, names)
-
-
 def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
     """Adds a steady force: a spring so long that motion hardly changes its force or direction."""
     force_n = np.linalg.norm(shift.base_force_n)
@@ -289,9 +290,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
-    for pattern in robot.posture:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            _require(robot, "joint for posture pattern", pattern, names)
+    _require_joints(robot, "posture pattern", robot.posture, names)
     positions = {}
     for name in names:
         value = by_pattern(robot.posture, name, "posture", robot.name)
