@@ -106,7 +106,7 @@ def read_pieces(
     found, cuts = cut_channels(channels, log_map.max_gap_s)
     pieces: list[RobotLog] = []
     for part in found:
-        if _num_rows(log_map, part, step_s) < 2:
+        if len(_times(log_map, part, step_s)) < 2:
             continue
         checks.check_norms(part[log_map.base_orientation.topic], log_map.base_orientation.columns)
         one = _converted(path, log_map, kinematics, part, step_s, is_checked=not pieces)
@@ -120,14 +120,14 @@ def read_pieces(
     return LogPieces(pieces=pieces, duration_s=end - begin, cuts=cuts)
 
 
-def _num_rows(log_map: LogMap, channels: dict[str, Channel], step_s: float | None) -> int:
-    """Number of rows of a converted piece."""
+def _times(log_map: LogMap, channels: dict[str, Channel], step_s: float | None) -> np.ndarray:
+    """Times of the rows of a converted piece, since the first row of any channel [s]."""
     begin, end = _common_time(channels)
     if step_s is not None:
-        return int((end - begin) / step_s + 1e-9) + 1
+        return begin + step_s * np.arange(int((end - begin) / step_s + 1e-9) + 1)
     origin = min(channel.time[0] for channel in channels.values())
     base_time = channels[log_map.base_position.topic].seconds_since(origin)
-    return int(np.sum((base_time >= begin) & (base_time <= end)))
+    return base_time[(base_time >= begin) & (base_time <= end)]
 
 
 def _common_time(channels: dict[str, Channel]) -> tuple[float, float]:
@@ -248,16 +248,12 @@ def _converted(
 ) -> RobotLog:
     origin = min(channel.time[0] for channel in channels.values())
     times = {topic: channel.seconds_since(origin) for topic, channel in channels.items()}
-    start = max(time[0] for time in times.values())
-    end = min(time[-1] for time in times.values())
+    start, end = _common_time(channels)
     if not end > start:
         spans = {topic: (float(t[0]), float(t[-1])) for topic, t in times.items()}
         raise ValueError(f"log '{path}': its topics do not overlap in time: {spans} [s]")
     base_time = times[log_map.base_position.topic]
-    if step_s is None:
-        at_s = base_time[(base_time >= start) & (base_time <= end)]
-    else:
-        at_s = start + step_s * np.arange(int((end - start) / step_s + 1e-9) + 1)
+    at_s = _times(log_map, channels, step_s)
     if len(at_s) < 2:
         raise ValueError(f"log '{path}': its topics overlap for {end - start:g} s only")
     first_row = int(np.searchsorted(base_time, at_s[0]))
