@@ -17,6 +17,7 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
     spoken,
 )
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
-
-    from drake_safety.learning.assessment import SafetyAssessment
 
 _MAX_POINTS = 12000
 FIRST_CAUSE = 3

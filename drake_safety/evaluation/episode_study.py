@@ -63,12 +63,8 @@ def evaluate_plans(
     Thresholds that are not given are chosen on the calibration set: each accepts most while a
     future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what the number of
     unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
-
-    Args:
-        thresholds: By scorer, the unsafe score above which a plan is refused.
-
-    Returns:
-        As :func:`evaluate_episodes`, of the first segments, with the outcomes' shares.
+    Given ones are the unsafe score above which a plan is refused, by scorer. Returns what
+    :func:`evaluate_episodes` does, of the first segments, with the outcomes' shares.
     """
     _check(scorers, calibration, test)
     first, seen = first_segments(test), first_segments(calibration)

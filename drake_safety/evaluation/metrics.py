@@ -41,12 +41,6 @@ class Estimate:
         value, low, high = (math.nan if end is None else float(end) for end in row[:3])
         return cls(value, low, high, int(row[3] or 0))
 
-    def to_json(self) -> dict[str, float | int | None]:
-        """The estimate as JSON types; non-finite numbers become None."""
-        fields = {"value": self.value, "low": self.low, "high": self.high}
-        finite = {k: float(v) if math.isfinite(v) else None for k, v in fields.items()}
-        return {**finite, "n": int(self.n)}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
@@ -209,14 +203,8 @@ def segment_estimates(
     """AUC, recalls and Brier score of a scorer on segments.
 
     Intervals are over episodes: bootstraps, and those of :func:`share` for the recalls.
-
-    Args:
-        segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
-        unsafe_score: Unsafe score of each, (N,), in [0, 1].
-        threshold: Score above which a segment is classified unsafe.
-
-    Returns:
-        `auc`, `safe_recall`, `unsafe_recall` and `brier`.
+    Segments are as `split(episodes, stride=1, ...)` gives them; scores (N,) are in [0, 1], and
+    unsafe above the threshold.
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode

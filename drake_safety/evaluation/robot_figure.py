@@ -31,11 +31,10 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
 )
 from drake_safety.evaluation.stills import StillCamera
+from drake_safety.simulation.legged_loop import LeggedLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from drake_safety.simulation.legged_loop import LeggedLoop
 
 _COLOURS: dict[type[Shape], tuple[str, str]] = {
     Box: ("boxes", SAFE_COLOUR),

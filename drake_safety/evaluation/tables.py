@@ -169,11 +169,7 @@ class Table:
 
 
 def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Column]) -> list[Row]:
-    """Rows of the results with given beginnings of their keys; empty rows are left out.
-
-    Args:
-        labels: Label of the row by beginning, such as "plans.sharpened".
-    """
+    """Rows of the results by beginning of their keys and label; empty rows are left out."""
     rows = [
         Row(prefix, label, [results.get(f"{prefix}.{column.key}") for column in columns])
         for prefix, label in labels.items()

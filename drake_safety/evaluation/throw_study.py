@@ -43,9 +43,7 @@ def trigger_rules(
 def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
     """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
 
-    Args:
-        persistence_s: Where nothing is known, the highest probability within this time counts [s];
-            before it has passed, 1.
+    Where nothing is known, the highest within ``persistence_s`` counts; before it has passed, 1.
     """
     probability = scorer.probability(log.state, log.desired_preview, log.features)
     if len(probability) < 2 or not persistence_s:
@@ -69,12 +67,8 @@ def evaluate_throws(
 ) -> tuple[dict[str, Estimate], list[ThrowLog]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
-    Args:
-        persistence_s: Time for which "don't know" must have lasted to trigger [s].
-        progress: Called with a stage, the number done and the number wanted.
-
-    Returns:
-        The estimates by dotted key, and the throws without recovery.
+    "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
+    and the throws without recovery.
     """
     report = progress or (lambda stage, done, total: None)
     throw = partial(run_throws, scenario, seed=seed, variation=variation, num_workers=num_workers)

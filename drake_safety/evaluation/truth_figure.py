@@ -9,17 +9,15 @@ import numpy as np
 from drake_safety.evaluation.embedding_figure import safety_colours
 from drake_safety.evaluation.figure_style import FAINT_INK, INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.metrics import area_under_curve
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import check_unused
-from drake_safety.learning.segments import DIVERGED
+from drake_safety.learning.segments import DIVERGED, Episodes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import Episodes
 
 _OUTSIDE_COLOUR = "#6b7178"
 _HATCH = "////"
