@@ -108,13 +108,9 @@ class LivePanel:
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
-        """Shows the probability and the belief.
+        """Shows the probability, or NaN, and the belief (safe, unsafe, don't know), of sum one.
 
-        Args:
-            probability: In [0, 1], or NaN.
-            belief: (safe, unsafe, don't know), (3,), of sum one; one that is not finite is shown
-                as "don't know".
-            time_s: Time of a point of the curve, later than the previous one [s]; None for none.
+        A belief that is not finite is "don't know". With a time [s] the curve gets a point.
         """
         self.probability = float(probability)
         self.belief = tuple(belief.tolist()) if np.isfinite(belief).all() else _UNKNOWN
