@@ -188,7 +188,6 @@ def test_a_motion_is_run_in_the_light_install(light_environment, tmp_path):
         ("train pendulum --out {}", "train"),
         ("calibrate pendulum", "train"),
         ("evaluate pendulum --assessment {}", "train"),
-        ("compare pendulum --out {}", "train"),
         ("adapt pendulum", "train"),
         ("report {}", "report"),
         ("play pendulum", "live"),
