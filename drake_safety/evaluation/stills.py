@@ -42,7 +42,8 @@ class StillCamera:
     Args:
         positions: Positions of the plant from which distance and lights are set, such as the first
             of a log, (n_q,).
-        width, height: Size of the stills [pixels].
+        width: Width of the stills [pixels].
+        height: Their height [pixels].
         view: View of the camera; that of the task by default.
     """
 

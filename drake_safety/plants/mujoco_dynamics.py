@@ -28,7 +28,6 @@ class MujocoDynamics:
     object keeps one scratch MjData, which every method overwrites.
 
     Args:
-        time_step_s: Step [s].
         servos: Whether the command is a joint state for robot.yaml's servos instead of torques.
     """
 

@@ -237,14 +237,9 @@ def build_model(
     plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
     defaults, with an elliptic friction cone.
 
-    Args:
-        time_step_s: Step [s].
-        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
-
-    Returns:
-        The model, and for each of its controls the index of its value in the command: joint
-        positions and velocities with servos, joint torques without, in the order of
-        :func:`~drake_safety.robots.robot.servo_joints`.
+    Returns the model, and for each of its controls the index of its value in the command: joint
+    positions and velocities with servos, joint torques without, in the order of
+    :func:`~drake_safety.robots.robot.servo_joints`.
     """
     mujoco = import_mujoco()
     spec = _read_robot(robot)
