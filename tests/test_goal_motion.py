@@ -69,12 +69,6 @@ def test_a_push_between_two_rows_is_as_strong_as_one_on_them(loop, goal):
     assert second == pytest.approx(first, rel=0.2)
 
 
-def test_a_body_that_cannot_be_pushed_is_named(loop, goal):
-    push = Push(body="tail", time_s=0.0)
-    with pytest.raises(ValueError, match="has no body 'tail'"):
-        run_to_goal(loop, goal, push=push, duration_s=0.1)
-
-
 @pytest.mark.slow
 def test_a_motion_that_leaves_the_safe_set_is_watched_until_the_robot_falls(loop):
     goal = np.array(loop.named_targets["red_can"])

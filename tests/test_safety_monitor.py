@@ -14,8 +14,8 @@ class BoxSafeSet:
         return np.array([1.0 - abs(q[0]), 2.0 - abs(v[0])])
 
 
-def monitored(state):
-    monitor = SafetyMonitor(BoxSafeSet(), 1, 1)
+def monitored(state, safe_set=BoxSafeSet):
+    monitor = SafetyMonitor(safe_set(), 1, 1)
     simulator = Simulator(monitor)
     context = simulator.get_mutable_context()
     monitor.GetInputPort("plant_state").FixValue(context, state)
@@ -58,8 +58,5 @@ def test_a_margin_that_is_no_number_is_not_safe():
         def margins(self, q, v):
             return np.array([np.nan, 1.0])
 
-    monitor = SafetyMonitor(Broken(), 1, 1)
-    simulator = Simulator(monitor)
-    monitor.GetInputPort("plant_state").FixValue(simulator.get_mutable_context(), [0.0, 0.0])
-    simulator.Initialize()
-    assert outputs(monitor, simulator.get_context())[0] == 0
+    monitor, _, context = monitored([0.0, 0.0], Broken)
+    assert outputs(monitor, context)[0] == 0
