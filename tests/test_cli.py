@@ -13,11 +13,7 @@ import drake_safety
 from command_line import call
 from drake_safety.cli import app, main
 from drake_safety.cli.run import parse_pushes
-from drake_safety.cli.training_folder import (
-    MODES,
-    assessment_file,
-    load_assessment,
-)
+from drake_safety.cli.training_folder import MODES, assessment_file, load_assessment
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw

@@ -276,10 +276,7 @@ def test_history_by_term_is_read_too(tmp_path):
         (lambda c: c.update(num_observations=45), "num_observations is 45, but its .* 8 entries"),
         (lambda c: c.update(wheel_indices=[1]), r"wheels are not supported; got .*\[1\]"),
         (lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
-        (
-            lambda c: c.update(clip_actions_upper=[8, 9]),
-            "between joints .* Write one for all",
-        ),
+        (lambda c: c.update(clip_actions_upper=[8, 9]), "between joints .* Write one for all"),
         (lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
         (lambda c: c.update(terrain=1), r"unknown keys \['terrain'\]"),
         (lambda c: c.update(rows=1, framework="isaacsim"), "rows and cols of old files"),

@@ -48,17 +48,6 @@ class Bench:
         return np.split(value, 2)
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_its_ports_have_the_sizes_of_the_robot(name):
-    bench = Bench(name)
-    kinematics, port = bench.kinematics, bench.controller.GetInputPort
-    assert port("plant_state").size() == kinematics.num_positions + kinematics.num_velocities
-    assert port("desired_output").size() == 3
-    assert port("desired_foot_positions").size() == 3 * kinematics.num_contacts
-    output = bench.controller.GetOutputPort("desired_joint_state")
-    assert output.size() == 2 * kinematics.num_joints
-
-
 def test_no_input_feeds_through():
     assert not Bench("laikago").controller.HasAnyDirectFeedthrough()
 
@@ -91,25 +80,19 @@ def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, 
     np.testing.assert_allclose(reached, feet, atol=1.1e-4)
 
 
-def test_a_connected_foot_input_overrides_the_parameter():
+@pytest.mark.parametrize(
+    ("name", "raised_m", "yaw_rad"),
+    [("desired_foot_positions", 0.04, 0.0), ("desired_yaw", 0.0, 0.1)],
+)
+def test_connected_feet_and_a_connected_yaw_override_the_parameter(name, raised_m, yaw_rad):
     bench = Bench("laikago", stiffness=1e9)
-    feet = standing_feet(bench.kinematics) + np.array([0.0, 0.0, 0.04])
-    bench.fix("desired_foot_positions", feet)
+    feet = standing_feet(bench.kinematics) + [0.0, 0.0, raised_m]
+    bench.fix(name, yaw_rad or feet)
     bench.simulator.Initialize()
     position, _ = bench.command()
-    X_WB = RigidTransform(base_over(bench.kinematics))
+    X_WB = RigidTransform(RotationMatrix.MakeZRotation(yaw_rad), base_over(bench.kinematics))
     reached = bench.kinematics.contact_positions(bench.kinematics.positions_at(X_WB, position))
     np.testing.assert_allclose(reached, feet, atol=1.1e-4)
-
-
-def test_a_connected_yaw_overrides_that_of_the_feet():
-    bench = Bench("laikago", stiffness=1e9)
-    bench.fix("desired_yaw", 0.1)
-    bench.simulator.Initialize()
-    position, _ = bench.command()
-    X_WB = RigidTransform(RotationMatrix.MakeZRotation(0.1), base_over(bench.kinematics))
-    reached = bench.kinematics.contact_positions(bench.kinematics.positions_at(X_WB, position))
-    np.testing.assert_allclose(reached, standing_feet(bench.kinematics), atol=1.1e-4)
 
 
 def test_a_lifted_foot_gets_no_share_of_the_weight():

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
 from drake_safety.robots.robot import PlantVariation, add_robot
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_kinematics, robot_model, write_hexapod
@@ -67,7 +66,7 @@ def test_no_answer_depends_on_an_earlier_call(kinematics):
 
 
 def test_the_gravity_torques_and_ground_forces_carry_the_weight(kinematics):
-    """Inverse dynamics: zero acceleration needs exactly these torques and a total force m g."""
+    # Inverse dynamics: zero acceleration needs exactly these torques and a total force m g.
     q = standing(kinematics)
     is_stance = np.ones(kinematics.num_contacts, bool)
     torques = kinematics.gravity_torques(q, is_stance)
@@ -179,18 +178,16 @@ def test_the_stance_is_the_least_squares_fit():
         assert cost(best) <= cost(best + 0.01 * rng.normal(size=3)) + 1e-15
 
 
-def test_yaw_is_the_angle_about_the_vertical():
-    assert yaw_of(RotationMatrix.MakeZRotation(2.5)) == pytest.approx(2.5)
-    assert yaw_of(RollPitchYaw(0.1, -0.2, -1.0).ToRotationMatrix()) == pytest.approx(-1.0)
-
-
-def test_a_base_that_does_not_float_is_refused(tmp_path):
-    path = write_hexapod(tmp_path)
-    text = yaml.safe_load(path.read_text())
-    text["base"] = "tibia_0"
-    path.write_text(yaml.safe_dump(text))
-    with pytest.raises(ValueError, match="base 'tibia_0' must be the floating body"):
-        RobotKinematics(load_robot_file(path))
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"base": "tibia_0"}, "base 'tibia_0' must be the floating body"),
+        ({"feet": {}}, "robot 'hexapod' has no feet to stand on"),
+    ],
+)
+def test_a_base_that_does_not_float_and_a_robot_without_feet_are_refused(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        RobotKinematics(load_robot_file(edited(write_hexapod(tmp_path), **change)))
 
 
 def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
@@ -204,9 +201,3 @@ def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
     joints = [joint for joint in joints if joint.num_velocities() == 1]
     joints.sort(key=lambda joint: joint.velocity_start())
     assert [joint.name() for joint in joints] == kinematics.joint_names
-
-
-def test_a_robot_without_feet_is_refused(tmp_path):
-    robot = load_robot_file(edited(write_hexapod(tmp_path), feet={}))
-    with pytest.raises(ValueError, match="robot 'hexapod' has no feet to stand on"):
-        RobotKinematics(robot)

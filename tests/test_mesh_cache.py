@@ -6,12 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from drake_safety.robots.mesh_cache import (
-    cache_folder,
-    is_shown,
-    mesh_points,
-    shown_mesh,
-)
+from drake_safety.robots.mesh_cache import cache_folder, is_shown, mesh_points, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
 

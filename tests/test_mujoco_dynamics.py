@@ -6,11 +6,7 @@ import pytest
 from pydrake.geometry import Mesh, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import (
-    CoulombFriction,
-    ExternallyAppliedSpatialForce,
-    MultibodyPlant,
-)
+from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce, MultibodyPlant
 
 import legged_robots
 from drake_safety.plants.mujoco_dynamics import MujocoDynamics
@@ -35,12 +31,7 @@ class Bench:
         add_ground(self.plant, self.robot.foot_friction)
         self.plant.Finalize()
         self.dynamics = MujocoDynamics(
-            self.robot,
-            self.plant,
-            scene_graph,
-            self.variation,
-            time_step_s=STEP_S,
-            servos=servos,
+            self.robot, self.plant, scene_graph, self.variation, time_step_s=STEP_S, servos=servos
         )
         self.model = self.dynamics.model
         self.scratch = mujoco.MjData(self.model)

@@ -105,11 +105,7 @@ def test_history_is_oldest_first_and_begins_with_what_is_seen_first(tmp_path):
     [
         ({"ages": [2, 1, 0]}, [3, 0, 0, -1] * 3, [3, 0, 0, -1] * 2 + [5, 0, 0, -1]),
         ({"ages": [0, 1, 2]}, [3, 0, 0, -1] * 3, [5, 0, 0, -1] + [3, 0, 0, -1] * 2),
-        (
-            {"ages": [0, 1, 2], "by": "term"},
-            [3] * 3 + [0, 0, -1] * 3,
-            [5, 3, 3] + [0, 0, -1] * 3,
-        ),
+        ({"ages": [0, 1, 2], "by": "term"}, [3] * 3 + [0, 0, -1] * 3, [5, 3, 3] + [0, 0, -1] * 3),
     ],
 )
 def test_a_history_of_the_whole_observation_is_laid_out_as_stated(tmp_path, history, first, second):

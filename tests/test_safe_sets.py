@@ -102,6 +102,10 @@ def test_repeated_points_change_no_hull():
     assert doubled == convex_hull(np.array(SQUARE))
 
 
+def margin(safe_set, q, name):
+    return safe_set.margins(q, np.zeros(safe_set.kinematics.num_velocities))[NAMES.index(name)]
+
+
 def safe_set_of(name, **limits):
     kinematics = robot_kinematics(name)
     height = kinematics.standing_height

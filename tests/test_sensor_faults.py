@@ -162,10 +162,7 @@ def test_all_memory_is_in_the_context():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: Fault(kind="freze"),
-            r"one of .*; got 'freze' \(did you mean 'freeze'",
-        ),
+        (lambda: Fault(kind="freze"), r"one of .*; got 'freze' \(did you mean 'freeze'"),
         (lambda: Fault(kind="drift"), "'drift' needs a value; got None"),
         (lambda: Fault(kind="zero", value=1.0), "'zero' has no value; got 1.0"),
         (lambda: Fault(kind="delay", value=-0.1), "value of 'delay' is out of range; got -0.1"),

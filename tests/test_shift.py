@@ -218,10 +218,7 @@ def test_a_shift_that_is_none_is_refused(make, message):
     [
         (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),
         (Shift(holes_m={"tail": 0.1}), "no foot 'tail' for a hole; it has"),
-        (
-            Shift(sensor_faults=[Fault(kind="zero", entries=["elbow_q"])]),
-            "no entry 'elbow_q'",
-        ),
+        (Shift(sensor_faults=[Fault(kind="zero", entries=["elbow_q"])]), "no entry 'elbow_q'"),
         (Shift(command_delay_s=0.004), "a delay must be a multiple of the period 0.0025 s"),
     ],
 )
