@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose, yaw_of
 from drake_safety.robots.robot import PlantVariation, add_robot
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_kinematics, robot_model, write_hexapod
@@ -176,6 +176,10 @@ def test_the_stance_is_the_least_squares_fit():
     best = fit_stance(p, nominal)
     for _ in range(100):
         assert cost(best) <= cost(best + 0.01 * rng.normal(size=3)) + 1e-15
+
+
+def test_yaw_is_the_angle_about_the_vertical():
+    assert yaw_of(RollPitchYaw(0.1, -0.2, -1.0).ToRotationMatrix()) == pytest.approx(-1.0)
 
 
 @pytest.mark.parametrize(

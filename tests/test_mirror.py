@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.control.kinematics import RobotKinematics, planar_pose
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
 from drake_safety.models import load_robot, robot_names
@@ -12,6 +12,7 @@ from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import edited, robot_kinematics, write_biped, write_hexapod
 
 SYMMETRIC = [name for name in robot_names() if load_robot(name).mirror]
+assert "laikago" in SYMMETRIC
 
 
 @pytest.fixture(params=[*SYMMETRIC, "biped"])
@@ -62,16 +63,10 @@ def test_reflecting_the_robot_reflects_its_feet_and_hands(kinematics):
         feet = kinematics.contact_positions(q)
         assert same_points(kinematics.contact_positions(mirrored), reflected(feet))
         for name in kinematics.robot.reaching_frames:
-            hand = hand_position(kinematics, q, name)
-            other = hand_position(kinematics, mirrored, mirror.hand(name))
+            frames = kinematics.robot.reaching_frames
+            hand = kinematics.reaching_position(q, frames[name])
+            other = kinematics.reaching_position(mirrored, frames[mirror.hand(name)])
             np.testing.assert_allclose(other, reflected(hand), atol=1e-6)
-
-
-def hand_position(kinematics, q, name):
-    frame = kinematics.robot.reaching_frames[name]
-    kinematics.plant.SetPositions(kinematics.context, q)
-    X_WB = kinematics.plant.GetBodyByName(frame.body).EvalPoseInWorld(kinematics.context)
-    return X_WB @ np.array([frame.point]).T[:, 0]
 
 
 def test_reflecting_the_velocities_reflects_the_velocities_of_the_feet(kinematics):
@@ -86,13 +81,18 @@ def test_reflecting_the_velocities_reflects_the_velocities_of_the_feet(kinematic
     assert same_points(np.concatenate([mirrored_feet, mirrored_rates], axis=1), reflected)
 
 
-def test_the_state_of_the_mirrored_robot_is_the_mirrored_state(kinematics):
+def test_the_state_of_the_mirrored_robot_is_the_mirrored_state_in_the_same_stance(kinematics):
     mirror = Mirror(kinematics)
     for planted in (True, False):
         q, v = random_state(kinematics, np.random.default_rng(3), planted)
-        mirrored = stance_state(kinematics, *mirror.plant_state(q, v))
+        mirrored = mirror.plant_state(q, v)
         expected = mirror.stance_state(stance_state(kinematics, q, v))
-        np.testing.assert_allclose(mirrored, expected, atol=1e-6)
+        np.testing.assert_allclose(stance_state(kinematics, *mirrored), expected, atol=1e-6)
+        stances = [
+            fit_stance(kinematics.contact_positions(p), kinematics.nominal_contacts)
+            for p in (q, mirrored[0])
+        ]
+        np.testing.assert_allclose(stances[0], stances[1], atol=1e-6)
 
 
 def test_the_standing_posture_is_its_own_reflection(kinematics):

@@ -14,8 +14,7 @@ from package_models import PUBLISHED, Scene
 LEGS = ("FR", "FL", "RR", "RL")
 LAIKAGO_LINKS = ("hip", "thigh", "calf")
 LAIKAGO_STANDING = (0.0, 0.67, -1.3)
-SAMPLED_LOWER = np.array([-0.4, 0.2, -2.0])
-SAMPLED_UPPER = np.array([0.4, 1.3, -0.7])
+SAMPLED = ((-0.4, 0.4, 5), (0.2, 1.3, 6), (-2.0, -0.7, 6))
 
 
 @pytest.fixture(params=sorted(PUBLISHED))
@@ -115,10 +114,8 @@ def test_every_signed_distance_within_the_robot_can_be_computed(scene):
 
 def test_the_robot_can_be_seen_and_what_is_seen_can_be_rendered(scene):
     inspector = scene.scene_graph.model_inspector()
-    assert inspector.NumGeometriesWithRole(Role.kIllustration) > len(scene.bodies)
-    assert inspector.NumGeometriesWithRole(Role.kPerception) == (
-        inspector.NumGeometriesWithRole(Role.kIllustration)
-    )
+    seen, rendered = map(inspector.NumGeometriesWithRole, (Role.kIllustration, Role.kPerception))
+    assert rendered == seen > len(scene.bodies)
 
 
 @pytest.mark.parametrize("name", [n for n in sorted(PUBLISHED) if load_robot(n).reaching_frames])
@@ -126,32 +123,20 @@ def test_a_reaching_point_is_the_centre_of_the_hands_sphere(name):
     scene = Scene(name)
     inspector = scene.scene_graph.model_inspector()
     for frame in scene.robot.reaching_frames.values():
-        spheres = [
-            geometry
-            for geometry in scene.plant.GetCollisionGeometriesForBody(scene.bodies[frame.body])
-            if isinstance(inspector.GetShape(geometry), Sphere)
-        ]
-        (sphere,) = spheres
+        shapes = scene.plant.GetCollisionGeometriesForBody(scene.bodies[frame.body])
+        (sphere,) = (g for g in shapes if isinstance(inspector.GetShape(g), Sphere))
         assert inspector.GetShape(sphere).radius() == frame.radius_m
-        np.testing.assert_allclose(
-            inspector.GetPoseInFrame(sphere).translation(), frame.point, rtol=0, atol=1e-12
-        )
+        centre = inspector.GetPoseInFrame(sphere).translation()
+        np.testing.assert_allclose(centre, frame.point, rtol=0, atol=1e-12)
 
 
 def test_a_laikago_leg_never_touches_itself_or_the_trunk_where_legs_are_sampled(laikago):
     laikago.set_base_height(1.0)
-    hips = np.linspace(SAMPLED_LOWER[0], SAMPLED_UPPER[0], 5)
-    thighs = np.linspace(SAMPLED_LOWER[1], SAMPLED_UPPER[1], 6)
-    calves = np.linspace(SAMPLED_LOWER[2], SAMPLED_UPPER[2], 6)
     for leg in LEGS:
-        for angles in itertools.product(hips, thighs, calves):
+        for angles in itertools.product(*(np.linspace(*sampled) for sampled in SAMPLED)):
             set_leg(laikago, leg, angles)
-            own = {
-                pair
-                for pair in laikago.touching()
-                if all(name.startswith((leg, "trunk")) for name in pair)
-            }
-            assert own == set(), angles
+            touching = laikago.touching()
+            assert not any(all(n.startswith((leg, "trunk")) for n in p) for p in touching), angles
         set_leg(laikago, leg, LAIKAGO_STANDING)
 
 
@@ -197,9 +182,7 @@ def test_a_front_foot_of_laikago_reaching_back_collides_with_the_hind_leg(laikag
     laikago.set_base_height(1.0)
     set_leg(laikago, "FR", (0.0, 1.3, -0.7))
     set_leg(laikago, "RR", (0.0, 0.2, -2.0))
-    assert any(
-        first.startswith("FR") and second.startswith("RR") for first, second in laikago.touching()
-    )
+    assert any(one[:2] == "FR" and other[:2] == "RR" for one, other in laikago.touching())
 
 
 def test_atlas_touches_the_world_only_and_never_itself(atlas):

@@ -47,21 +47,16 @@ def test_a_block_says_its_ports_and_their_remarks():
     assert block.inputs == (("first", ""), ("second", "optional"))
     assert "| input | `second` | optional |" in block.table
     assert block.table.count("\n") == 4
-
-
-def test_the_picture_names_the_system_and_has_a_dot_for_every_port():
-    svg = system_block.parse_block(DOCSTRING).svg
-    assert svg.count("<circle") == 3
-    assert all(f">{name}</text>" in svg for name in ("Adder", "first", "second", "total"))
-    assert svg.count("<text") == 4
+    # The picture names the system and has a dot for every port.
+    assert block.svg.count("<circle") == 3
+    assert all(f">{name}</text>" in block.svg for name in ("Adder", "first", "second", "total"))
+    assert block.svg.count("<text") == 4
 
 
 def test_a_docstring_becomes_markdown_without_its_block():
     text = system_block.to_markdown(DOCSTRING)
     assert text == "Adds two numbers.\n\nNot `subtract`, see `total`."
-
-
-def test_a_unit_behind_an_index_is_no_link():
+    # A unit behind an index is no link.
     assert system_block.to_markdown("The entry q[3] [rad].") == "The entry q[3] \\[rad]."
 
 
