@@ -258,14 +258,12 @@ def test_a_run_obeys_a_refusal(call, folder, nothing_near):
 def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     calibrate(folder, 0.0)
     started = []
-    recording = SimpleNamespace(
-        viewer=None, start=lambda: started.append(True), save=lambda *what: None
-    )
+    recording = SimpleNamespace(viewer=None, start=lambda: started.append(1), save=lambda *_: None)
     monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
     monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)
     options = ("--assessment", folder, "--target", *NEAR, "--duration", 0.1)
     assert call("run", SCENARIO, *options)[0] == 0
-    assert started == [True]
+    assert started == [1]
 
 
 @pytest.mark.slow

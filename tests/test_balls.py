@@ -50,10 +50,8 @@ class Bench:
         return self.plant.GetPositions(self.context, self.instance)[4:]
 
     def robot_momentum(self):
-        about = np.zeros(3)
-        return self.plant.CalcSpatialMomentumInWorldAboutPoint(
-            self.context, [self.robot], about
-        ).translational()
+        momentum = self.plant.CalcSpatialMomentumInWorldAboutPoint
+        return momentum(self.context, [self.robot], np.zeros(3)).translational()
 
 
 DIRECTIONS = [0.0, math.pi / 2, math.pi, -math.pi / 3]

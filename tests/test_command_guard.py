@@ -44,12 +44,8 @@ class SlowIsSafe:
 
 
 def guard(assessment, **options):
-    return CommandGuard(
-        assessment,
-        lambda features, commands: commands,
-        LIMITS,
-        **{"threshold": 0.5, "period_s": 0.1, "num_outlook": OUTLOOK, **options},
-    )
+    options = {"threshold": 0.5, "period_s": 0.1, "num_outlook": OUTLOOK} | options
+    return CommandGuard(assessment, lambda features, commands: commands, LIMITS, **options)
 
 
 def passed_on(system, command, state=0.0, features=(0.0, 0.0, 0.0)):

@@ -227,11 +227,8 @@ def borrowed_tests(source, name):
 
 
 def offences_in(rule, paths):
-    return [
-        offence
-        for path in paths
-        for offence in rule(path.read_text(encoding="utf-8"), relative(path))
-    ]
+    sources = ((path.read_text(encoding="utf-8"), relative(path)) for path in paths)
+    return [offence for source, name in sources for offence in rule(source, name)]
 
 
 def test_imports_only_go_down():
@@ -314,9 +311,7 @@ def test_every_module_stands_in_a_room_and_says_what_it_is():
     rooms = {room_of(module_of(relative(path))) for path in LIBRARY}
     assert rooms <= {*ALLOWED, "__init__"}
     assert [relative(path) for path in LIBRARY if path.stem in VAGUE_NAMES] == []
-
-
-def test_a_folder_of_a_robot_is_no_python_package():
+    # A folder of a robot is no Python package.
     assert list((ROOT / "models").glob("*/**/__init__.py")) == []
 
 

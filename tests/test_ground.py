@@ -31,8 +31,7 @@ def test_the_ground_has_the_friction_that_was_asked_for_and_is_seen(grounded):
     plant, scene_graph, _ = grounded
     inspector = scene_graph.model_inspector()
     (collision,) = plant.GetCollisionGeometriesForBody(plant.world_body())
-    friction = inspector.GetProximityProperties(collision).GetProperty(
-        "material", "coulomb_friction"
-    )
+    properties = inspector.GetProximityProperties(collision)
+    friction = properties.GetProperty("material", "coulomb_friction")
     assert (friction.static_friction(), friction.dynamic_friction()) == (0.7, 0.7)
     assert inspector.GetAllGeometryIds(Role.kIllustration)

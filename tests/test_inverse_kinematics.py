@@ -55,9 +55,8 @@ def test_from_the_last_ticks_answer_one_step_suffices():
 def test_joints_stay_within_their_limits_when_the_target_is_out_of_reach(name, height):
     kinematics = robot_kinematics(name)
     X_WB = base_pose(kinematics, shift=(0.0, 0.0, height))
-    joints = solve_inverse_kinematics(
-        kinematics, X_WB, standing_contacts(kinematics), kinematics.posture
-    )
+    p_WC = standing_contacts(kinematics)
+    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
     lowest, highest = kinematics.position_limits.T
     assert np.all((joints >= lowest) & (joints <= highest))
 

@@ -43,9 +43,8 @@ def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinemat
         np.testing.assert_allclose(J @ v, difference.ravel() / (2 * step), atol=1e-7)
 
 
-def test_standing_puts_the_lowest_sphere_on_the_ground(kinematics):
+def test_standing_puts_every_sphere_on_the_ground(kinematics):
     p_WC = kinematics.contact_positions(standing(kinematics))
-    assert np.min(p_WC[:, 2] - kinematics.foot_radii) == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(p_WC[:, 2], kinematics.foot_radii, atol=1e-9)
 
 
@@ -115,9 +114,8 @@ def test_a_lighter_robot_needs_less_torque_in_proportion():
     full, light = RobotKinematics(robot), RobotKinematics(robot, PlantVariation(mass_scale=0.8))
     assert light.total_mass == pytest.approx(0.8 * full.total_mass)
     q, is_stance = standing(full), np.ones(full.num_contacts, bool)
-    np.testing.assert_allclose(
-        light.gravity_torques(q, is_stance), 0.8 * full.gravity_torques(q, is_stance), atol=1e-9
-    )
+    torques = full.gravity_torques(q, is_stance)
+    np.testing.assert_allclose(light.gravity_torques(q, is_stance), 0.8 * torques, atol=1e-9)
 
 
 def test_the_centre_of_mass_is_the_mean_of_the_bodies(kinematics):

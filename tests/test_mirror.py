@@ -96,9 +96,8 @@ def test_the_state_of_the_mirrored_robot_is_the_mirrored_state_in_the_same_stanc
 
 
 def test_the_standing_posture_is_its_own_reflection(kinematics):
-    np.testing.assert_allclose(
-        Mirror(kinematics).joints(kinematics.posture), kinematics.posture, atol=1e-9
-    )
+    reflected = Mirror(kinematics).joints(kinematics.posture)
+    np.testing.assert_allclose(reflected, kinematics.posture, atol=1e-9)
 
 
 def test_many_states_are_reflected_as_one_by_one(kinematics):

@@ -33,9 +33,8 @@ def atlas() -> Scene:
 
 
 def set_leg(scene: Scene, leg: str, angles) -> None:
-    scene.set_joints(
-        {f"{leg}_{link}_joint": angle for link, angle in zip(LAIKAGO_LINKS, angles, strict=True)}
-    )
+    joints = (f"{leg}_{link}_joint" for link in LAIKAGO_LINKS)
+    scene.set_joints(dict(zip(joints, angles, strict=True)))
 
 
 def lowest_of(scene: Scene) -> float:
@@ -159,10 +158,8 @@ def test_laikagos_calf_ends_short_of_its_foot(laikago):
     shapes = laikago.collision_geometries()
     shin, foot = shapes["FR_calf/shin"], shapes["FR_calf/foot"]
     capsule, radius = inspector.GetShape(shin), inspector.GetShape(foot).radius()
-    shin_end = (
-        inspector.GetPoseInFrame(shin).translation()[2] - capsule.length() / 2 - capsule.radius()
-    )
-    assert shin_end > inspector.GetPoseInFrame(foot).translation()[2] + radius
+    shin_z, foot_z = (inspector.GetPoseInFrame(one).translation()[2] for one in (shin, foot))
+    assert shin_z - capsule.length() / 2 - capsule.radius() > foot_z + radius
     assert capsule.radius() < radius
 
 
@@ -193,11 +190,8 @@ def test_atlas_touches_the_world_only_and_never_itself(atlas):
 def test_only_the_forearms_of_atlas_are_anything_but_spheres(atlas):
     # Between a half space and any other shape Drake finds contact, but no signed distance.
     inspector = atlas.scene_graph.model_inspector()
-    others = {
-        name
-        for name, geometry in atlas.collision_geometries().items()
-        if not isinstance(inspector.GetShape(geometry), Sphere)
-    }
+    shapes = {name: inspector.GetShape(g) for name, g in atlas.collision_geometries().items()}
+    others = {name for name, shape in shapes.items() if not isinstance(shape, Sphere)}
     assert others == {"l_ufarm/forearm", "r_ufarm/forearm"}
 
 
@@ -216,11 +210,9 @@ def test_no_board_fits_between_the_hand_and_the_forearm_of_atlas(atlas, side):
         query = atlas.query()
         X_WF, X_WH = query.GetPoseInWorld(forearm), query.GetPoseInWorld(hand)
         p_FH = X_WF.inverse() @ X_WH.translation()
-        outside = [
-            max(np.hypot(*p_FH[:2]) - cylinder.radius(), 0.0),
-            max(abs(p_FH[2]) - cylinder.length() / 2, 0.0),
-        ]
-        gap = np.hypot(*outside) - inspector.GetShape(hand).radius()
+        beside = max(np.hypot(*p_FH[:2]) - cylinder.radius(), 0.0)
+        beyond = max(abs(p_FH[2]) - cylinder.length() / 2, 0.0)
+        gap = np.hypot(beside, beyond) - inspector.GetShape(hand).radius()
         assert 0.0 < gap < board
 
 

@@ -195,10 +195,8 @@ def test_of_all_contacts_those_of_arms_with_obstacles_and_the_rest_with_ground_a
         inspector = scene_graph.model_inspector()
         frames = sorted(inspector.GetName(inspector.GetFrameId(one)) for one in arms)
         assert frames == ["porter::left_palm", "porter::right_palm"]
-    expected = {
-        frozenset(pair)
-        for pair in [*itertools.product(arms, boxes), *itertools.product(robots - arms, ground)]
-    }
+    pairs = [*itertools.product(arms, boxes), *itertools.product(robots - arms, ground)]
+    expected = {frozenset(pair) for pair in pairs}
     found = {frozenset(pair) for pair in scene_graph.model_inspector().GetCollisionCandidates()}
     assert found == expected
 
@@ -209,10 +207,8 @@ def test_obstacles_stand_still_where_they_are_told_to(tmp_path, names):
     plant = MultibodyPlant(0.001)
     first, second = map(link, names)
     path = model(tmp_path, first, joint("fixed", "post", "board"), second)
-    obstacles = [
-        Obstacle(model=path, position=[1.0, 2.0, 3.0], yaw_rad=0.5),
-        Obstacle(model=path, position=[-1.0, 0.0, 0.0]),
-    ]
+    obstacles = [Obstacle(model=path, position=[1.0, 2.0, 3.0], yaw_rad=0.5)]
+    obstacles.append(Obstacle(model=path, position=[-1.0, 0.0, 0.0]))
     instances = add_obstacles(plant, obstacles)
     plant.Finalize()
     assert plant.num_velocities() == 0

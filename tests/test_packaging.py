@@ -21,13 +21,8 @@ from drake_safety.extras import MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-# Where the source tree's folders stand once installed.
-INSTALLED_AT = {
-    "drake_safety": "drake_safety",
-    "models": "drake_safety/models",
-    "diagrams": "drake_safety/diagrams",
-    "assessments": "drake_safety/assessments",
-}
+# What is installed: the other folders of the source tree stand in the first.
+FOLDERS = ("drake_safety", "models", "diagrams", "assessments")
 # Shipped assessments come and go; this one is always there, so that the way is.
 SHIPPED = {"assessments/pendulum/sharpened.safetensors", "assessments/pendulum/evaluation.json"}
 
@@ -158,9 +153,8 @@ ABSENT = [*{name for extra in MODULES.values() for name in extra}, "numba", "sta
 @pytest.mark.parametrize("scenario", ["laikago_balancing", "atlas_reaching"])
 def test_a_loop_with_an_assessment_runs_in_the_light_install(light_environment, scenario):
     code = LOOP.format(scenario, ABSENT)
-    probability, *found = run(
-        light_environment / "bin" / "python", "-c", code, cwd="/"
-    ).splitlines()
+    printed = run(light_environment / "bin" / "python", "-c", code, cwd="/")
+    probability, *found = printed.splitlines()
     assert 0.0 <= float(probability) <= 1.0
     assert found == [""]
 
@@ -225,11 +219,8 @@ def test_every_file_of_the_library_and_of_the_folders_beside_it_is_in_the_wheel_
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
     metadata = {name for name in names if ".dist-info/" in name}
-    expected = {
-        f"{installed}/{name}"
-        for folder, installed in INSTALLED_AT.items()
-        for name in files_under(ROOT / folder)
-    }
+    paths = (f"{folder}/{name}" for folder in FOLDERS for name in files_under(ROOT / folder))
+    expected = {f"drake_safety/{path.removeprefix('drake_safety/')}" for path in paths}
     expected |= {f"drake_safety/{name}" for name in SHIPPED}
     assert names - metadata == expected
     assert any(name.endswith("/licenses/LICENSE") for name in metadata)

@@ -65,9 +65,8 @@ def test_a_cloned_context_goes_on_from_its_phase(monkeypatch):
     for one in (simulator, other):
         one.AdvanceTo(0.13)
     for name in ("desired_joint_state", "action_state"):
-        np.testing.assert_array_equal(
-            output(system, context, name), output(system, other.get_context(), name)
-        )
+        states = (output(system, one, name) for one in (context, other.get_context()))
+        np.testing.assert_array_equal(*states)
     _, fresh = started(system)
     system.set_state(fresh, system.state_of(context))
     states = (output(system, one, "action_state") for one in (fresh, context))

@@ -16,9 +16,8 @@ from drake_safety.plants.obstacles import Clearance, Obstacle
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import edited, robot_kinematics, robot_model, write_porter
 
-SHELF = Obstacle(
-    model="package://drake_safety_models/scenes/bookshelf.urdf", position=[0.9, 0.0, 0.0]
-)
+SHELF_MODEL = "package://drake_safety_models/scenes/bookshelf.urdf"
+SHELF = Obstacle(model=SHELF_MODEL, position=[0.9, 0.0, 0.0])
 RANGE_M = 0.1
 NAMES = ("support_polygon", "collision", "joint_limits", "fall")
 ROBOTS = ("porter", "atlas")
@@ -309,9 +308,8 @@ def test_features_do_not_depend_on_where_in_the_world_the_robot_stands(name):
     X_WM = RigidTransform(RotationMatrix.MakeZRotation(1.2), [3.0, -2.0, 0.0])
     X_WB = RigidTransform(RotationMatrix(RollPitchYaw(0.02, 0.0, 0.03)), q[4:7])
     moved = kinematics.positions_at(X_WM @ X_WB, q[7:])
-    np.testing.assert_allclose(
-        of.features(moved, v, preview), of.features(q, v, preview), atol=1e-7
-    )
+    here, there = of.features(q, v, preview), of.features(moved, v, preview)
+    np.testing.assert_allclose(there, here, atol=1e-7)
 
 
 # The torso that Atlas was published with is not quite symmetric.

@@ -68,18 +68,13 @@ def test_a_threshold_of_zero_fires_only_on_what_is_no_number():
     assert Bench(math.nan, threshold=0.0).look()
 
 
-def test_it_latches_whatever_the_probability_does():
+def test_it_latches_until_recovery_is_done_and_may_fire_again():
     bench = Bench(0.1)
     assert bench.look()
     bench.set(1.0)
     assert bench.look(20)
     bench.set(1.0, done=0.0)
     assert bench.look(20)
-
-
-def test_it_may_fire_again_after_it_let_go():
-    bench = Bench(0.1)
-    bench.look()
     bench.set(1.0, done=1.0)
     assert not bench.look()
     bench.set(0.1, done=0.0)

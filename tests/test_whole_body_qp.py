@@ -29,9 +29,8 @@ G = 9.81
 @functools.cache
 def whole_body_model(name):
     """A robot's model; with its first hand, if it has any."""
-    return WholeBodyModel(
-        robot_kinematics(name), next(iter(robot_kinematics(name).robot.reaching_frames), None)
-    )
+    hand = next(iter(robot_model(name).reaching_frames), None)
+    return WholeBodyModel(robot_kinematics(name), hand)
 
 
 @pytest.fixture(params=NAMES)
@@ -128,9 +127,8 @@ def test_the_torques_are_those_of_an_interior_point_solver(model):
     rng = np.random.default_rng(2)
     for size in (0.0, 0.3, 1.0):
         qp = build_qp(model, *random_program(model, rng, size))
-        np.testing.assert_allclose(
-            solve_qp(qp).torques, clarabel_torques(qp, 1e-10), rtol=0, atol=1e-3
-        )
+        expected = clarabel_torques(qp, 1e-10)
+        np.testing.assert_allclose(solve_qp(qp).torques, expected, rtol=0, atol=1e-3)
 
 
 def test_the_same_program_has_the_same_solution_to_the_last_bit(model):
@@ -248,11 +246,8 @@ def test_a_point_accelerates_by_feedforward_and_the_gains_times_its_errors(name,
     setattr(reference, task, wanted)
     solution = solved(model, q, v, reference)
     acceleration = rate_of_change(model, q, v, solution.vdot, rate, step=1e-4)
-    expected = (
-        wanted.acceleration
-        + 64.0 * (wanted.position - position(q))
-        + 11.0 * (wanted.rate - rate(q, v))
-    )
+    expected = wanted.acceleration + 64.0 * (wanted.position - position(q))
+    expected += 11.0 * (wanted.rate - rate(q, v))
     np.testing.assert_allclose(acceleration, expected, atol=0.01)
 
 
@@ -330,11 +325,8 @@ def test_the_torques_do_not_depend_on_place_or_heading(model):
     for point in filter(None, (moved.center_of_mass, moved.reaching)):
         point.position, point.rate = X @ point.position, turn @ point.rate
     moved.orientations = [X.rotation() @ R for R in reference.orientations]
-    np.testing.assert_allclose(
-        solved(model, moved_q, moved_v, moved).torques,
-        solved(model, q, v, reference).torques,
-        atol=1e-5,
-    )
+    there, here = solved(model, moved_q, moved_v, moved), solved(model, q, v, reference)
+    np.testing.assert_allclose(there.torques, here.torques, atol=1e-5)
 
 
 def test_a_mirrored_robot_needs_the_mirrored_torques():
@@ -345,11 +337,9 @@ def test_a_mirrored_robot_needs_the_mirrored_torques():
     mirrored = copy.deepcopy(reference)
     for point in (mirrored.center_of_mass, mirrored.reaching):
         point.position, point.rate = mirror.points(point.position), mirror.points(point.rate)
-    np.testing.assert_allclose(
-        solved(model, mirrored_q, mirrored_v, mirrored).torques,
-        mirror.joints(solved(model, q, v, reference).torques),
-        atol=1e-6,
-    )
+    expected = mirror.joints(solved(model, q, v, reference).torques)
+    found = solved(model, mirrored_q, mirrored_v, mirrored).torques
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_joint_without_an_actuator_gets_no_torque():
