@@ -16,7 +16,6 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import write_hexapod
-from urdf_files import with_shape
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -28,7 +27,7 @@ def shaped(folder, **meshes):
     text = urdf.read_text()
     for link, mesh in meshes.items():
         mesh.export(folder / f"{link}.stl")
-        text = with_shape(text, link, urdf_files.mesh("collision", f"{link}.stl"))
+        text = urdf_files.with_shape(text, link, urdf_files.mesh("collision", f"{link}.stl"))
     urdf.write_text(text)
     return urdf
 

@@ -20,12 +20,6 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "cache"))
 
 
-@pytest.fixture
-def copied(tmp_path):
-    """A function: the copy of a URDF of one link with some shapes."""
-    return lambda shapes: simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
-
-
 def meshes_of(path):
     return [element.get("filename") for element in ET.parse(path).getroot().iter("mesh")]
 
@@ -51,10 +45,10 @@ def test_a_mesh_that_drake_shows_goes_along_as_it_is(tmp_path):
     assert copy.notes == []
 
 
-def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_path, copied):
+def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_path):
     pytest.importorskip("trimesh")
     stl(tmp_path / "skin.stl", TRIANGLE)
-    copy = copied(mesh("visual", "skin.stl"))
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
     folder = tmp_path / "written"
     folder.mkdir()
     copy.write(folder / "copy.urdf")
@@ -68,33 +62,33 @@ def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_pat
     assert shape.source().path() == folder / "meshes" / "skin.gltf"
 
 
-def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(
-    tmp_path, copied, monkeypatch
-):
+def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     stl(tmp_path / "skin.stl", TRIANGLE)
-    copy = copied(mesh("visual", "skin.stl"))
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
     (note,) = copy.left_out
     assert "left out: skin.stl; install their converter by `pip install" in note
     assert "'drake_safety[robots]'" in note
     assert list(copy.root.iter("visual")) == [] and copy.meshes == {}
 
 
-def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_path, copied):
+def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_path):
     pytest.importorskip("trimesh")
     (tmp_path / "broken.dae").write_text("no mesh")
-    copy = copied(mesh("visual", "gone.stl") + mesh("visual", "broken.dae"))
+    shapes = mesh("visual", "gone.stl") + mesh("visual", "broken.dae")
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
     missing, broken = copy.left_out
     assert missing == "visual meshes that are not where the URDF says are left out: gone.stl"
     assert "broken.dae' cannot be read" in broken
     assert copy.notes == copy.left_out
 
 
-def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path, copied):
+def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
     for name, x in (("left", 1), ("right", 2)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "hull.obj").write_text(f"v {x} 0 0\n")
-    copy = copied(mesh("visual", "left/hull.obj") + mesh("visual", "right/hull.obj"))
+    shapes = mesh("visual", "left/hull.obj") + mesh("visual", "right/hull.obj")
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
     folder = tmp_path / "written"
     folder.mkdir()
     copy.write(folder / "copy.urdf")
@@ -102,10 +96,11 @@ def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path, copied):
     assert texts == ["v 1 0 0\n", "v 2 0 0\n"]
 
 
-def test_a_mesh_of_an_installed_package_is_found(copied):
+def test_a_mesh_of_an_installed_package_is_found(tmp_path):
     pytest.importorskip("trimesh")
     url = "package://example-robot-data/robots/hyq_description/meshes/leg/lowerleg.dae"
-    assert list(copied(mesh("visual", url)).meshes) == ["meshes/lowerleg.gltf"]
+    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", url))))
+    assert list(copy.meshes) == ["meshes/lowerleg.gltf"]
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply"])

@@ -14,14 +14,6 @@ from legged_robots import write_biped, write_hexapod, write_porter
 WRITERS = {"hexapod": write_hexapod, "biped": write_biped, "porter": write_porter}
 
 
-def rewritten(urdf, edit):
-    """A survey of a URDF whose element tree was changed."""
-    root = ElementTree.parse(urdf).getroot()
-    edit(root)
-    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
-    return Survey(urdf)
-
-
 @pytest.fixture(scope="module", params=WRITERS)
 def surveyed(request, tmp_path_factory):
     """A made-up robot: what is found, and what its own robot.yaml says."""
@@ -86,23 +78,27 @@ def test_the_posture_of_a_robot_of_the_package_is_near_the_published_one():
 
 def test_a_joint_that_cannot_be_at_zero_is_off_its_stop(tmp_path):
     write_porter(tmp_path)
-    stops = "joint[@name='left_elbow']/limit"
-    survey = rewritten(
-        tmp_path / "porter.urdf",
-        lambda root: root.find(stops).attrib.update(lower="0.3", upper="1.9"),
-    )
+    urdf = tmp_path / "porter.urdf"
+    root = ElementTree.parse(urdf).getroot()
+    stops = root.find("joint[@name='left_elbow']/limit")
+    stops.set("lower", "0.3")
+    stops.set("upper", "1.9")
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    survey = Survey(urdf)
     assert survey.posture()["left_elbow"] == pytest.approx(0.35)
     assert solve_standing_posture(survey, survey.legs())["left_elbow"] == pytest.approx(0.35)
 
 
 def test_feet_are_put_under_a_centre_of_mass_that_is_not_over_them(tmp_path):
-    def shift(root):
-        origin = root.find("link[@name='pelvis']/inertial/origin")
-        x, *rest = origin.get("xyz").split()
-        origin.set("xyz", " ".join([f"{float(x) + 0.15}", *rest]))
-
     write_biped(tmp_path)
-    survey = rewritten(tmp_path / "biped.urdf", shift)
+    urdf = tmp_path / "biped.urdf"
+    survey = Survey(urdf)
+    root = ElementTree.parse(urdf).getroot()
+    origin = root.find(f"link[@name='{survey.base}']/inertial/origin")
+    x, y, z = map(float, origin.get("xyz").split())
+    origin.set("xyz", f"{x + 0.15} {y} {z}")
+    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+    survey = Survey(urdf)
     legs = survey.legs()
     solve_standing_posture(survey, legs)
     points = np.concatenate([survey.positions(leg) for leg in legs])
