@@ -1,9 +1,9 @@
 """Figures of Atlas as published, every fixed link by itself.
 
 Source: RobotLocomotion/models, atlas/atlas_minimal_contact.urdf. Left out: four optical frames that
-have neither mass nor anything fixed to them, and the contact points between heel and toe. The
-standing posture: junhyeokahn/PyPnC, simulator/pybullet/atlas_dynamics_main.py, with the left
-elbow's signs inside the limits here.
+have neither mass nor anything fixed to them, twelve that only repeat the spindle's own, and the
+contact points between heel and toe. The standing posture: junhyeokahn/PyPnC,
+simulator/pybullet/atlas_dynamics_main.py, with the left elbow's signs inside the limits here.
 """
 
 import math
@@ -96,19 +96,7 @@ _FIXED = """
 r_situational_awareness_camera_link utorso 0.155 -0.121 0.785 0 0 -1.309
 l_situational_awareness_camera_link utorso 0.155 0.121 0.785 0 0 1.309
 pre_spindle head -0.0446 0 0.088 0 0 0
-pre_spindle_cal_x pre_spindle 0 0 0 0 0 0
-pre_spindle_cal_y pre_spindle_cal_x 0 0 0 0 0 0
-pre_spindle_cal_z pre_spindle_cal_y 0 0 0 0 0 0
-pre_spindle_cal_roll pre_spindle_cal_z 0 0 0 0 0 0
-pre_spindle_cal_pitch pre_spindle_cal_roll 0 0 0 0 0 0
-pre_spindle_cal_yaw pre_spindle_cal_pitch 0 0 0 0 0 0
-post_spindle pre_spindle_cal_yaw 0 0 0 0 0 0
-post_spindle_cal_x post_spindle 0 0 0 0 0 0
-post_spindle_cal_y post_spindle_cal_x 0 0 0 0 0 0
-post_spindle_cal_z post_spindle_cal_y 0 0 0 0 0 0
-post_spindle_cal_roll post_spindle_cal_z 0 0 0 0 0 0
-post_spindle_cal_pitch post_spindle_cal_roll 0 0 0 0 0 0
-hokuyo_link post_spindle_cal_pitch 0 0 0 0 0 0
+hokuyo_link pre_spindle 0 0 0 0 0 0
 head_hokuyo_frame hokuyo_link 0.03 0 0.015 0 0 0
 left_camera_frame head 0 0.035 -0.002 0 0 0
 right_camera_frame head 0 -0.035 -0.002 0 0 0

@@ -7,9 +7,16 @@ import pytest
 from drake_safety import cli
 
 
-def call(monkeypatch, *arguments):
+def call(monkeypatch, *arguments, main=cli.main):
     """Runs the command as a shell would; returns its exit code."""
     monkeypatch.setattr(sys, "argv", ["drake-safety", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return ended.value.code
+        main()
+    return ended.value.code or 0
+
+
+def study(monkeypatch, *arguments):
+    """The same of ``python -m studies``."""
+    from studies.__main__ import main
+
+    return call(monkeypatch, *arguments, main=main)

@@ -1,6 +1,7 @@
 """Figures of Laikago as published, every fixed link by itself.
 
-Source: unitreerobotics/unitree_ros, robots/laikago_description/urdf/laikago.urdf.
+Source: unitreerobotics/unitree_ros, robots/laikago_description/urdf/laikago.urdf. Left
+out: the shoulders' frames, which have no mass.
 """
 
 from published_robots import PublishedRobot, read_fixed, read_joints, read_links
@@ -42,15 +43,11 @@ RL_thigh_joint RL_hip RL_thigh 0 0.037 0 0 0 0 0 1 0 -0.523598775598 3.926990816
 RL_calf_joint RL_thigh RL_calf 0 0 -0.25 0 0 0 0 1 0 -2.77507351067 -0.610865238198 55 28.6 0
 """
 
-# Child, parent, origin, roll pitch yaw. Links that are not in the table above have no mass.
+# Child, parent, origin, roll pitch yaw.
 _FIXED = """
-FR_thigh_shoulder FR_hip 0 -0.059 0 0 0 0
 FR_foot FR_calf 0 0 -0.25 0 0 0
-FL_thigh_shoulder FL_hip 0 0.059 0 0 0 0
 FL_foot FL_calf 0 0 -0.25 0 0 0
-RR_thigh_shoulder RR_hip 0 -0.059 0 0 0 0
 RR_foot RR_calf 0 0 -0.25 0 0 0
-RL_thigh_shoulder RL_hip 0 0.059 0 0 0 0
 RL_foot RL_calf 0 0 -0.25 0 0 0
 """
 

@@ -3,7 +3,11 @@
 import dataclasses
 import functools
 
+import numpy as np
+
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.calibration import PLAN, Calibration
+from drake_safety.learning.embedding import MapData
 from drake_safety.learning.feedback import feedback_sets
 from drake_safety.learning.segments import Episodes, split
 from lip_episodes import make_episodes
@@ -34,6 +38,15 @@ def quick_assessment(mode):
     return SafetyAssessment(AssessmentParameters(mode=mode, **QUICK)).fit(quick_episodes())
 
 
+def map_data(x, target, **changes):
+    """What a map learns of inputs that are all safe and have no margins."""
+    n = len(x)
+    values = dict(x=x, target=target, has_target=np.ones(n, dtype=bool), tsne_unit=1.0)
+    values |= dict(is_unsafe=np.zeros(n, dtype=bool), margins=np.zeros((n, 0)))
+    values |= dict(sample_weight=np.ones(n), input_scale=np.ones(x.shape[1]))
+    return MapData(**values | {"neighbours": np.full((n, 1), -1)} | changes)
+
+
 def inputs(segments, rows=slice(None)):
     return segments.state[rows], segments.desired_preview[rows], segments.features[rows]
 
@@ -58,3 +71,16 @@ def worse(num=NUM_PAIRS):
 
 def better(num=NUM_PAIRS):
     return pairs_with(lambda episode: not episode.is_safe and episode.index % 2 == 0, num)
+
+
+def calibration(**changes):
+    values = dict(kind=PLAN, miss_rate=0.05, false_alarm_rate=0.1, confidence=None)
+    values |= dict(threshold=0.8, unsafe_below=0.3, num_unsafe=40, num_safe=60, num_missed=1)
+    values |= dict(num_accepted=50, seed=7, scenario_hash="abc")
+    return Calibration(**values | changes)
+
+
+def scored_episodes(rng, n=1000, apart=3.0):
+    """Unsafe scores of episodes of two classes that overlap, and which are unsafe."""
+    label = rng.random(n) < 0.5
+    return 1.0 / (1.0 + np.exp(-(rng.normal(size=n) + apart * (label - 0.5)))), label

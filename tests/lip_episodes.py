@@ -16,15 +16,8 @@ _OMEGA = np.sqrt(9.81 / 0.42)
 _SUBSTEPS = 8
 
 
-def make_episodes(
-    num_episodes: int,
-    *,
-    seed: int = 0,
-    num_states: int = 6,
-    num_features: int = 5,
-    noise: float = 0.0,
-) -> Episodes:
-    """Rolls out `num_episodes` pendulums; further columns are mixtures."""
+def make_episodes(num_episodes: int, *, seed: int = 0, noise: float = 0.0) -> Episodes:
+    """Rolls out `num_episodes` pendulums."""
     draws = [
         np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,))).normal(
             size=(NUM_STEPS + 2, 24)
@@ -56,9 +49,6 @@ def make_episodes(
             v = v + dt * (np.column_stack([horizontal, vertical]) + gust)
             p = p + dt * v
 
-    mixing = np.random.default_rng(12345)
-    state_mix = mixing.normal(size=(6, max(num_states - 6, 0)))
-    feature_mix = mixing.normal(size=(5, max(num_features - 5, 0)))
     episodes = []
     for i in range(num_episodes):
         true_state = states[i]
@@ -68,18 +58,17 @@ def make_episodes(
         last = NUM_STEPS if is_safe else int(violated[0])
         rows = slice(0, last + 1)
         seen = true_state[rows] + noise * normal[i, 1 : last + 2, 9:15]
-        features = _features(seen, desired[i, : last + 1])
         windows = np.stack([desired[i, r : r + HORIZON].ravel() for r in range(last + 1)])
         episodes.append(
             Episode(
                 index=i,
                 time_s=STEP_S * np.arange(last + 1),
-                state=np.hstack([seen, np.sin(seen @ state_mix)]),
-                true_state=np.hstack([true_state[rows], np.sin(true_state[rows] @ state_mix)]),
+                state=seen,
+                true_state=true_state[rows].copy(),
                 output=true_state[rows, :3].copy(),
                 desired_output=desired[i, : last + 1].copy(),
                 desired_preview=windows,
-                features=np.hstack([features, np.sin(features @ feature_mix)]),
+                features=_features(seen, desired[i, : last + 1]),
                 margins=margins[rows],
                 is_safe=is_safe,
                 cause="" if is_safe else ("support", "height")[int(np.argmin(margins[last]))],
@@ -94,9 +83,9 @@ def make_episodes(
         step_s=STEP_S,
         horizon=HORIZON,
         constraint_names=["support", "height"],
-        state_names=[f"state_{i}" for i in range(max(num_states, 6))],
+        state_names=[f"state_{i}" for i in range(6)],
         output_names=["x", "y", "z"],
-        feature_names=[f"feature_{i}" for i in range(max(num_features, 5))],
+        feature_names=[f"feature_{i}" for i in range(5)],
         versions={"lip": "1"},
         num_steps=NUM_STEPS,
     )

@@ -10,6 +10,8 @@ from drake_safety.simulation.dataset import EpisodeWriter
 from lip_episodes import make_episodes
 
 MODES = ("sharpened", "paper")
+QUICKEST = dict(epochs=2, ensemble_size=1, hidden_sizes=[16], perplexity=10, min_count=3)
+QUICKEST |= dict(resolution=6, cell_length=20.0)
 SCENARIO = "name: lip\ntask: nowhere.to_be:Found\nrobot: pendulum\nparameters: {push: {}}\n"
 
 
@@ -20,26 +22,19 @@ def make_figures():
         for kind in ("segments", "episodes"):
             for column in ("auc", "safe_recall", "unsafe_recall", "brier"):
                 estimates[f"{kind}.{name}.{column}"] = proportion(count, 60)
-        prefix = f"throws.{name}."
-        estimates[f"{prefix}threshold"] = proportion(24, 60)
-        estimates[f"{prefix}falls_with_recovery"] = proportion(60 - count, 60)
-        estimates[f"{prefix}false_triggers"] = proportion(2, 30)
-        estimates[f"{prefix}falls_missed"] = proportion(0, 20)
+        estimates[f"throws.{name}.threshold"] = proportion(24, 60)
+        estimates[f"throws.{name}.falls_with_recovery"] = proportion(60 - count, 60)
+        estimates[f"throws.{name}.false_triggers"] = proportion(2, 30)
+        estimates[f"throws.{name}.falls_missed"] = proportion(0, 20)
     estimates["throws.falls_without_recovery"] = proportion(20, 60)
     estimates["calibration.plan.sharpened.miss_rate"] = proportion(1, 40)
     return estimates
 
 
 def write_evaluation(folder, scenario_hash="0" * 64):
-    entries = {
-        "command": "drake-safety evaluate lip --assessment /somebodys/own/lip --episodes 60",
-        "scenario": "lip",
-        "scenario_hash": scenario_hash,
-        "seed": 1000,
-        "training_seed": 0,
-        "training_episodes": 60,
-        "versions": {"lip": "1"},
-    }
+    command = "drake-safety evaluate lip --assessment /somebodys/own/lip --episodes 60"
+    entries = {"command": command, "scenario": "lip", "scenario_hash": scenario_hash}
+    entries |= {"seed": 1000, "training_seed": 0, "training_episodes": 60, "versions": {"lip": "1"}}
     Results(make_figures(), entries).write(folder / "evaluation.json")
 
 
@@ -52,16 +47,7 @@ def write_run(folder):
             writer.append(episode)
     assessments = {}
     for mode in MODES:
-        parameters = AssessmentParameters(
-            mode=mode,
-            epochs=2,
-            ensemble_size=1,
-            hidden_sizes=[16],
-            perplexity=10,
-            min_count=3,
-            resolution=6,
-            cell_length=20.0,
-        )
+        parameters = AssessmentParameters(mode=mode, **QUICKEST)
         assessments[mode] = SafetyAssessment(parameters).fit(episodes)
         assessments[mode].save(folder / f"{mode}.safetensors")
     write_evaluation(folder)

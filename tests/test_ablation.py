@@ -1,5 +1,3 @@
-"""Ablations on pendulums: one choice changed at a time, everyone judged alike, and resumed."""
-
 from dataclasses import asdict, replace
 from functools import partial
 
@@ -103,18 +101,6 @@ def test_a_shorter_horizon_is_the_beginning_of_what_was_recorded(sets):
     np.testing.assert_array_equal(same[3].desired_preview, episodes[3].desired_preview)
 
 
-def test_everyone_is_judged_at_the_baselines_rows(sets):
-    scores = unsafe_scores(Variant(name="horizon", changes={"horizon": 5}), BASE, *sets)
-    assert len(scores["test"]) == len(judged_segments(sets[2], BASE))
-    assert len(scores["calibration"]) == len(judged_segments(sets[1], BASE))
-
-
-def test_what_cannot_be_learned_says_why(sets):
-    crowded = Variant(name="crowded", changes={"perplexity": 5000.0})
-    found = unsafe_scores(crowded, BASE, *sets)
-    assert "needs more than 15000 segments" in str(found["failed"])
-
-
 def test_each_variant_makes_one_choice_otherwise():
     base = AssessmentParameters(shortest_segment=8)
     rates = ["velocity_x", "capture_point"]
@@ -136,3 +122,11 @@ def test_each_variant_makes_one_choice_otherwise():
     assert {v.num_episodes for v in found if "episodes" in v.name} == {25, 50, 100}
     assert [list(v.without) for v in found if "velocities" in v.name] == [rates[:1], rates]
     assert not any(variant.without for variant in list_of(rate_names=[]))
+
+
+def test_everyone_is_judged_at_the_baselines_rows_and_what_cannot_be_learned_says_why(sets):
+    scores = unsafe_scores(Variant(name="horizon", changes={"horizon": 5}), BASE, *sets)
+    assert len(scores["test"]) == len(judged_segments(sets[2], BASE))
+    assert len(scores["calibration"]) == len(judged_segments(sets[1], BASE))
+    crowded = Variant(name="crowded", changes={"perplexity": 5000.0})
+    assert "needs more than 15000" in str(unsafe_scores(crowded, BASE, *sets)["failed"])

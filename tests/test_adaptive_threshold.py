@@ -1,5 +1,3 @@
-"""AdaptiveThreshold: the promised miss rate in the long run, whatever the robot does."""
-
 import math
 
 import numpy as np

@@ -1,15 +1,10 @@
-"""Alarms on motions worked out by hand."""
-
 import math
 
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.verdict_tables import verdict_table
 from studies.alarms import (
-    ALARMS,
     Alarm,
     WatchedMotion,
     accepted,
@@ -45,12 +40,12 @@ def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
     )
 
 
-def seen(name="sharpened", delay_rows=0):
+def seen(delay_rows=0):
     def value(motion):
         calm = motion.state[:, 0]
         return np.concatenate([np.ones(delay_rows), calm[: len(calm) - delay_rows]])
 
-    return Alarm(name=name, value=value)
+    return Alarm(name="sharpened", value=value)
 
 
 CALM = [motion_of(i, {1.1: 0.9 - 0.01 * i}) for i in range(20)]
@@ -77,13 +72,9 @@ def test_what_is_noticed_is_noticed_between_push_and_leaving():
     assert estimates["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
     assert estimates["monitoring.motions.leave_safe_set"].value == 4 / 6
     assert estimates["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
-
-
-def test_who_sees_the_same_later_has_that_much_less_time():
+    # Who sees the same later has that much less time.
     late = figures_of(seen(delay_rows=2))
-    prompt = figures_of(seen())
-    lead = [f["monitoring.sharpened.lead_to_fall_s"].value for f in (prompt, late)]
-    assert lead[0] - lead[1] == pytest.approx(0.2)
+    assert late["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.5 + 0.1) / 2)
     assert late["monitoring.sharpened.detected"].value == 1 / 4
 
 
@@ -107,23 +98,17 @@ def test_false_alarms_are_counted_once_a_motion_over_all_hours():
 
 
 def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
+    alarm = Alarm(name="one", value=lambda m: 39.37 * m.state[:, 0] - 20.0)
+
+    def num_cries(threshold):
+        return sum(math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM)
+
     for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
-        for scale in (1.0, -3.0 + 4.0):
-            alarm = Alarm(name="one", value=lambda m, scale=scale: scale * m.state[:, 0] - 5.0)
-            found = figures_of(alarm, false_alarm_share=share)
-            threshold = found["monitoring.one.threshold"].value
-            cries = [math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM]
-            assert sum(cries) == count
-            # No higher threshold would do.
-            higher = threshold + 0.011
-            assert sum(math.isfinite(first_alarm(m, alarm.value(m), higher)) for m in CALM) > count
-
-
-def test_an_alarm_is_the_same_in_whatever_unit_it_is_measured():
-    metres = figures_of(seen())
-    inches = figures_of(Alarm(name="sharpened", value=lambda m: 39.37 * m.state[:, 0] - 20.0))
-    for key in metres.keys() - {"monitoring.sharpened.threshold"}:
-        np.testing.assert_equal(metres[key], inches[key])
+        found = figures_of(alarm, false_alarm_share=share)
+        threshold = found["monitoring.one.threshold"].value
+        assert num_cries(threshold) == count < num_cries(threshold + 39.37 * 0.011)
+    with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
+        equal_share_threshold(np.array([]), 0.1)
 
 
 def test_who_does_not_know_cries():
@@ -148,11 +133,6 @@ def test_motions_that_leave_before_the_push_are_left_out():
     found = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
     assert found["monitoring.motions.left_out"].value == 2 / 8
     assert found["monitoring.sharpened.auc"].n == 6
-
-
-def test_a_threshold_that_cannot_be_chosen_is_refused():
-    with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
-        equal_share_threshold(np.array([]), 0.1)
 
 
 def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
@@ -180,14 +160,6 @@ def test_what_an_engineer_would_watch_is_found_by_name():
         {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
     )
     assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
-
-
-def test_the_table_says_where_another_alarm_is_ahead():
-    found = evaluate_alarms([seen(delay_rows=1), seen("tilt")], CALM, TEST, num_rows=1)
-    table = verdict_table(Results(found), "monitoring", kind=ALARMS)
-    assert [row.key for row in table.rows] == ["sharpened", "tilt"]
-    (first, *_) = table.better_baselines()
-    assert first.startswith("detection rate: tilt, 50.0 % against 25.0 %")
 
 
 def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():

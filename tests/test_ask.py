@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import command_line
+from drake_safety.cli import join_targets
 from drake_safety.cli.target_run import alarm_row, named_push
-from drake_safety.cli.targets import join_targets, parse_target
+from drake_safety.cli.targets import parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results

@@ -1,3 +1,4 @@
+import operator
 import subprocess
 import sys
 from dataclasses import fields
@@ -6,23 +7,27 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import split
 from drake_safety.learning.training import segments_for
-from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
+from lip_assessments import (
+    QUICK,
+    calibration,
+    held_out_segments,
+    inputs,
+    quick_assessment,
+    quick_episodes,
+)
 from lip_episodes import make_episodes
 
 pytestmark = pytest.mark.train
 
 
-@pytest.fixture(scope="module")
-def episodes():
-    return quick_episodes()
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def held_out():
     return held_out_segments()
 
@@ -30,12 +35,6 @@ def held_out():
 @pytest.fixture(scope="module", params=["sharpened", "paper"])
 def assessment(request):
     return quick_assessment(request.param)
-
-
-def area_under_curve(score, is_positive):
-    positive, negative = score[is_positive], score[~is_positive]
-    difference = positive[:, None] - negative
-    return ((difference > 0.0) + 0.5 * (difference == 0.0)).mean()
 
 
 def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
@@ -47,22 +46,18 @@ def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
 
 def test_held_out_episodes_are_told_apart(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
-    area = area_under_curve(result.belief[:, 0], ~held_out.is_unsafe)
+    area = area_under_curve(-result.belief[:, 0], held_out.is_unsafe)
     assert area > (0.88 if assessment.parameters.is_sharpened else 0.75)
-
-
-def test_masses_sum_to_one_and_causes_to_the_unsafe_mass(assessment, held_out):
-    result = assessment.predict(*inputs(held_out))
-    np.testing.assert_allclose(result.belief.sum(axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose(result.cause_probability.sum(axis=1), result.belief[:, 1])
-    assert np.all(result.belief >= 0.0)
-    assert np.all(result.belief[:, 0] <= 0.7 + 1e-9)
 
 
 def test_the_probability_is_b_safe_without_heads_and_zero_where_it_is_dont_know(
     assessment, held_out
 ):
     result = assessment.predict(*inputs(held_out))
+    np.testing.assert_allclose(result.belief.sum(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(result.cause_probability.sum(axis=1), result.belief[:, 1])
+    assert np.all(result.belief >= 0.0)
+    assert np.all(result.belief[:, 0] <= 0.7 + 1e-9)
     assert np.all((result.probability >= 0.0) & (result.probability <= 1.0))
     unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
     assert unknown.any() and not unknown.all()
@@ -124,20 +119,6 @@ def test_an_input_that_is_not_finite_gets_the_empty_belief(assessment, held_out,
     assert result.belief[0, 2] < 1.0
 
 
-def test_other_beliefs_may_be_given_in_place_of_the_learned_ones(assessment, held_out):
-    beliefs = np.zeros_like(assessment.beliefs_)
-    beliefs[..., 1] = beliefs[..., 3] = 1.0
-    result = assessment.predict(*inputs(held_out, slice(0, 50)), beliefs=beliefs)
-    is_inside = result.belief[:, 2] < 1e-9
-    assert is_inside.mean() > 0.9
-    np.testing.assert_allclose(result.belief[is_inside, 1], 1.0)
-    np.testing.assert_allclose(result.cause_probability[is_inside, 0], 1.0)
-    one = assessment.predict_one(*inputs(held_out, 0), beliefs=beliefs)
-    np.testing.assert_allclose(one.belief, result.belief[0], atol=1e-9)
-    with pytest.raises(ValueError, match="the shape of beliefs is"):
-        assessment.predict(*inputs(held_out), beliefs=beliefs[:, 1:])
-
-
 def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessment):
     cells = assessment.grid_.locate(assessment.training_.points[0])
     filled, counts = np.unique(cells[cells >= 0], return_counts=True)
@@ -165,28 +146,6 @@ def test_predicted_margins_and_causes_name_what_will_be_violated(assessment, hel
     assert (named == held_out.cause)[is_clear].mean() > 0.9
 
 
-def test_the_same_seed_learns_the_same_assessment(episodes):
-    parameters = AssessmentParameters(**{**QUICK, "epochs": 1})
-    first, again = (SafetyAssessment(parameters).fit(episodes[:60]) for _ in range(2))
-    np.testing.assert_array_equal(first.beliefs_, again.beliefs_)
-    np.testing.assert_array_equal(first.training_.points, again.training_.points)
-
-
-def test_progress_runs_through_the_stages(episodes):
-    seen = []
-    SafetyAssessment(AssessmentParameters(**{**QUICK, "epochs": 1})).fit(
-        episodes[:60], lambda stage, fraction: seen.append((stage, fraction))
-    )
-    assert list(dict.fromkeys(stage for stage, _ in seen)) == [
-        "distances",
-        "t-SNE",
-        "training",
-        "innovation",
-        "beliefs",
-    ]
-    assert all(0.0 <= fraction <= 1.0 for _, fraction in seen)
-
-
 def test_a_loaded_assessment_runs_with_numpy_alone(assessment, held_out, tmp_path):
     path = tmp_path / "assessment.safetensors"
     assessment.save(path)
@@ -205,74 +164,11 @@ sys.exit(", ".join(heavy & set(sys.modules)) or 0)
     assert result.returncode == 0, result.stderr
 
 
-def test_inputs_of_another_width_are_refused_with_the_expected_one(assessment, held_out):
-    state, preview, features = inputs(held_out)
-    with pytest.raises(ValueError, match=r"of 'lip': state has the shape \(\d+, 5\), expected \("):
-        assessment.predict(state[:, 1:], preview, features)
-    with pytest.raises(ValueError, match=r"state has the shape \(5,\), expected \(6,\)"):
-        assessment.predict_one(state[0, 1:], preview[0], features[0])
-    with pytest.raises(ValueError, match="predict assesses many inputs"):
-        assessment.predict_one(state, preview, features)
-
-
-def test_episodes_of_another_horizon_and_too_few_episodes_are_refused(episodes):
-    with pytest.raises(ValueError, match="'lip' is 10"):
-        SafetyAssessment(AssessmentParameters(horizon=12)).fit(episodes)
-    with pytest.raises(ValueError, match="needs more than 90 segments"):
-        SafetyAssessment(AssessmentParameters()).fit(episodes[:2])
-
-
-def test_nothing_can_be_asked_before_something_is_learned():
-    with pytest.raises(ValueError, match="not fitted"):
-        SafetyAssessment().predict(np.zeros((1, 6)), np.zeros((1, 30)))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("mode", "blunt"),
-        ("discount", 1.1),
-        ("initial_uncertainty", -0.1),
-        ("min_count", 0),
-        ("cell_length", 0.0),
-        ("dropout", 1.0),
-        ("hidden_sizes", []),
-        ("margin_range", [0.1, -0.1]),
-        ("discount", float("nan")),
-    ],
-)
-def test_parameters_out_of_range_are_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=name):
-        AssessmentParameters(**{name: value})
-    learner = SafetyAssessment()
-    setattr(learner.parameters, name, value)
-    with pytest.raises(ValueError, match=name):
-        learner.fit(None)
-
-
-@pytest.mark.parametrize(("part", "name"), [("paper", "loss"), ("adaptation", "count")])
-def test_parameters_of_parts_are_checked_before_learning_too(part, name):
-    learner = SafetyAssessment()
-    setattr(getattr(learner.parameters, part), name, "sharp")
-    with pytest.raises(ValueError, match=f"{name} is sharp"):
-        learner.fit(None)
-
-
-def test_the_defaults_are_the_papers_table():
-    parameters = AssessmentParameters()
-    assert parameters.discount == 0.99
-    assert parameters.horizon == 10
-    assert parameters.score_weight == 0.01
-    assert parameters.initial_uncertainty == 0.3
-    assert parameters.min_count == 5
-    assert (parameters.resolution, parameters.cell_length) == (14, 10.0)
-
-
-def test_features_may_enter_a_second_time_spread_out_near_zero(episodes, held_out):
+def test_features_may_enter_a_second_time_spread_out_near_zero(held_out):
     parameters = AssessmentParameters(
         feature_unit=0.05, raw_input_scale=0.2, **QUICK | {"epochs": 1}
     )
-    doubled = SafetyAssessment(parameters).fit(episodes[:60])
+    doubled = SafetyAssessment(parameters).fit(quick_episodes()[:60])
     info = doubled.info_
     num_raw = len(info.state_names) + info.horizon * len(info.output_names)
     assert doubled.embedding_.num_inputs == num_raw + 2 * len(info.feature_names)
@@ -284,45 +180,60 @@ def test_features_may_enter_a_second_time_spread_out_near_zero(episodes, held_ou
     assert np.all(doubled.predict(state, preview, features).belief == EMPTY)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"raw_input_scale": 0.0}, {"feature_unit": -1.0}, {"shortest_segment": 11}]
-)
-def test_scales_and_lengths_that_mean_nothing_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        AssessmentParameters(**wrong)
+def test_an_assessment_says_scenario_mode_and_counts(assessment):
+    mode = assessment.parameters.mode
+    assert repr(SafetyAssessment()) == "SafetyAssessment(mode 'sharpened', not fitted)"
+    told = repr(assessment)
+    assert told.startswith(f"SafetyAssessment('lip', mode '{mode}', ")
+    assert told.endswith(f"training on {len(quick_episodes())} episodes of 'nominal')")
 
 
-def trained_on(episodes, **changes):
-    quick = QUICK | {"epochs": 1, "ensemble_size": 1} | changes
-    return SafetyAssessment(AssessmentParameters(**quick)).fit(episodes)
-
-
-def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_for(episodes):
-    few = episodes[:40]
-    sizes = {}
+@pytest.mark.parametrize("mode", ["sharpened", "paper"])
+def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_for(mode):
+    few, sizes = quick_episodes()[:40], {}
     for shortest in (0, 10, 3):
-        learned = trained_on(few, shortest_segment=shortest)
-        expected = split(few, stride=1, discount=0.99, shortest=shortest or None)
-        sizes[shortest] = len(segments_for(few, learned.parameters)[0])
+        parameters = AssessmentParameters(mode=mode, shortest_segment=shortest)
+        is_asked = shortest and mode == "sharpened"  # The paper's mode knows none.
+        expected = split(few, stride=1, discount=0.99, shortest=shortest if is_asked else None)
+        sizes[shortest] = len(segments_for(few, parameters)[0])
         assert sizes[shortest] == len(expected)
-    assert sizes[0] == sizes[10] < sizes[3]  # The horizon is 10.
+    assert sizes[0] == sizes[10]  # The horizon.
+    assert (sizes[3] > sizes[0]) == (mode == "sharpened")
 
 
-def test_the_papers_mode_knows_no_short_segments(episodes):
-    few = episodes[:60]
-    learned = [trained_on(few, mode="paper", shortest_segment=n, perplexity=5.0) for n in (0, 3)]
-    sizes = {len(segments_for(few, assessment.parameters)[0]) for assessment in learned}
-    assert sizes == {len(split(few, stride=1, discount=0.99))}
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda a, s, p, f: a.predict(s[:, 1:], p, f), r"of 'lip': state .*\d+, 5\), expected \("),
+        (lambda a, s, p, f: a.predict_one(s[0, 1:], p[0], f[0]), r"shape \(5,\), expected \(6,\)"),
+        (lambda a, s, p, f: a.predict_one(s, p, f), "predict assesses many inputs"),
+        (
+            lambda a, s, p, f: a.predict(s, p, f, beliefs=a.beliefs_[:, 1:]),
+            "the shape of beliefs is",
+        ),
+        (lambda a, s, p, f: a.predict(p, s, f), r"state has the shape \(\d+, \d+\), exp"),
+        (
+            lambda a, s, p, f: a.predict(s, np.hstack([p, p[:, :1]]), f),
+            r"desired_preview has the shape \(\d+, \d+\), exp",
+        ),
+        (
+            lambda a, s, p, f: a.predict(s, p[1:], f),
+            r"desired_preview has the shape \((\d+), \d+\), expected \((?!\1)\d+, \d+\), as",
+        ),
+        (lambda a, s, p, f: a.predict(s[0], p[0], f[0]), r"shape \(6,\), expected \(N, n_s\)"),
+        (
+            lambda a, s, p, f: a.predict([["three"] * 6], p[:1], f[:1]),
+            r"state must be an array of numbers: .*'three'",
+        ),
+    ],
+)
+def test_inputs_that_do_not_fit_are_refused_by_name(assessment, held_out, ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask(assessment, *inputs(held_out))
 
 
-def test_parts_of_the_input_that_are_swapped_are_refused_by_name(assessment, held_out):
+def test_features_that_do_not_fit_are_refused_where_they_are_used(assessment, held_out):
     state, preview, features = inputs(held_out)
-    for name, swapped in {
-        "state": (preview, state, features),
-        "desired_preview": (state, np.hstack([preview, preview[:, :1]]), features),
-    }.items():
-        with pytest.raises(ValueError, match=rf"{name} has the shape \({len(state)}, \d+\), exp"):
-            assessment.predict(*swapped)
     if assessment.parameters.is_sharpened:
         with pytest.raises(ValueError, match=r"features has the shape"):
             assessment.predict(state, preview, features[:, :-1])
@@ -330,31 +241,32 @@ def test_parts_of_the_input_that_are_swapped_are_refused_by_name(assessment, hel
             assessment.predict(state, preview)
 
 
-def test_inputs_of_other_lengths_a_single_one_and_words_are_refused_by_name(assessment, held_out):
-    state, preview, features = inputs(held_out)
-    n, width = preview.shape
-    message = rf"desired_preview has the shape \({n - 1}, {width}\), expected \({n}, {width}\), as"
+@pytest.mark.parametrize(
+    ("name", "value", "num_episodes", "message"),
+    [
+        ("horizon", 12, 40, "'lip' is 10"),
+        ("horizon", 10, 2, "needs more than 90 segments"),
+        ("discount", 1.1, 40, "discount"),
+        ("paper.loss", "sharp", 40, "loss is sharp"),
+        ("adaptation.count", "sharp", 40, "count is sharp"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused_and_nothing_is_known(name, value, num_episodes, message):
+    learner = SafetyAssessment()
+    part, _, name = name.rpartition(".")
+    setattr(operator.attrgetter(f"parameters.{part}".rstrip("."))(learner), name, value)
     with pytest.raises(ValueError, match=message):
-        assessment.predict(state, preview[1:], features)
-    with pytest.raises(ValueError, match=r"state has the shape \(6,\), expected \(N, n_s\)"):
-        assessment.predict(state[0], preview[0], features[0])
-    with pytest.raises(ValueError, match=r"state must be an array of numbers: .*'three'"):
-        assessment.predict([["three"] * 6], preview[:1], features[:1])
-
-
-def test_an_assessment_says_scenario_mode_and_counts(assessment, episodes):
-    mode = assessment.parameters.mode
-    assert repr(SafetyAssessment()) == "SafetyAssessment(mode 'sharpened', not fitted)"
-    told = repr(assessment)
-    assert told.startswith(f"SafetyAssessment('lip', mode '{mode}', ")
-    assert told.endswith(f"training on {len(episodes)} episodes of 'nominal')")
+        learner.fit(quick_episodes()[:num_episodes])
+    with pytest.raises(ValueError, match="not fitted"):
+        learner.predict(np.zeros((1, 6)), np.zeros((1, 30)))
 
 
 def test_learning_gives_the_same_bits_for_any_number_of_threads():
-    episodes, found = make_episodes(120, noise=0.002), []
+    episodes, found, seen = make_episodes(120, noise=0.002), [], []
     for number in (1, 2):
         with threadpool_limits(number):
-            found.append(SafetyAssessment(AssessmentParameters(**QUICK)).fit(episodes))
+            learner = SafetyAssessment(AssessmentParameters(**QUICK))
+            found.append(learner.fit(episodes, lambda *report: seen.append(report)))
     one, other = found
     np.testing.assert_array_equal(one.beliefs_, other.beliefs_)
     for name in ("points", "heads"):
@@ -363,3 +275,105 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
     for name, array in one.innovation_.arrays().items():
         np.testing.assert_array_equal(array, other.innovation_.arrays()[name], err_msg=name)
+    stages = ["distances", "t-SNE", "training", "innovation", "beliefs"]
+    assert list(dict.fromkeys(stage for stage, *_ in seen)) == stages
+    assert all(0 <= done <= total == 100 for _, done, total in seen)
+
+
+def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    loaded = SafetyAssessment.load(path)
+    assert loaded.parameters == assessment.parameters
+    assert loaded.info_ == assessment.info_
+    before, after = (a.predict(*inputs(held_out)) for a in (assessment, loaded))
+    for field in fields(before):
+        np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
+    np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
+    assert loaded.embedding_.is_same(assessment.embedding_)
+    assert np.isfinite(loaded.embedding_.input_range).all() == assessment.parameters.is_sharpened
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_calibration_is_kept_with_the_assessment(assessment, tmp_path):
+    found = calibration(confidence=0.9)
+    path = tmp_path / "gamma.safetensors"
+    assert assessment.calibrations_ == {}
+    assessment.calibrations_ = {"plan": found}
+    assessment.save(path)
+    assessment.calibrations_ = {}
+    assert SafetyAssessment.load(path).calibrations_ == {"plan": found}
+    assessment.save(path)
+    assert SafetyAssessment.load(path).calibrations_ == {}
+
+
+def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_path, monkeypatch):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    content = path.read_bytes()
+
+    def full_disk(descriptor):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        assessment.save(path)
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_path):
+    from safetensors.numpy import load_file, save_file
+
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    content = path.read_bytes()
+    for size in (0, 5, 200, len(content) // 2, len(content) - 1):
+        (tmp_path / "short").write_bytes(content[:size])
+        with pytest.raises(ValueError, match="not a safety assessment or truncated"):
+            SafetyAssessment.load(tmp_path / "short")
+    save_file({"x": np.zeros(3)}, tmp_path / "foreign")
+    with pytest.raises(ValueError, match="is not a safety assessment: its metadata has the entr"):
+        SafetyAssessment.load(tmp_path / "foreign")
+    metadata = {"schema": SCHEMA, "schema_version": "8"}
+    save_file(load_file(path), tmp_path / "old", metadata)
+    with pytest.raises(ValueError, match=f"schema version 8, this version reads {SCHEMA_VERSION}"):
+        SafetyAssessment.load(tmp_path / "old")
+    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 9}'})
+    with pytest.raises(ValueError, match="damaged safety assessment: it has no 'sha256'"):
+        SafetyAssessment.load(tmp_path / "hollow")
+    for text in ("", "[]", "{}", "[" * 100_000):
+        save_file(load_file(path), tmp_path / "torn", {SCHEMA: text})
+        with pytest.raises(ValueError, match="torn' is a damaged safety assessment"):
+            SafetyAssessment.load(tmp_path / "torn")
+
+
+def test_every_flipped_bit_is_noticed(assessment, tmp_path):
+    path = tmp_path / "assessment.safetensors"
+    assessment.save(path)
+    content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    header = int(content[:8].view(np.uint64)[0])
+    rng = np.random.default_rng(0)
+    # Half of them in names, shapes and metadata, half in numbers.
+    places = np.concatenate(
+        [rng.integers(8, 8 + header, 150), rng.integers(8 + header, len(content), 150)]
+    )
+    for place in places:
+        damaged = content.copy()
+        damaged[place] ^= np.uint8(1 << rng.integers(8))
+        path.write_bytes(damaged.tobytes())
+        with pytest.raises(ValueError, match=r"assessment\.safetensors"):
+            SafetyAssessment.load(path)
+
+
+def test_the_same_assessment_gives_the_same_bytes(assessment, tmp_path):
+    paths = [tmp_path / f"{i}.safetensors" for i in range(5)]
+    for path in paths:
+        assessment.save(path)
+    SafetyAssessment.load(paths[0]).save(paths[-1])
+    assert len({path.read_bytes() for path in paths}) == 1
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors"):
+        SafetyAssessment.load(tmp_path / "nowhere.safetensors")

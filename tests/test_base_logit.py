@@ -1,5 +1,3 @@
-"""The logit L of an unsafe end: scaled by what maps say of episodes that they have not learned."""
-
 import dataclasses
 
 import numpy as np
@@ -29,11 +27,9 @@ def test_all_maps_leave_out_the_same_episodes_and_whole_ones(segments):
     left_out = set(segments.episode[held_out])
     assert len(left_out) == int(0.1 * len(np.unique(segments.episode)))
     assert left_out.isdisjoint(segments.episode[~held_out])
-
-
-def test_the_maps_never_leave_out_so_much_that_nothing_is_left(segments):
-    held_out = held_out_segments(segments, parameters(held_out=0.9))
-    assert len(set(segments.episode[held_out])) == len(np.unique(segments.episode)) // 2
+    # Never so much that nothing is left.
+    most = held_out_segments(segments, parameters(held_out=0.9))
+    assert len(set(segments.episode[most])) == len(np.unique(segments.episode)) // 2
     assert not held_out_segments(segments, parameters(held_out=0.0)).any()
     assert not held_out_segments(segments, parameters(mode="paper")).any()
 
@@ -99,13 +95,8 @@ def test_each_head_counts_for_what_it_is_worth(segments, safety_slope):
 
 
 def test_the_logit_is_that_of_the_mean_head_and_the_smallest_mean_margin_and_is_limited():
-    logit = BaseLogit(
-        margin_unit=0.02,
-        margin_range=(-0.03, 0.1),
-        offset=-0.2,
-        safety_slope=0.8,
-        margin_slope=1.3,
-    )
+    worth = {"offset": -0.2, "safety_slope": 0.8, "margin_slope": 1.3}
+    logit = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), **worth)
     output = EmbeddingOutput(
         np.zeros((2, 1, 2)), np.array([[1.0], [9.0]]), np.array([[[0.02, 0.5]], [[0.04, 0.5]]])
     )

@@ -11,7 +11,7 @@ import typer
 
 import drake_safety
 from command_line import call
-from drake_safety.cli import app, main
+from drake_safety.cli import COMMANDS, main, make_app
 from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import MODES, assessment_file, load_assessment
 from drake_safety.learning.assessment import AssessmentParameters
@@ -27,7 +27,7 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
     command = ("train", file, "--episodes", 8, "--workers", 1)
     assert call(monkeypatch, *command, "--out", tmp_path / "a") == 2
     told = capsys.readouterr().out
-    assert "of 'gliding' (seed 0): ValueError: operands could not be broadcast" in told
+    assert "of 'gliding' (seed 0): RuntimeError: operands could not be broadcast" in told
     assert "--debug in the command line shows where" in told
     arguments = ["drake-safety", *map(str, command), "--debug", "--out", str(tmp_path / "b")]
     monkeypatch.setattr(sys, "argv", arguments)
@@ -37,11 +37,20 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
 
 
 def test_every_command_says_in_a_sentence_what_it_does():
-    commands = typer.main.get_command(app).commands
-    names = "scenarios new check train calibrate ask run play evaluate adapt export report"
-    assert list(commands) == names.split()
-    for command in commands.values():
-        assert command.help.splitlines()[0].endswith(".")
+    commands = typer.main.get_command(make_app()).commands
+    for name, command in commands.items():
+        line = command.help.splitlines()[0]
+        assert line.endswith(".")
+        assert COMMANDS[name].line == line
+
+
+def test_only_the_module_of_the_called_command_is_imported():
+    program = (
+        "import sys; from drake_safety.cli import make_app; make_app(['report'])\n"
+        "found = {one.rpartition('.')[2] for one in sys.modules if 'drake_safety.cli.' in one}\n"
+        "assert 'report' in found and not found & {'train', 'run', 'play', 'adapt'}, found"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_a_table_of_scenarios_and_the_version_are_printed(monkeypatch, capsys):
@@ -100,7 +109,7 @@ def stopped(monkeypatch):
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drake_safety.simulation.rollouts.run_episodes", stop)
+    monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
 
 
 @pytest.mark.train
@@ -138,7 +147,7 @@ def test_a_command_that_keeps_nothing_is_not_continued(monkeypatch, capsys):
     def stop(arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drake_safety.cli.app", stop)
+    monkeypatch.setattr("drake_safety.cli.make_app", lambda called: stop)
     assert call(monkeypatch, "scenarios") == 130
     assert capsys.readouterr().out == "stopped; finished episodes are kept\n"
 
@@ -173,7 +182,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
 
 @pytest.mark.train
 def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("drake_safety.simulation.dataset.completed", lambda path: {0, 1, 2})
+    monkeypatch.setattr("drake_safety.cli.train.completed", lambda path: {0, 1, 2})
     (tmp_path / "episodes").mkdir()
     assert call(monkeypatch, "train", "laikago_balancing", "--out", tmp_path) == 2
     assert "already holds 3 episodes: pass --resume" in capsys.readouterr().out

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,7 +54,11 @@ def test_among_all_segments_the_graph_holds_exactly_the_nearest_neighbours(
 ):
     monkeypatch.setattr(distance, "_ROWS", rows)
     monkeypatch.setattr(distance, "_BLOCK", 4 * rows)
-    graph = graph_of(segments, score_weight=score_weight)
+    seen = []
+    graph = graph_of(segments, score_weight=score_weight, progress=seen.append)
+    assert seen == sorted(seen) and seen[-1] == 1.0
+    assert not np.any(graph.indices == np.arange(len(segments))[:, None])
+    assert all(len(set(row)) == 15 for row in graph.indices.tolist())
     oracle = graph_of(segments, score_weight=score_weight, backend="tslearn")
     assert graph.max_dtw == pytest.approx(oracle.max_dtw, rel=1e-12)
     np.testing.assert_allclose(graph.distances, oracle.distances, atol=1e-12)
@@ -103,11 +109,6 @@ def test_candidates_with_the_smallest_bounds_hold_most_of_the_neighbours(cost, s
     np.testing.assert_array_equal(every.indices, exact.indices)
 
 
-def test_fewer_candidates_than_neighbours_are_refused(segments):
-    with pytest.raises(ValueError, match="got 14 candidates for 15 neighbours"):
-        graph_of(segments, num_candidates=14)
-
-
 def test_the_costs_of_a_path_are_the_values_worked_by_hand():
     # (0, 3) against (1, 1): 0-1 at 1, 3-1 at 2.
     error = np.array([[[0.0], [3.0]], [[1.0], [1.0]], [[9.0], [9.0]]])
@@ -119,11 +120,6 @@ def test_the_costs_of_a_path_are_the_values_worked_by_hand():
         found[cost] = float(graph.distances[0, 0] * graph.max_dtw)
     expected = {"squared": 5.0, "rooted": 5.0**0.5, "absolute": 3.0}
     assert found == pytest.approx(expected)
-
-
-def test_tslearn_has_no_absolute_cost(segments):
-    with pytest.raises(ValueError, match="'tslearn' has no cost 'absolute'"):
-        graph_of(segments, backend="tslearn", cost="absolute")
 
 
 def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
@@ -142,15 +138,6 @@ def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
         learned[backend], _ = learned_maps(segments, has_target, x, grid, parameters, None)
         assert bool(asked) == (backend == "tslearn")
     assert learned["tslearn"].is_same(learned["dtaidistance"])
-    with pytest.raises(ValueError, match=r"distance_backend is fast, expected one of .*tslearn"):
-        AssessmentParameters(distance_backend="fast")
-
-
-def test_no_segment_is_its_own_neighbour_nor_twice_the_same(segments):
-    graph = graph_of(segments)
-    assert not np.any(graph.indices == np.arange(len(segments))[:, None])
-    assert all(len(set(row)) == 15 for row in graph.indices.tolist())
-    assert np.all(np.diff(graph.distances, axis=1) >= 0.0)
 
 
 def test_the_largest_dtw_is_found_though_the_euclidean_bound_misleads():
@@ -170,25 +157,18 @@ def test_identical_segments_are_at_distance_zero_of_each_other():
     np.testing.assert_array_equal(graph.distances, 0.0)
 
 
-def test_progress_grows_to_one(segments):
-    seen = []
-    graph_of(segments, progress=seen.append)
-    assert seen == sorted(seen)
-    assert seen[-1] == 1.0
-
-
-def test_more_neighbours_than_segments_are_refused(segments):
-    with pytest.raises(ValueError, match="expected fewer neighbours than segments"):
-        graph_of(segments, num_neighbours=len(segments))
-
-
-def test_an_unknown_backend_is_refused_with_those_that_exist(segments):
-    with pytest.raises(ValueError, match=r"unknown backend 'fast'.*dtaidistance.*tslearn"):
-        graph_of(segments, backend="fast")
-
-
-def test_errors_that_are_not_finite_are_refused(segments):
-    error = segments.error.copy()
-    error[3, 2, 0] = np.nan
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_candidates": 14}, "got 14 candidates for 15 neighbours"),
+        ({"backend": "tslearn", "cost": "absolute"}, "'tslearn' has no cost 'absolute'"),
+        ({"num_neighbours": 10_000}, "expected fewer neighbours than segments"),
+        ({"backend": "fast"}, r"unknown backend 'fast'.*dtaidistance.*tslearn"),
+    ],
+)
+def test_a_graph_that_cannot_be_is_refused(segments, options, message):
+    with pytest.raises(ValueError, match=message):
+        graph_of(segments, **options)
+    unknown = replace(segments, error=np.full_like(segments.error, np.nan))
     with pytest.raises(ValueError, match="not finite"):
-        neighbour_graph(error, segments.length, segments.score, score_weight=0.0, num_neighbours=3)
+        graph_of(unknown)

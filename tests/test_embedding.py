@@ -5,14 +5,10 @@ import pytest
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
-from drake_safety.learning.embedding import (
-    MapData,
-    stack_members,
-    train_map,
-    tsne,
-)
+from drake_safety.learning.embedding import stack_members, train_map, tsne
 from drake_safety.learning.segments import split
 from drake_safety.learning.trained_maps import Embedding
+from lip_assessments import map_data
 from lip_episodes import make_episodes
 
 pytestmark = pytest.mark.train
@@ -48,17 +44,8 @@ def data():
     x[:, 3] = 2.0
     target = np.column_stack([20.0 * x[:, 0], 2.0 * (x[:, 1] - 5.0)])
     has_target = rng.uniform(size=600) < 0.5
-    return MapData(
-        x=x,
-        has_target=has_target,
-        target=target[has_target],
-        is_unsafe=x[:, 0] > 0.5,
-        margins=(0.02 * (0.5 - x[:, :1])),
-        sample_weight=np.ones(600),
-        input_scale=np.ones(4),
-        neighbours=np.full((600, 1), -1),
-        tsne_unit=1.0,
-    )
+    data = map_data(x, target[has_target], has_target=has_target)
+    return replace(data, is_unsafe=x[:, 0] > 0.5, margins=0.02 * (0.5 - x[:, :1]))
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +68,6 @@ def test_tsne_gives_the_same_bits_for_the_same_seed(graph):
     first, again, other = (tsne(graph[1], perplexity=10, **PLAIN, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
-
-
-def test_tsne_refuses_a_graph_with_too_few_neighbours(graph):
     with pytest.raises(ValueError, match="perplexity 30 needs 90 neighbours"):
         tsne(graph[1], perplexity=30, **PLAIN, seed=0)
 
@@ -107,8 +91,9 @@ def test_a_map_predicts_safety_and_margins_in_their_own_unit(data, embedding):
 
 
 def test_numpy_evaluates_what_torch_trained(data):
-    torch = pytest.importorskip("torch")
-    (embedding,) = [stack_members([train_map(data, SETTINGS, seed=5)], num_margins=1)]
+    import torch
+
+    embedding = stack_members([train_map(data, SETTINGS, seed=5)], num_margins=1)
     weights = {name: torch.from_numpy(w[0].copy()) for name, w in embedding.weights.items()}
     z = torch.from_numpy(data.x.astype(np.float32))
     for layer in ("trunk.0", "trunk.1"):
@@ -144,20 +129,6 @@ def test_a_sample_weight_draws_the_map_towards_its_samples(data):
     assert agreement[1] > agreement[0]
 
 
-def test_one_input_alone_gives_what_it_gives_among_many(data, embedding):
-    output = embedding.evaluate(data.x)
-    activations = embedding.activations(data.x)
-    for row in (0, 17, 599):
-        x = data.x[row : row + 1]
-        one = embedding.evaluate(x)
-        np.testing.assert_allclose(
-            one.embedding[:, 0], output.embedding[:, row], rtol=1e-4, atol=1e-3
-        )
-        np.testing.assert_allclose(one.margins[:, 0], output.margins[:, row], rtol=1e-4, atol=1e-5)
-        hidden = embedding.activations(x)[:, 0]
-        np.testing.assert_allclose(hidden, activations[:, row], rtol=1e-4, atol=1e-4)
-
-
 def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):
     x = data.x[:4].copy()
     x[1, 2], x[2, 0] = np.nan, np.inf
@@ -165,34 +136,6 @@ def test_a_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, em
     assert np.all(np.isnan(output.embedding[:, 1:3]))
     assert np.all(np.isnan(output.unsafe_logit[:, 1:3]))
     np.testing.assert_allclose(output.embedding[:, ::3], embedding.embed(data.x[:4])[:, ::3])
-
-
-def test_a_plain_map_has_no_safety_head_and_no_margins(data):
-    settings = AssessmentParameters(
-        **{**vars(SETTINGS), "safety_weight": 0.0, "margin_weight": 0.0, "epochs": 1}
-    )
-    embedding = stack_members([train_map(data, settings, seed=0)], num_margins=0)
-    output = embedding.evaluate(data.x[:5])
-    assert np.all(np.isnan(output.unsafe_logit))
-    assert output.margins.shape == (1, 5, 0)
-
-
-def test_a_trained_embedding_cannot_be_written_to(embedding):
-    with pytest.raises(ValueError, match="read-only"):
-        embedding.weights["output.bias"][...] = 0.0
-
-
-def test_inputs_of_another_width_are_refused(embedding):
-    with pytest.raises(ValueError, match=r"inputs have shape \(2, 3\), expected \(N, 4\)"):
-        embedding.evaluate(np.zeros((2, 3)))
-
-
-def test_weights_that_do_not_fit_are_refused(embedding):
-    missing = {name: w for name, w in embedding.weights.items() if name != "output.bias"}
-    with pytest.raises(ValueError, match=r"output\.bias"):
-        Embedding(missing, num_margins=1)
-    with pytest.raises(ValueError, match="output layer has 3 columns, expected 5"):
-        Embedding(embedding.weights, num_margins=3)
 
 
 def test_an_input_beyond_the_range_is_that_at_its_edge(embedding):
@@ -214,8 +157,20 @@ def test_an_input_beyond_the_range_is_that_at_its_edge(embedding):
     np.testing.assert_array_equal(gradient[1], expected[1])
 
 
-def test_a_range_of_another_width_is_refused(embedding):
-    with pytest.raises(
-        ValueError, match=r"range of inputs has the shape \(2, 3\), expected \(2, 4\)"
-    ):
-        embedding.clipping(np.zeros((2, 3)))
+def without_bias(embedding):
+    return {name: w for name, w in embedding.weights.items() if name != "output.bias"}
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda e: e.weights["output.bias"].fill(0.0), "read-only"),
+        (lambda e: e.evaluate(np.zeros((2, 3))), r"inputs have shape \(2, 3\), expected \(N, 4\)"),
+        (lambda e: e.clipping(np.zeros((2, 3))), r"range of .* shape \(2, 3\), expected \(2, 4\)"),
+        (lambda e: Embedding(without_bias(e), num_margins=1), r"output\.bias"),
+        (lambda e: Embedding(e.weights, num_margins=3), "output layer has 3 columns, expected 5"),
+    ],
+)
+def test_what_does_not_fit_the_maps_is_refused(embedding, ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask(embedding)

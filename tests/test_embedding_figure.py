@@ -54,8 +54,12 @@ def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fr
     assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
 
 
-def test_empty_cells_are_hatched_and_the_others_show_their_belief(assessment, fresh):
-    middle = embedding_figure(assessment, fresh).axes[1]
+def test_empty_cells_are_hatched_the_others_show_their_belief_and_causes_are_named(
+    assessment, fresh
+):
+    _, middle, right, *_ = embedding_figure(assessment, fresh).axes
+    legend = right.get_legend().get_texts()
+    assert [text.get_text() for text in legend] == ["support", "height"]
     hollow, filled = middle.collections[:2]
     is_empty = assessment.beliefs_[0, :, 2] == 1.0
     assert 0 < is_empty.sum() < 36
@@ -63,14 +67,6 @@ def test_empty_cells_are_hatched_and_the_others_show_their_belief(assessment, fr
     assert hollow.get_hatch()
     # Bluer where safer: the blue share grows with the belief.
     colours = filled.get_facecolor()
-    safest, least = (
-        np.argmax(assessment.beliefs_[0, ~is_empty, 0]),
-        np.argmin(assessment.beliefs_[0, ~is_empty, 0]),
-    )
-    assert colours[safest, 2] > colours[safest, 0]
-    assert colours[least, 0] > colours[least, 2]
-
-
-def test_the_right_panel_names_the_causes(assessment, fresh):
-    legend = embedding_figure(assessment, fresh).axes[2].get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == ["support", "height"]
+    safe = assessment.beliefs_[0, ~is_empty, 0]
+    assert colours[np.argmax(safe), 2] > colours[np.argmax(safe), 0]
+    assert colours[np.argmin(safe), 0] > colours[np.argmin(safe), 2]

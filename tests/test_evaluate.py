@@ -1,25 +1,19 @@
-"""`evaluate` and `calibrate`, and the studies' `evaluate` beside baselines."""
-
 import shutil
-import sys
 
 import pytest
 
-from command_line import call
+from command_line import call, study
 from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
-from drake_safety.evaluation import figure_style
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.seeds import SHIFTS
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
-from studies.__main__ import main as studies
 
 
 @pytest.fixture(scope="module")
 def shuttle_run(tmp_path_factory):
-    """A scenario whose plans have a goal, and what was learned of it."""
     folder = tmp_path_factory.mktemp("shuttle")
     return train_shuttle(folder), folder
 
@@ -35,7 +29,7 @@ def evaluate_shuttle(monkeypatch, run, *arguments):
 @pytest.mark.slow
 def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
-    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
     printed = capsys.readouterr().out
     assert "all targets" in printed and "paper uses its next H steps" in printed
     first = Results.read(folder / "evaluation.json")
@@ -52,18 +46,24 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     hash_ = load_scenario(file).simulation_hash()
     kept = [fresh_episodes_folder(folder, hash_, seed, {}) for seed in (100, 103)]
     assert [len(completed(path)) for path in kept] == [30, 20]
-    # Once all are there, even a simulation that always fails is not needed.
-    monkeypatch.setattr(rollouts, "run_episode", None)
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    # Once all are there, one of each set is simulated again, to know the set.
+    again = count_episodes(monkeypatch)
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
+    assert len(again) == 2
     assert dict(Results.read(folder / "evaluation.json")) == dict(first)
 
 
-def study(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["studies", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        studies()
-    assert ended.value.code in (0, None)
+def count_episodes(monkeypatch):
+    """A list that grows by an index whenever an episode is simulated."""
+    indices, run_episode = [], rollouts.run_episode
+
+    def counted(loop, index, **options):
+        indices.append(index)
+        return run_episode(loop, index, **options)
+
+    monkeypatch.setattr(rollouts, "run_episode", counted)
+    return indices
 
 
 @pytest.mark.slow
@@ -71,24 +71,24 @@ def test_shifts_and_promises_are_studied_beside_baselines(monkeypatch, capsys, s
     file, folder = shuttle_run
     out, where = folder / "beside", ("--assessment", folder, "--workers", 1)
     shifts = ("--shifts", 6, "--episodes", 12, "--out", out)
-    study(monkeypatch, "evaluate", file, *where, *shifts)
+    assert study(monkeypatch, "evaluate", file, *where, *shifts) == 0
     found = Results.read(out / "shifts.json")
     assert found.entries["kinds"]["state of another row"] == "junk"
     for method in ("gamma", "without_novelty", "gradient_boosting", "mlp", "deep_knn"):
         assert f"shifts.gaussian.{method}.confident_error" in found
         assert f"shifts.nominal.{method}.first.confident_error" in found
-    study(monkeypatch, "promises", file, *where, "--episodes", 40, "--splits", 5)
+    assert study(monkeypatch, "promises", file, *where, "--episodes", 40, "--splits", 5) == 0
     assert "needs 99 unsafe episodes" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow
 def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, shuttle_run) in (0, None)
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
     alone = Results.read(folder / "evaluation.json")
     arguments = ("--other-hand", 10, "--plane-step", 0.6, "--pushes", 15)
-    study(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments)
+    assert study(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments) == 0
     beside = Results.read(folder / "evaluation.json")
     assert {key: beside[key] for key in alone} == dict(alone)
     for method in ("sharpened", "paper", "gradient_boosting", "mlp"):
@@ -111,7 +111,7 @@ def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys,
     for seed, given in ((1_000_000, ("--seed", 1_000_000)), (SHIFTS.first, ())):
         out = folder / f"shifts-{seed}"
         options = ("--workers", 1, "--out", out)
-        assert call(monkeypatch, *words, *given, *options) in (0, None)
+        assert call(monkeypatch, *words, *given, *options) == 0
         results = Results.read(out / "shifts.json")
         assert results.entries["seed"] == seed
         hash_ = load_scenario(file).simulation_hash()
@@ -127,12 +127,6 @@ def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys,
     assert (out / "shifts.png").is_file()
 
 
-def calibrate_shuttle(monkeypatch, run, *arguments):
-    file, folder = run
-    options = ("--assessment", folder, "--episodes", 120, "--workers", 1)
-    return call(monkeypatch, "calibrate", file, *options, *arguments)
-
-
 @pytest.mark.slow
 def test_a_calibration_is_stored_and_used_by_who_evaluates(
     monkeypatch, capsys, shuttle_run, tmp_path
@@ -141,7 +135,8 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
     run = (file, folder)
-    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.1) in (0, None)
+    calibrate = ("calibrate", file, "--assessment", folder, "--episodes", 120, "--workers", 1)
+    assert call(monkeypatch, *calibrate, "--miss-rate", 0.1) == 0
     printed = capsys.readouterr().out
     assert "at most 10 % of unsafe episodes called safe, on average" in printed
     stored = {mode: load_assessment(folder, mode).calibrations_ for mode in MODES}
@@ -149,14 +144,15 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
         assert stored[mode].keys() == {"plan", "motion"}
         assert stored[mode]["plan"].miss_rate == 0.1
         assert stored[mode]["plan"].num_unsafe + stored[mode]["plan"].num_safe == 120
-    # The episodes are kept: another promise simulates nothing.
-    monkeypatch.setattr(rollouts, "run_episode", None)
-    assert calibrate_shuttle(monkeypatch, run, "--miss-rate", 0.01) == 2
+    # The episodes are kept: another promise simulates one, to know them.
+    again = count_episodes(monkeypatch)
+    assert call(monkeypatch, *calibrate, "--miss-rate", 0.01) == 2
     assert "needs at least 99 unsafe episodes; of 120 episodes" in capsys.readouterr().out
     assert load_assessment(folder, "sharpened").calibrations_ == stored["sharpened"]
+    assert len(again) == 1
     monkeypatch.undo()
-    monkeypatch.setattr(figure_style, "save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, run) in (0, None)
+    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
+    assert evaluate_shuttle(monkeypatch, run) == 0
     found = Results.read(folder / "evaluation.json")
     threshold = found["plans.sharpened.threshold"].value
     assert threshold == pytest.approx(stored["sharpened"]["plan"].threshold)

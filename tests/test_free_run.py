@@ -1,5 +1,3 @@
-"""`run` for a task that has neither a goal nor a ball: a module beside its scenario."""
-
 import json
 import sys
 from pathlib import Path

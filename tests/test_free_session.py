@@ -1,5 +1,3 @@
-"""A live session with a task that has no goals, no ball and no legs, and `play` of such a task."""
-
 import contextlib
 import threading
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""One plan carried out and watched: nothing but the push disturbs it, and it ends as it must."""
-
 import dataclasses
 import math
 

@@ -42,9 +42,6 @@ def test_interpolation_reproduces_a_linear_function_between_the_outermost_centre
     points = np.random.default_rng(1).uniform(-65.0, 65.0, size=(200, 2))
     found = interpolated(GRID, points, GRID.centres @ [2.0, -3.0] + 5.0)
     np.testing.assert_allclose(found, points @ [2.0, -3.0] + 5.0, atol=1e-9)
-
-
-def test_at_a_centre_interpolation_gives_the_cell_itself():
     values = np.random.default_rng(2).uniform(size=GRID.num_cells)
     np.testing.assert_allclose(interpolated(GRID, GRID.centres, values), values, atol=1e-12)
 
@@ -53,11 +50,8 @@ def test_between_the_outermost_centres_and_the_edge_the_nearest_centres_count():
     values = np.arange(GRID.num_cells, dtype=float)
     found = interpolated(GRID, [[-69.9, -69.9], [69.9, -65.0], [-69.0, -60.0]], values)
     np.testing.assert_allclose(found, [0.0, 13 * 14, 0.5])
-
-
-def test_a_grid_of_one_cell_interpolates_to_that_cell():
-    grid = Grid(resolution=1, cell_length=2.0)
-    np.testing.assert_allclose(interpolated(grid, [[0.3, -0.7]], [4.0]), [4.0])
+    one = Grid(resolution=1, cell_length=2.0)
+    np.testing.assert_allclose(interpolated(one, [[0.3, -0.7]], [4.0]), [4.0])
 
 
 def test_each_map_reads_its_own_cells():
@@ -71,13 +65,14 @@ def test_each_map_reads_its_own_cells():
         np.testing.assert_array_equal(GRID.interpolate(points, values)[0][k], alone[0])
 
 
-def test_points_that_coincide_cannot_be_scaled():
-    with pytest.raises(ValueError, match="extent is 0"):
-        GRID.scale(np.ones((5, 2)))
-
-
-def test_a_grid_needs_cells_of_a_size():
-    with pytest.raises(ValueError, match="resolution is 0"):
-        Grid(resolution=0, cell_length=1.0)
-    with pytest.raises(ValueError, match="cell_length is 0"):
-        Grid(resolution=3, cell_length=0.0)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GRID.scale(np.ones((5, 2))), "extent is 0"),
+        (lambda: Grid(resolution=0, cell_length=1.0), "resolution is 0"),
+        (lambda: Grid(resolution=3, cell_length=0.0), "cell_length is 0"),
+    ],
+)
+def test_a_grid_without_an_extent_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

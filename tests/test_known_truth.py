@@ -1,5 +1,3 @@
-"""Known truth: overlap, confident errors and their distance from the boundary, worked by hand."""
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,59 +7,16 @@ from cart_episodes import make_episode, make_info
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.episode_start import StatePlane
 from shuttle_task import shuttling
-from studies.truth import (
-    KnownTruth,
-    agreement,
-    boundary_distance,
-    known_truth_figure,
-    random_plan_estimates,
-    simulate_truth,
-)
+from studies.truth import agreement, boundary_distance, random_plan_estimates, simulate_truth
 
 # Safe on the left half of a grid of 5 x 5: its first two rows along the first variable.
 HALF = np.repeat(np.array([True, True, False, False, False]), 5).reshape(5, 5)
-
-
-def test_the_truth_itself_agrees_wholly():
-    found = agreement(HALF, HALF.astype(float))
-    assert found.intersection_over_union == 1.0
-    assert found.confident_errors == 0.0
-    assert found.band == 0.0
-
-
-def test_one_row_too_many_costs_a_third_of_the_overlap():
-    says = np.zeros((5, 5))
-    says[:3] = 0.8
-    found = agreement(HALF, says)
-    assert found.intersection_over_union == pytest.approx(2 / 3)
-    # 0.8 is no confident word; 0 where it is safe would be.
-    assert found.confident_errors == 0.0
-
-
-def test_a_confident_error_is_as_far_off_as_the_nearest_start_of_the_other_kind():
-    says = np.zeros((5, 5))
-    says[:2] = 1.0
-    says[4, 2] = 0.95
-    found = agreement(HALF, says)
-    assert found.confident_errors == pytest.approx(1 / 25)
-    # From row 4 to row 1 there are three of four spacings.
-    assert found.band == pytest.approx(0.75)
 
 
 def test_distances_count_from_either_side():
     distance = boundary_distance(HALF)
     np.testing.assert_allclose(distance[:, 0], [0.5, 0.25, 0.25, 0.5, 0.75])
     assert np.isinf(boundary_distance(np.ones((3, 3), dtype=bool))).all()
-
-
-def test_grids_of_different_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"\(5, 5\) outcomes and \(4, 5\) probabilities"):
-        agreement(HALF, np.zeros((4, 5)))
-
-
-def test_a_task_without_planes_says_so():
-    with pytest.raises(ValueError, match=r"'Shuttling' has no state plane 'hold'; it has \[\]"):
-        simulate_truth(shuttling(), "hold", 3, num_workers=1)
 
 
 def test_a_grid_reaches_to_its_corners_with_the_first_variable_first():
@@ -74,26 +29,6 @@ def test_a_grid_reaches_to_its_corners_with_the_first_variable_first():
     np.testing.assert_array_equal(points[1, 2], [1.0, 1.0])
     with pytest.raises(ValueError, match="resolution must be at least 2; got 1"):
         plane.points(1)
-
-
-def test_the_picture_marks_each_confident_error_once():
-    plane = StatePlane(
-        axes=("x", "y"), lowest=(0.0, 0.0), highest=(1.0, 1.0), start=lambda point: point
-    )
-    says = HALF.astype(float)
-    says[4, 2] = 0.95
-    truth = KnownTruth(
-        plane="still",
-        axes=plane.axes,
-        points=plane.points(5),
-        is_safe=HALF,
-        state=np.zeros((5, 5, 1)),
-        desired_preview=np.zeros((5, 5, 1)),
-        features=np.zeros((5, 5, 1)),
-    )
-    figure = known_truth_figure([(truth, says, agreement(HALF, says))], "a title")
-    (marks,) = figure.axes[0].lines
-    np.testing.assert_allclose(marks.get_xydata(), [[1.0, 0.5]])
 
 
 class SaysTheState:
@@ -122,3 +57,23 @@ def test_random_plans_are_judged_by_their_first_rows_alone():
     assert found["intersection_over_union"].value == pytest.approx(2 / 5)
     assert found["intersection_over_union"].n == 5
     assert found["confident_errors"].value == pytest.approx(1 / 6)
+
+
+def test_agreement_is_overlap_and_confident_errors_with_their_distance_to_the_other_kind():
+    found = agreement(HALF, HALF.astype(float))
+    assert (found.intersection_over_union, found.confident_errors, found.band) == (1.0, 0.0, 0.0)
+    more = np.zeros((5, 5))
+    more[:3] = 0.8  # No confident word; 0 where it is safe would be.
+    found = agreement(HALF, more)
+    assert found.intersection_over_union == pytest.approx(2 / 3)
+    assert found.confident_errors == 0.0
+    wrong = HALF.astype(float)
+    wrong[4, 2] = 0.95
+    found = agreement(HALF, wrong)
+    assert found.confident_errors == pytest.approx(1 / 25)
+    # From row 4 to row 1 there are three of four spacings.
+    assert found.band == pytest.approx(0.75)
+    with pytest.raises(ValueError, match=r"\(5, 5\) outcomes and \(4, 5\) probabilities"):
+        agreement(HALF, np.zeros((4, 5)))
+    with pytest.raises(ValueError, match=r"'Shuttling' has no state plane 'hold'; it has \[\]"):
+        simulate_truth(shuttling(), "hold", 3, num_workers=1)

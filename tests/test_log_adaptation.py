@@ -1,5 +1,3 @@
-"""``drake-safety adapt --log``: feedback from files adapts Γ as the run that was recorded does."""
-
 import numpy as np
 import pytest
 

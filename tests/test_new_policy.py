@@ -4,7 +4,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drake_safety.cli import app
+from drake_safety.cli import make_app
 from drake_safety.control.policy_network import PolicyMetadata, PolicyNetwork
 from drake_safety.control.policy_template import PolicyTemplate, survey_policy
 from drake_safety.simulation.scenario_check import check_scenario
@@ -22,7 +22,7 @@ def new(folder, policy, *more):
     write_hexapod(folder)
     urdf, out = folder / "hexapod.urdf", folder / "walker"
     words = ["new", "walker", "--urdf", str(urdf), "--out", str(out), "--task", "walking"]
-    result = CliRunner().invoke(app, [*words, "--policy", str(policy), *more])
+    result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
     return out, result
 
 
@@ -136,7 +136,7 @@ def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
         assert result.exit_code != 0 and not out.exists()
     write_hexapod(tmp_path)
     words = ["new", "walker", "--urdf", str(tmp_path / "hexapod.urdf")]
-    result = CliRunner().invoke(app, [*words, "--task", "walking"])
+    result = CliRunner().invoke(make_app(), [*words, "--task", "walking"])
     assert result.exit_code != 0
     with pytest.raises(ValueError, match=r"is neither a deploy\.yaml"):
         survey_policy(tmp_path / "odd.yaml")

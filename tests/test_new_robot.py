@@ -8,7 +8,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drake_safety.cli import app
+from drake_safety.cli import make_app
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
@@ -235,7 +235,9 @@ def bare(tmp_path):
 
 def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
     out = tmp_path / "spider"
-    result = CliRunner().invoke(app, ["new", "spider", "--urdf", str(bare), "--out", str(out)])
+    result = CliRunner().invoke(
+        make_app(), ["new", "spider", "--urdf", str(bare), "--out", str(out)]
+    )
     assert result.exit_code == 0
     assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
     assert "everything passes through femur_0, femur_1. Add boxes" in result.output
@@ -246,7 +248,7 @@ def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
 def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path):
     written = write_robot("spider", bare, "balancing", tmp_path / "spider")
     file = written.folder / "balancing.yaml"
-    result = CliRunner().invoke(app, ["check", str(file), "--quick"])
+    result = CliRunner().invoke(make_app(), ["check", str(file), "--quick"])
     assert result.exit_code == 0
     assert "warning  collision shapes: 2 links have none" in result.output
     assert "fix: add a <collision> with a box, sphere or capsule [m]" in result.output
@@ -262,7 +264,7 @@ def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path
 
 def test_a_quick_check_leaves_out_the_episodes_and_says_so(spider):
     file = spider.folder / "balancing.yaml"
-    result = CliRunner().invoke(app, ["check", str(file), "--quick"])
+    result = CliRunner().invoke(make_app(), ["check", str(file), "--quick"])
     assert result.exit_code == 0
     assert "starts can be sampled" not in result.output
     assert "not checked: the share of unsafe episodes" in result.output
@@ -291,7 +293,9 @@ def test_new_says_which_visuals_it_left_out(tmp_path):
     gone = mesh("visual", "gone.stl")
     urdf = urdf_of_spider(tmp_path, lambda text: with_shape(text, "body", gone))
     out = tmp_path / "spider"
-    result = CliRunner().invoke(app, ["new", "spider", "--urdf", str(urdf), "--out", str(out)])
+    result = CliRunner().invoke(
+        make_app(), ["new", "spider", "--urdf", str(urdf), "--out", str(out)]
+    )
     assert result.exit_code == 0
     assert "not where the URDF says are left out: gone.stl" in result.output
     assert "left out: gone.stl" in (out / "README.md").read_text()
@@ -330,6 +334,8 @@ def test_new_refuses_what_it_cannot_write(tmp_path, name, task, folder, message)
 
 def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_fix_it(own):
     edited(own / "robot.yaml", base="trunk")
-    result = CliRunner().invoke(app, ["check", str(own / "balancing.yaml"), "--episodes", "0"])
+    result = CliRunner().invoke(
+        make_app(), ["check", str(own / "balancing.yaml"), "--episodes", "0"]
+    )
     assert result.exit_code == 1
     assert "fix: correct what the message names" in result.output

@@ -1,12 +1,10 @@
-"""Novelty: what no training input was like is not known, however sure the maps are of it."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drake_safety import SafetyAssessment, load_assessment, load_scenario
-from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.inputs import input_names
 from drake_safety.learning.novelty import Moments, Novelty
 
@@ -21,22 +19,13 @@ def redundant(rng, num_episodes=EPISODES):
     return x + 1e-6 * rng.normal(size=x.shape), np.repeat(np.arange(num_episodes), ROWS)
 
 
+def fitted(x, episode, is_unsafe=False, plan=NO_PLAN):
+    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool) | is_unsafe, rate=0.05, plan=plan)
+
+
 @pytest.fixture(scope="module")
 def novelty():
-    x, episode = redundant(np.random.default_rng(0))
-    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool), rate=0.05, plan=NO_PLAN)
-
-
-def test_the_distance_does_not_depend_on_units_and_is_that_of_mahalanobis():
-    x = np.random.default_rng(0).normal(size=(4000, 3)) @ [[1.0, 0.5, 0.0], [0, 1, 0.2], [0, 0, 1]]
-    distance = Novelty(training=Moments.of(x), limits=np.ones(3), plan=NO_PLAN).of(x)
-    offset = x - x.mean(axis=0)
-    inverse = np.linalg.inv(np.cov(x.T, bias=True))
-    expected = np.sqrt(np.einsum("ij,jk,ik->i", offset, inverse, offset))
-    np.testing.assert_allclose(distance, expected, rtol=1e-9)
-    scaled = x * [1e3, 0.1, 1.0]
-    again = Novelty(training=Moments.of(scaled), limits=np.ones(3), plan=NO_PLAN).of(scaled)
-    np.testing.assert_allclose(again, distance, rtol=1e-6)
+    return fitted(*redundant(np.random.default_rng(0)))
 
 
 def whitened_distances(known, x, plan):
@@ -89,11 +78,10 @@ def test_a_plan_unlike_those_of_training_is_novel_whatever_the_state():
     slope, noise = rng.normal(size=(len(episode), 1)), rng.normal(size=(len(episode), 5))
     state, bend = rng.normal(size=(len(episode), 30)), [0.3, -0.3, 0.3, -0.3, 0.3]
     x = np.column_stack([state, slope * np.arange(1, 6) + 0.02 * noise])
-    is_unsafe = np.zeros(len(x), dtype=bool)
     bent = x + np.r_[np.zeros(30), bend]
-    alone = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=NO_PLAN)
+    alone = fitted(x, episode)
     assert (alone.of(bent) > 1.0).mean() < 0.1
-    novelty = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=slice(30, 35))
+    novelty = fitted(x, episode, plan=slice(30, 35))
     assert (novelty.of(bent) > 1.0).mean() > 0.99
     assert (novelty.of(x) > 1.0).mean() < 0.01
     assert np.abs(novelty.contradictions(bent[0]))[:30].max() < 4.0
@@ -111,9 +99,7 @@ def test_unsafe_episodes_widen_the_gaussian_and_not_the_limit():
     x, episode = redundant(np.random.default_rng(0))
     is_unsafe = episode % 4 == 0
     x[is_unsafe, :3] *= 3.0
-    counted = Novelty.fit(x, episode, is_unsafe, rate=0.05, plan=NO_PLAN)
-    every = Novelty.fit(x, episode, np.zeros_like(is_unsafe), rate=0.05, plan=NO_PLAN)
-    assert counted.limits[0] < every.limits[0]
+    assert fitted(x, episode, is_unsafe).limits[0] < fitted(x, episode).limits[0]
 
 
 def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_zero(novelty):
@@ -121,20 +107,13 @@ def test_what_is_not_finite_is_infinitely_far_and_a_constant_is_no_division_by_z
     assert distance[0] == np.inf
     assert distance[1] < 0.5
     assert novelty.of(np.array([[0.0, 0.0, 0.0, 7.1]]))[0] > 1.0
-
-
-def test_one_episode_gives_no_limit_and_what_is_not_finite_is_novel_all_the_same():
-    x, _ = redundant(np.random.default_rng(0), num_episodes=1)
-    alone = Novelty.fit(x, np.zeros(len(x)), np.zeros(len(x), dtype=bool), rate=0.05, plan=NO_PLAN)
+    alike = fitted(np.tile([1.0, 2.0], (40, 1)), np.arange(40) // 2)
+    np.testing.assert_array_equal(alike.of(np.array([[1.0, 2.0]])), [0.0])
+    assert alike.of(np.array([[1.0, 3.0]]))[0] > 1.0
+    # One episode gives no limit, and what is not finite is novel all the same.
+    alone = fitted(*redundant(np.random.default_rng(0), num_episodes=1))
     assert np.isinf(alone.limits).all()
     np.testing.assert_array_equal(alone.of(np.array([[np.nan] * 4, [1e3] * 4])), [np.inf, 0.0])
-
-
-def test_inputs_that_are_all_alike_are_known_and_others_are_not():
-    x = np.tile([1.0, 2.0], (40, 1))
-    alike = Novelty.fit(x, np.arange(40) // 2, np.zeros(40, dtype=bool), rate=0.05, plan=NO_PLAN)
-    np.testing.assert_array_equal(alike.of(x[:1]), [0.0])
-    assert alike.of(np.array([[1.0, 3.0]]))[0] > 1.0
 
 
 def test_the_entry_that_contradicts_the_others_is_named(novelty):
@@ -195,17 +174,6 @@ def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(robot, mode):
     np.testing.assert_array_equal(result.belief, np.tile(EMPTY, (30, 1)))
     assert not result.probability.any()
     assert not result.cause_probability.any()
-
-
-def test_what_is_not_known_is_not_taken_for_safe(robot):
-    name, parts = robot
-    assessment = load_assessment(name, "sharpened")
-    beliefs = 0.1 * assessment.beliefs_
-    beliefs[..., UNCERTAINTY] = 1.0 - beliefs[..., SAFE] - beliefs[..., UNSAFE]
-    known, unknown = assessment.predict(*parts), assessment.predict(*parts, beliefs=beliefs)
-    assert known.probability.max() > 0.5
-    assert unknown.belief[:, SAFE].any()
-    assert not unknown.probability.any()
 
 
 def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):

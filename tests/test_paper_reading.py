@@ -1,5 +1,3 @@
-"""The readings of the paper: each parameter does what the sentence says that it reads."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,33 +9,17 @@ from drake_safety.learning.assessment import (
     SafetyAssessment,
 )
 from drake_safety.learning.assessment_parameters import PaperReading
-from drake_safety.learning.embedding import MapData, stack_members, train_map
+from drake_safety.learning.embedding import stack_members, train_map
 from drake_safety.learning.inputs import inputs, is_rate, num_inputs
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.training import segments_for
-from lip_assessments import QUICK
+from lip_assessments import QUICK, map_data
 from lip_episodes import make_episodes
 
 
 def paper(**changes):
     quick = {name: value for name, value in QUICK.items() if name != "epochs"}
     return AssessmentParameters(mode="paper", **quick | {"perplexity": 8.0} | changes)
-
-
-def map_data(x, target, neighbours=None):
-    if neighbours is None:
-        neighbours = np.full((len(x), 1), -1)
-    return MapData(
-        x=x,
-        has_target=np.ones(len(x), dtype=bool),
-        target=target,
-        is_unsafe=np.zeros(len(x), dtype=bool),
-        margins=np.zeros((len(x), 0)),
-        sample_weight=np.ones(len(x)),
-        input_scale=np.ones(x.shape[1]),
-        neighbours=neighbours,
-        tsne_unit=1.0,
-    )
 
 
 def trained(data, reading, held_out=None):
@@ -92,7 +74,7 @@ def test_neighbours_under_omega_meet_in_the_plane_where_the_target_does_not_say_
     gaps = []
     for weight in (0.0, 0.5):
         reading = PaperReading(neighbour_weight=weight, epochs=40)
-        (y,) = trained(map_data(x, target, neighbours), reading).embed(x)
+        (y,) = trained(map_data(x, target, neighbours=neighbours), reading).embed(x)
         centres = [y[group == one].mean(axis=0) for one in (False, True)]
         spread = np.mean([y[group == one].std() for one in (False, True)])
         gaps.append(np.linalg.norm(centres[0] - centres[1]) / spread)
@@ -102,7 +84,9 @@ def test_neighbours_under_omega_meet_in_the_plane_where_the_target_does_not_say_
 def test_taking_inputs_keeps_the_neighbours_that_are_taken():
     x = np.arange(4.0)[:, None]
     neighbours = np.array([[1, 2], [3, 0], [-1, 3], [2, 1]])
-    data = map_data(x, np.zeros((4, 2)), neighbours).take(np.array([True, False, True, True]))
+    data = map_data(x, np.zeros((4, 2)), neighbours=neighbours).take(
+        np.array([True, False, True, True])
+    )
     np.testing.assert_array_equal(data.neighbours, [[-1, 1], [-1, 2], [1, -1]])
 
 
@@ -158,8 +142,36 @@ def test_standardised_inputs_make_the_map_independent_of_units():
         (lambda: paper(exaggeration=0.5), "exaggeration is 0.5, expected >= 1"),
         (lambda: paper(initialization="pca"), "initialization is pca, expected one of"),
         (lambda: AdaptationParameters(count="all"), "count is all, expected one of"),
+        (lambda: AdaptationParameters(gate=-1.0), "gate"),
+        (lambda: AdaptationParameters(least_uncertainty=1.1), "least_uncertainty"),
+        (lambda: AdaptationParameters(update_interval=0), "update_interval"),
+        (lambda: AdaptationParameters(offset_std=0.0), "offset_std"),
+        (lambda: AdaptationParameters(slope_std=0.0), "slope_std"),
+        (lambda: AssessmentParameters(mode="blunt"), "mode"),
+        (lambda: AssessmentParameters(discount=1.1), "discount"),
+        (lambda: AssessmentParameters(discount=float("nan")), "discount"),
+        (lambda: AssessmentParameters(initial_uncertainty=-0.1), "initial_uncertainty"),
+        (lambda: AssessmentParameters(min_count=0), "min_count"),
+        (lambda: AssessmentParameters(cell_length=0.0), "cell_length"),
+        (lambda: AssessmentParameters(dropout=1.0), "dropout"),
+        (lambda: AssessmentParameters(hidden_sizes=[]), "hidden_sizes"),
+        (lambda: AssessmentParameters(margin_range=[0.1, -0.1]), "margin_range"),
+        (lambda: AssessmentParameters(raw_input_scale=0.0), "raw_input_scale"),
+        (lambda: AssessmentParameters(feature_unit=-1.0), "feature_unit"),
+        (lambda: AssessmentParameters(shortest_segment=11), "shortest_segment"),
+        (lambda: AssessmentParameters(distance_backend="fast"), r"distance_backend .*tslearn"),
     ],
 )
-def test_a_reading_that_does_not_exist_is_refused_with_those_that_do(make, message):
+def test_parameters_out_of_range_are_refused_by_name(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_the_defaults_are_the_papers_table():
+    learned, adapted = AssessmentParameters(), AdaptationParameters()
+    assert (learned.discount, learned.horizon, learned.score_weight) == (0.99, 10, 0.01)
+    assert (learned.initial_uncertainty, learned.min_count) == (0.3, 5)
+    assert (learned.resolution, learned.cell_length) == (14, 10.0)
+    assert (adapted.gate, adapted.least_uncertainty) == (0.3, 0.1)
+    assert (adapted.decay_rate, adapted.first_uncertainty) == (0.4, 0.3)
+    assert adapted.update_interval == 40

@@ -1,5 +1,3 @@
-"""path_figure: the motion's points over the cells, events numbered in both panels."""
-
 import numpy as np
 import pytest
 

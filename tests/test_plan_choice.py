@@ -1,7 +1,3 @@
-"""Of the plans that would do, the one with the highest Γ is set, and only the plan changes."""
-
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -51,26 +47,6 @@ def test_the_plan_with_the_highest_gamma_is_set_and_the_state_stays(loop, contex
     np.testing.assert_array_equal(after[3:], plans[slowest])
 
 
-def test_where_no_plan_passes_the_choice_asks_for_another_target(loop, context):
-    rng = np.random.default_rng(0)
-    easy, hard = (
-        choose_plan(loop, SlowIsSafe(), context, threshold=threshold, rng=rng)
-        for threshold in (0.01, 0.999)
-    )
-    assert easy.is_accepted
-    assert not hard.is_accepted
-
-
-def test_of_equally_good_plans_the_first_stays(loop, context):
-    before = state(loop, context)
-    indifferent = FieldAssessment(lambda goals: np.full(len(goals), 0.7))
-    choice = choose_plan(
-        loop, indifferent, context, threshold=THRESHOLD, rng=np.random.default_rng(0)
-    )
-    assert choice.index == 0
-    np.testing.assert_array_equal(state(loop, context), before)
-
-
 def test_judging_plans_changes_nothing(loop, context):
     before = state(loop, context)
     plans = loop.candidate_plans(context, np.random.default_rng(0), 5)
@@ -92,11 +68,17 @@ def test_an_episode_can_begin_with_a_plan_that_was_chosen(loop):
 
 
 def test_a_task_that_offers_no_plans_says_so():
-    class Wandering(ClosedLoop):
-        pass
-
-    loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
-    with pytest.raises(ValueError, match="'Wandering' has no plans to choose from"):
+    loop = ClosedLoop(shuttling(), "nominal", None)
+    with pytest.raises(ValueError, match="'ClosedLoop' has no plans to choose from"):
         choose_plan(loop, SlowIsSafe(), None, threshold=0.5, rng=None)
-    with pytest.raises(ValueError, match="'Wandering' has no plans to choose from"):
+    with pytest.raises(ValueError, match="'ClosedLoop' has no plans to choose from"):
         plan_inputs(loop, None, [])
+
+
+def test_of_equally_good_plans_the_first_stays_and_is_taken_where_it_passes(loop, context):
+    before, indifferent = state(loop, context), FieldAssessment(lambda goals: 0.7 + 0 * goals[:, 0])
+    for threshold, is_accepted in ((0.5, True), (0.9, False)):
+        rng = np.random.default_rng(0)
+        choice = choose_plan(loop, indifferent, context, threshold=threshold, rng=rng)
+        assert (choice.index, choice.is_accepted) == (0, is_accepted)
+        np.testing.assert_array_equal(state(loop, context), before)

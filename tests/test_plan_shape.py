@@ -1,5 +1,3 @@
-"""The shape of a plan is found again from its beginning, and its points lie on the plan."""
-
 import numpy as np
 import pytest
 

@@ -1,23 +1,15 @@
-"""Goals are judged before anything moves, and the nearest accepted one is found."""
-
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from drake_safety.planning.goal_verdict import (
-    SAFE,
-    UNKNOWN,
-    UNSAFE,
-    assess_goal,
-    goal_inputs,
-)
+from drake_safety.planning.goal_verdict import SAFE, UNKNOWN, UNSAFE, assess_goal, goal_inputs
 from drake_safety.planning.nearest_goal import nearest_accepted_goal, on_grid
 from drake_safety.simulation.closed_loop import ClosedLoop
 from goal_field import BOX, FieldAssessment, GoalTask
+from shuttle_task import shuttling
 
 INSIDE = np.array([0.5, 0.0, 1.0])
 
@@ -52,6 +44,10 @@ def test_a_goal_is_safe_from_the_threshold_on():
     assert ask(constant(0.6), threshold=0.6).is_accepted
     assert ask(constant(0.6), threshold=0.61).verdict == UNSAFE
     assert not ask(constant(0.6), threshold=0.61).is_accepted
+    # The corners of the region belong to it.
+    assert all(ask(constant(1.0), corner).is_accepted for corner in BOX)
+    for part in goal_inputs(GoalTask(), np.array([INSIDE, BOX[0]])):
+        np.testing.assert_array_equal(part, [INSIDE, BOX[0]])
 
 
 def test_between_the_thresholds_of_a_calibration_a_goal_is_not_known():
@@ -96,11 +92,6 @@ def test_outside_what_was_trained_the_answer_is_the_region_and_no_number(goal, w
     assert told["cause"] is None
 
 
-def test_the_corners_of_the_region_belong_to_it():
-    for corner in BOX:
-        assert ask(constant(1.0), corner).is_accepted
-
-
 def test_a_refusal_names_the_constraint_whose_margin_comes_nearest_to_violation():
     # Most of the unsafe mass is the floor's, but it is the wall that the margins tell of.
     verdict = ask(constant(0.25))
@@ -121,23 +112,12 @@ def test_without_predicted_margins_the_cause_is_what_most_of_the_unsafe_mass_is_
     assert replace(verdict, cause_probability=np.zeros(2)).cause == ""
 
 
-def test_goals_are_judged_by_the_first_instant_on_the_way_to_each():
-    goals = np.array([INSIDE, BOX[0]])
-    for part in goal_inputs(GoalTask(), goals):
-        np.testing.assert_array_equal(part, goals)
-
-
 def test_points_on_the_grid_are_the_numbers_that_their_digits_say():
     points = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3))
     placed = on_grid(points, 1e-3)
     assert np.abs(placed - points).max() <= 0.5e-3 + 1e-9
     assert placed.tolist() == [[float(f"{value:.3f}") for value in row] for row in placed]
     np.testing.assert_array_equal(on_grid(placed, 1e-3), placed)
-
-
-def test_what_is_accepted_is_its_own_nearest_accepted_goal():
-    found = search(constant(1.0), INSIDE)
-    np.testing.assert_array_equal(found.goal, INSIDE)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -168,11 +148,6 @@ def test_a_small_region_far_away_is_found_all_the_same():
     assert np.linalg.norm(found.goal - centre) <= 0.2
 
 
-def test_a_goal_outside_the_region_is_moved_into_it():
-    found = search(constant(1.0), np.array([0.5, 3.0, 1.0]))
-    np.testing.assert_array_equal(found.goal, [0.5, 1.0, 1.0])
-
-
 def test_an_accepted_goal_stays_one_when_it_is_typed_to_the_millimetre():
     gamma = step(lambda goals: (goals - INSIDE) @ [0.48, 0.6, 0.64] - 0.1234567)
     found = search(gamma, INSIDE)
@@ -191,32 +166,29 @@ def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve(reserve, x_m):
     assert found.is_accepted
 
 
-def test_where_nothing_is_accepted_with_reserve_nothing_is_suggested():
-    assert search(constant(0.89), INSIDE, num_candidates=4) is None
+@pytest.mark.parametrize(
+    ("goal", "nearest"),
+    [(INSIDE, INSIDE), (np.array([0.5, 3.0, 1.0]), [0.5, 1.0, 1.0])],
+    ids=["accepted", "outside the region"],
+)
+def test_what_is_accepted_is_its_own_nearest_and_what_is_outside_is_moved_in(goal, nearest):
+    np.testing.assert_array_equal(search(constant(1.0), goal).goal, nearest)
+    gamma = step(lambda goals: 0.2 - goals[:, 0])
+    np.testing.assert_array_equal(search(gamma, goal).goal, search(gamma, goal).goal)
+
+
+def test_where_nothing_is_accepted_with_reserve_or_asked_nothing_is_suggested():
+    for gamma in (0.0, 0.89):
+        assert search(constant(gamma), INSIDE, num_candidates=4) is None
     assert search(constant(0.91), INSIDE, num_candidates=4) is not None
+    assert search(constant(1.0), np.array([math.nan, 0.0, 1.0])) is None
     with pytest.raises(ValueError, match=r"reserve is 1\.5, expected a value in \[0, 1\]"):
         search(constant(1.0), INSIDE, reserve=1.5)
 
 
-def test_the_same_generator_finds_the_same_goal():
-    gamma = step(lambda goals: 0.2 - goals[:, 0])
-    np.testing.assert_array_equal(search(gamma, INSIDE).goal, search(gamma, INSIDE).goal)
-
-
-def test_where_nothing_is_accepted_or_asked_nothing_is_found():
-    assert search(constant(0.0), INSIDE, num_candidates=4) is None
-    assert search(constant(1.0), np.array([math.nan, 0.0, 1.0])) is None
-
-
-def test_a_task_whose_plans_have_no_goal_is_not_asked():
-    class Wandering(ClosedLoop):
-        pass
-
-    loop = Wandering(SimpleNamespace(variation=lambda name: None), "nominal", None)
-    with pytest.raises(ValueError, match="'Wandering' has no plans with a goal"):
-        assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)
-
-
-def test_a_goal_is_three_numbers():
+def test_a_goal_is_three_numbers_and_a_task_whose_plans_have_none_is_not_asked():
     with pytest.raises(ValueError, match=r"three numbers; got \[0.5, 0.0\]"):
         ask(constant(1.0), INSIDE[:2])
+    loop = ClosedLoop(shuttling(), "nominal", None)
+    with pytest.raises(ValueError, match="'ClosedLoop' has no plans with a goal"):
+        assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)

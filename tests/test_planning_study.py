@@ -9,7 +9,6 @@ from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO as GLIDING
 from goal_field import FieldAssessment
 from shuttle_task import shuttling
-from studies import planning
 from studies.planning import planning_estimates, run_trials
 
 
@@ -47,47 +46,9 @@ def test_what_gamma_sees_of_a_plan_is_what_it_would_see_when_it_chooses(trials):
     loop.reset(context, episode_rng(9, 3))
     rng = np.random.default_rng(np.random.SeedSequence(9, spawn_key=(3, 1)))
     seen = plan_inputs(loop, context, loop.candidate_plans(context, rng, 5))
-    trial = trials[3]
-    for expected, found in zip(
-        seen, (trial.state, trial.desired_preview, trial.features), strict=True
-    ):
-        np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.train
-def test_a_stopped_study_goes_on_with_the_motions_it_has(trials, tmp_path, monkeypatch):
-    num_run = 0
-    run_episode = planning.run_episode
-
-    def counted(*arguments, **options):
-        nonlocal num_run
-        num_run += 1
-        return run_episode(*arguments, **options)
-
-    def stop(done, total):
-        assert total == 40
-        if done >= 4:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(planning, "run_episode", counted)
-    with pytest.raises(KeyboardInterrupt):
-        run_trials(shuttling(), 40, **OPTIONS, path=tmp_path, progress=stop)
-    assert num_run == 20
-    calls = []
-    again = run_trials(
-        shuttling(), 40, **OPTIONS, path=tmp_path, progress=lambda *call: calls.append(call)
-    )
-    assert calls[0] == (4, 40) and calls[-1] == (40, 40)
-    assert num_run == 200
-    for index, other in trials.items():
-        for name in ("state", "desired_preview", "features", "is_safe"):
-            np.testing.assert_array_equal(getattr(again[index], name), getattr(other, name))
-    # All are there, and fewer starts are the first of them.
-    assert list(run_trials(shuttling(), 7, **OPTIONS, path=tmp_path)) == list(range(7))
-    assert num_run == 200
-    # Another seed has other motions.
-    run_trials(shuttling(), 7, **{**OPTIONS, "seed": 10}, path=tmp_path)
-    assert num_run == 235
+    found = (trials[3].state, trials[3].desired_preview, trials[3].features)
+    for one, expected in zip(found, seen, strict=True):
+        np.testing.assert_array_equal(one, expected)
 
 
 def test_who_knows_comes_all_the_way_to_hindsight_and_who_errs_does_not(trials):

@@ -1,5 +1,3 @@
-"""Files that would keep a reader busy, or bury the error, are refused in a line."""
-
 from pathlib import Path
 
 import pytest

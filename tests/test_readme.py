@@ -1,5 +1,3 @@
-"""The README says what is so: its code runs, its commands parse, its links lead somewhere."""
-
 import os
 import re
 import shlex
@@ -14,7 +12,7 @@ import pytest
 import typer
 import yaml
 
-from drake_safety.cli import app
+from drake_safety.cli import make_app
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.simulation.scenario import load_scenario, parse_scenario, task_names
@@ -25,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
 OWN_DIAGRAM = (ROOT / "docs/own_diagram.md").read_text(encoding="utf-8")
+MAKEFILE = (ROOT / "Makefile").read_text()
 CARDS = "".join(
     path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("assessments/*/README.md"))
 )
@@ -43,15 +42,6 @@ def shell_commands(program, text=README):
     lines += re.findall(r"`([^`\n]+ [^`\n]+ [^`\n]+)`", text)
     called = [line for line in lines if line.startswith(f"{program} ")]
     return [shlex.split(line, comments=True)[len(program.split()) :] for line in called]
-
-
-@pytest.fixture
-def own_robot(tmp_path):
-    """A folder as the README describes it: a robot.yaml beside its URDF, and the README's YAML."""
-    write_hexapod(tmp_path)
-    (text,) = blocks("yaml")
-    (tmp_path / "balancing.yaml").write_text(text)
-    return tmp_path
 
 
 @pytest.mark.slow
@@ -80,7 +70,7 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
 
 
 def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():
-    for program, commands in (("drake-safety", app), ("python -m studies", studies)):
+    for program, commands in (("drake-safety", make_app()), ("python -m studies", studies)):
         group = typer.main.get_command(commands)
         calls = shell_commands(program, README + COMMANDS + CARDS)
         assert {call[0] for call in calls} == set(group.commands)
@@ -89,36 +79,23 @@ def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_p
             group.commands[name].make_context(name, arguments)
 
 
-def test_every_make_target_of_the_readme_is_in_the_makefile():
-    makefile = (ROOT / "Makefile").read_text()
-    targets = set(re.findall(r"^([a-z]+):.*## ", makefile, flags=re.MULTILINE))
+def test_the_makefile_has_every_target_of_the_readme_and_does_what_is_said_of_the_demo():
+    targets = set(re.findall(r"^([a-z]+):.*## ", MAKEFILE, flags=re.MULTILINE))
     named = {call[0] for call in shell_commands("make")}
     assert {"demo", "test"} <= named <= targets
+    trained = r"/drake-safety train .*--episodes (\d+) --out runs/demo"
+    (num_episodes,) = re.findall(trained, MAKEFILE)
+    assert f"simulates {num_episodes} episodes" in README
+    assert f"## Train on {num_episodes} episodes" in MAKEFILE
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_make_help_lists_every_target_that_is_no_file():
-    makefile = (ROOT / "Makefile").read_text()
-    named = " ".join(re.findall(r"^\.PHONY: (.*)$", makefile, flags=re.MULTILINE)).split()
+    named = " ".join(re.findall(r"^\.PHONY: (.*)$", MAKEFILE, flags=re.MULTILINE)).split()
     command = ["make", "--no-print-directory", "help"]
     printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     listed = re.findall(r"^  make (\S+) +\S", printed, flags=re.MULTILINE)
     assert sorted(listed) == sorted(named)
-
-
-def test_the_citation_is_of_this_version_and_licence():
-    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    stated = ("name", "version", "license", "keywords")
-    assert [cited[key] for key in ("title", *stated[1:])] == [project[key] for key in stated]
-
-
-def test_what_is_said_of_the_demo_is_what_it_does():
-    makefile = (ROOT / "Makefile").read_text()
-    trained = r"/drake-safety train .*--episodes (\d+) --out runs/demo"
-    (num_episodes,) = re.findall(trained, makefile)
-    assert f"simulates {num_episodes} episodes" in README
-    assert f"## Train on {num_episodes} episodes" in makefile
 
 
 @pytest.mark.parametrize("target", re.findall(r"\]\(([^)#\s]+)", README))
@@ -128,41 +105,41 @@ def test_every_relative_link_of_the_readme_leads_to_a_file(target):
         assert (ROOT / target).is_file()
 
 
-def test_the_figures_are_filled_in():
-    assert re.findall(r"\{\{.*?\}\}|@\w*@", README) == []
-
-
-def test_the_scenario_of_the_readme_makes_a_loop_with_a_robot_of_ones_own(own_robot):
-    scenario = load_scenario(own_robot / "balancing.yaml")
-    assert Path(scenario.robot) == own_robot / "robot.yaml"
-    for variation in ("nominal", "actual"):
-        loop = scenario.make_loop(variation)
-        assert loop.robot.name == load_robot_file(own_robot / "robot.yaml").name
-    assert scenario.task.partition(":")[0] in task_names()
-
-
-def test_a_key_that_does_not_exist_is_answered_with_those_that_do(own_robot):
-    raw = yaml.safe_load((own_robot / "balancing.yaml").read_text())
-    with pytest.raises(ValueError, match=r"unknown key 'robots' .*; keys there are \['name', "):
-        parse_scenario(yaml.safe_dump(raw | {"robots": "two"}), name="own", folder=own_robot)
-
-
 def test_the_numbers_in_the_readmes_prose_are_the_programs_defaults():
     recovery = load_scenario("laikago_balancing").parameters.recovery
-    assert f"below a threshold ({recovery.threshold:g} in Laikago's scenario)" in README
+    assert f"({recovery.threshold:g} in Laikago's scenario)" in README
     parameters = AssessmentParameters()
     assert f"{parameters.resolution} × {parameters.resolution} cells" in README
     assert parameters.ensemble_size == 3
     assert re.search(r"the\s+mean\s+of three such maps", README)
 
 
-def test_the_versions_in_the_readme_are_those_of_the_constraints():
+def test_the_versions_are_those_of_the_constraints_and_the_citation_is_of_this_one():
     constraints = (ROOT / "constraints.txt").read_text()
     pinned = re.findall(r"^drake==([^\s;]+);", constraints, flags=re.MULTILINE)
     assert len(pinned) == 2
     assert [version for version in pinned if f"with Drake {version}" not in README] == []
-    assert "!=1.52.0" in (ROOT / "pyproject.toml").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
+    assert "!=1.52.0" in project
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    stated, project = ("version", "license", "keywords"), tomllib.loads(project)["project"]
+    assert [cited[key] for key in ("title", *stated)] == [project[key] for key in ("name", *stated)]
 
 
-def test_the_readme_knows_no_path_of_anyones_machine():
+def test_the_readme_is_filled_in_and_knows_no_path_of_anyones_machine():
+    assert re.findall(r"\{\{.*?\}\}|@\w*@", README) == []
     assert re.findall(r"(?<![\w.])/(?:home|root|tmp|work|Users)/\S*", README) == []
+
+
+def test_the_scenario_of_the_readme_makes_a_loop_with_a_robot_of_ones_own(tmp_path):
+    write_hexapod(tmp_path)
+    (text,) = blocks("yaml")
+    (tmp_path / "balancing.yaml").write_text(text)
+    scenario = load_scenario(tmp_path / "balancing.yaml")
+    assert Path(scenario.robot) == tmp_path / "robot.yaml"
+    for variation in ("nominal", "actual"):
+        loop = scenario.make_loop(variation)
+        assert loop.robot.name == load_robot_file(tmp_path / "robot.yaml").name
+    assert scenario.task.partition(":")[0] in task_names()
+    with pytest.raises(ValueError, match=r"unknown key 'robots' .*; keys there are \['name', "):
+        parse_scenario(f"{text}\nrobots: two\n", name="own", folder=tmp_path)

@@ -1,5 +1,3 @@
-"""RecoverySwitch: the nominal set point passes through until Γ falls, and again afterwards."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
@@ -24,9 +22,15 @@ class Bench:
     def __init__(self, name="laikago"):
         self.kinematics = robot_kinematics(name)
         self.parameters = RecoveryStepParameters(settle_margin_m=0.01, resume_margin_m=0.0)
-        options = {"threshold": 0.6, "period_s": PERIOD_S, "offset_s": OFFSET_S}
-        options |= {"horizon": HORIZON, "num_outlook": 2}
-        self.switch = RecoverySwitch(self.kinematics, self.parameters, **options)
+        self.switch = RecoverySwitch(
+            self.kinematics,
+            self.parameters,
+            threshold=0.6,
+            period_s=PERIOD_S,
+            offset_s=OFFSET_S,
+            horizon=HORIZON,
+            num_outlook=2,
+        )
         self.simulator = Simulator(self.switch)
         self.context = self.simulator.get_mutable_context()
         base = np.append(self.kinematics.nominal_base_offset, self.kinematics.standing_height)
@@ -56,17 +60,6 @@ class Bench:
         return steps + self.parameters.return_duration_s + 0.2
 
 
-def test_it_exports_the_promised_ports():
-    switch = Bench().switch
-    inputs = {switch.get_input_port(i).get_name() for i in range(switch.num_input_ports())}
-    outputs = {switch.get_output_port(i).get_name() for i in range(switch.num_output_ports())}
-    nominal = {f"nominal_desired_{name}" for name in ("output", "preview", "outlook")}
-    assert inputs == {"safety_probability", "belief", "plant_state", *nominal}
-    names = "output preview outlook foot_positions yaw"
-    desired = {f"desired_{name}" for name in names.split()}
-    assert outputs == {*desired, "stance_pose", "recovery_active"}
-
-
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_while_safe_the_nominal_plan_passes_through_at_once(name):
     bench = Bench(name)
@@ -81,7 +74,7 @@ def test_while_safe_the_nominal_plan_passes_through_at_once(name):
 
 
 @pytest.mark.parametrize("probability", [0.3, np.nan])
-def test_a_low_probability_or_none_makes_feet_leave_the_ground_within_two_ticks(probability):
+def test_a_low_probability_makes_feet_leave_the_ground_within_two_ticks(probability):
     bench = Bench()
     bench.advance(0.1)
     bench.fix("safety_probability", [probability])
@@ -119,7 +112,7 @@ def test_only_a_system_that_updates_a_tick_later_sees_what_another_has_updated(o
     assert holds[1].get_output_port().Eval(own)[0] == pytest.approx(seen)
 
 
-def test_recovery_ends_with_the_nominal_plan_passing_through_again_after_every_dip():
+def test_each_recovery_ends_with_the_nominal_plan_passing_through_again():
     bench = Bench()
     for _ in range(2):
         bench.fix("safety_probability", [0.3])
@@ -127,18 +120,11 @@ def test_recovery_ends_with_the_nominal_plan_passing_through_again_after_every_d
         bench.fix("safety_probability", [1.0])
         bench.advance(3 * PERIOD_S)
         assert bench.get("recovery_active")[0] == 1  # It latches.
+        outlook, preview = bench.get("desired_outlook"), bench.get("desired_preview")
+        np.testing.assert_array_equal(outlook, preview[:6])
+        assert not np.array_equal(outlook, OUTLOOK)
         bench.advance(bench.recovery_duration_s())
         assert bench.get("recovery_active")[0] == 0
         np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
         np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
         np.testing.assert_array_equal(bench.get("desired_outlook"), OUTLOOK)
-
-
-def test_during_recovery_preview_and_outlook_tell_the_same_plan():
-    bench = Bench()
-    bench.fix("safety_probability", [0.3])
-    for _ in range(60):
-        bench.advance(PERIOD_S)
-        if bench.get("recovery_active")[0] and bench.context.get_time() > 3 * PERIOD_S:
-            outlook, preview = bench.get("desired_outlook"), bench.get("desired_preview")
-            np.testing.assert_array_equal(outlook, preview[:6])

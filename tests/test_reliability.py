@@ -4,11 +4,7 @@ import pytest
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.learning.calibration import PLAN, calibrate
-
-
-def episodes(rng, n=1000):
-    label = rng.random(n) < 0.5
-    return 1.0 / (1.0 + np.exp(-(rng.normal(size=n) + 3.0 * (label - 0.5)))), label
+from lip_assessments import scored_episodes
 
 
 def once(p, label, **options):
@@ -16,8 +12,8 @@ def once(p, label, **options):
 
 
 def test_every_episode_has_one_verdict():
-    found = calibrate(*episodes(np.random.default_rng(2)), kind=PLAN, miss_rate=0.05)
-    score, label = episodes(np.random.default_rng(3), n=400)
+    found = calibrate(*scored_episodes(np.random.default_rng(2)), kind=PLAN, miss_rate=0.05)
+    score, label = scored_episodes(np.random.default_rng(3), n=400)
     shares = {name: one.value for name, one in verdict_shares(found, score, label).items()}
     assert shares["promised_miss_rate"] == 0.05
     of_safe = shares["safe_recall"] + shares["safe_unknown"] + shares["false_alarm_rate"]
@@ -48,7 +44,7 @@ def test_equal_probabilities_share_a_bin_and_not_knowing_is_certainty():
 
 
 def test_repeating_the_rows_of_an_episode_adds_no_certainty():
-    score, label = episodes(np.random.default_rng(5), n=200)
+    score, label = scored_episodes(np.random.default_rng(5), n=200)
     rows = (np.repeat(score, 20), np.repeat(label, 20))
     often = reliability(*rows, np.repeat(np.arange(200), 20), num_bins=2)
     independent = reliability(*rows, np.arange(4000), num_bins=2)

@@ -1,5 +1,3 @@
-"""The report of a run: it shows what there is, and needs nothing but itself."""
-
 import base64
 import json
 import re
@@ -74,17 +72,13 @@ def test_the_page_asks_nothing_of_any_other_place(whole):
     assert "default-src 'none'" in "".join(whole.page.all("meta", "content"))
 
 
-def test_it_says_what_was_learned_from_and_what_is_promised(whole):
+def test_it_says_what_was_learned_from_what_is_promised_and_where_a_baseline_is_better(whole):
     words = whole.page.words
     assert "drake-safety train lip --episodes 60" in words
     assert f"training: 60 of plant “nominal”, seed {whole.assessment.info_.seed}" in words
     for name in whole.assessment.info_.constraint_names:
         assert name.replace("_", " ") in words
     assert words.count("nothing: drake-safety calibrate chooses thresholds") == 2
-
-
-def test_it_shows_every_result_and_where_a_baseline_is_better(whole):
-    words = whole.page.words
     assert "drake-safety evaluate lip --assessment" in words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in words
     assert f"All {len(make_figures())} results" in words
@@ -119,18 +113,20 @@ def test_what_a_half_finished_run_lacks_is_left_out_and_the_rest_shown(whole, co
         assert "0.900 (0.795–0.962)" in page.words
 
 
-def test_a_damaged_file_is_named(copy):
+def test_a_folder_that_is_no_run_or_is_damaged_and_a_missing_extra_are_named(
+    copy, tmp_path, monkeypatch
+):
     (copy / "sharpened.safetensors").write_bytes(b"half of it")
     with pytest.raises(ValueError, match=r"sharpened\.safetensors"):
         page_of(copy)
-
-
-def test_a_folder_that_is_no_run_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").write_bytes(b"")
     with pytest.raises(ValueError, match=r"neither an assessment nor results.*holiday\.jpg"):
         page_of(tmp_path)
     with pytest.raises(ValueError, match="there is no folder"):
         page_of(tmp_path / "nowhere")
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
+        page_of(copy)
 
 
 def test_names_that_look_like_html_stay_text(copy):
@@ -140,9 +136,3 @@ def test_names_that_look_like_html_stay_text(copy):
     text = page_of(copy)
     assert "<script" not in text
     assert "<script>alert(1)</script>" in Page(text).words
-
-
-def test_a_page_without_what_writes_it_names_the_extra(copy, monkeypatch):
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
-        page_of(copy)

@@ -1,5 +1,3 @@
-"""The README's results are those of the stored evaluations, to the letter."""
-
 import re
 from pathlib import Path
 
@@ -44,18 +42,6 @@ def test_every_stored_evaluation_is_shown():
     assert shown == {path.stem for path in STORED}
 
 
-def test_a_summary_is_one_table_with_and_without_targets(tmp_path):
-    summary = BLOCK.replace("results:", "summary:")
-    text = filled(tmp_path, make_figures(), summary)
-    assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
-    assert "```sh" not in text
-    estimates = {"plans.outcomes.safe": proportion(20, 50)}
-    for column in ("safe_recall", "unsafe_recall", "auc"):
-        estimates[f"plans.sharpened.{column}"] = proportion(19, 20)
-    text = filled(tmp_path, estimates, summary)
-    assert "| *the paper's own* | *0.952* | *0.987* | |" in text
-
-
 def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
     info = make_info(scenario="lip")
     extra = {"command": "drake-safety train lip --resume --out=/somebodys/own/lip"}
@@ -83,43 +69,9 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     assert "Trained on 64 episodes of seed 7. Evaluated on 60 fresh ones of seed 1000" in text
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
-    assert generate(text, tmp_path) == text
-
-
-def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
-    estimates = {"plans.outcomes.safe": proportion(20, 50)}
-    for name, count in (("sharpened", 19), ("paper", 10)):
-        for column in ("safe_recall", "unsafe_recall", "auc"):
-            estimates[f"plans.{name}.{column}"] = proportion(count, 20)
-    estimates["plans.causes.right_cause"] = proportion(9, 10)
-    text = filled(tmp_path, estimates)
-    assert "| all targets | safe recall | unsafe recall | AUC |" in text
-    assert "| *the paper's own* | *0.952* | *0.987* | |" in text
-    assert "of which 40.0 % (26.4–54.8) are safe" in text
-    assert "named for 90.0 % (55.5–99.7) of the 10 correctly refused" in text
-
-
-def test_what_the_other_hand_loses_is_told(tmp_path):
-    estimates = {"plans.outcomes.safe": proportion(20, 50)}
-    for prefix in ("plans.sharpened", "plans.other_hand.sharpened"):
-        for column in ("safe_recall", "unsafe_recall", "auc"):
-            estimates[f"{prefix}.{column}"] = proportion(19, 20)
-    text = filled(tmp_path, estimates)
-    assert "mirrored" not in text
-    assert "| the other hand | 0.950 (0.751–0.999) | 0.950" in text
-    lost = {"safe": Estimate(0.011, -0.002, 0.024, 40), "unsafe": Estimate(0.0, 0.0, 0.0, 40)}
-    for what, estimate in lost.items():
-        estimates[f"plans.other_hand.sharpened.{what}_recall_loss"] = estimate
-    assert (
-        "On the same 40 targets, mirrored, the other hand minus the trained one: -1.1 (-2.4 to "
-        "+0.2) points of safe recall, +0.0 (+0.0 to +0.0) points of unsafe recall."
-    ) in filled(tmp_path, estimates)
-
-
-def test_a_figure_that_is_changed_by_hand_is_noticed(tmp_path):
-    text = filled(tmp_path, make_figures())
+    # Whatever is changed by hand is written again.
     forged = text.replace("0.900 (0.795–0.962)", "0.990 (0.795–0.962)", 1)
-    assert generate(forged, tmp_path) == text
+    assert generate(forged, tmp_path) == generate(text, tmp_path) == text
 
 
 @pytest.mark.parametrize(
@@ -135,3 +87,21 @@ def test_a_text_that_cannot_be_filled_in_is_refused(tmp_path, text, message):
     Results(make_figures(), ENTRIES).write(tmp_path / "lip.json")
     with pytest.raises(ValueError, match=message):
         generate(text, tmp_path)
+
+
+def test_verdicts_on_targets_stand_beside_the_papers_own_and_the_other_hand_s(tmp_path):
+    estimates = {"plans.outcomes.safe": proportion(20, 50)}
+    for prefix in ("plans.sharpened", "plans.other_hand.sharpened"):
+        for column in ("safe_recall", "unsafe_recall", "auc"):
+            estimates[f"{prefix}.{column}"] = proportion(19, 20)
+    lost = {"safe": Estimate(0.011, -0.002, 0.024, 40), "unsafe": Estimate(0.0, 0.0, 0.0, 40)}
+    for what, estimate in lost.items():
+        estimates[f"plans.other_hand.sharpened.{what}_recall_loss"] = estimate
+    text = filled(tmp_path, estimates)
+    assert "| *the paper's own* | *0.952* | *0.987* | |" in text
+    assert "of which 40.0 % (26.4–54.8) are safe" in text
+    assert "| the other hand | 0.950 (0.751–0.999) | 0.950" in text
+    assert (
+        "On the same 40 targets, mirrored, the other hand minus the trained one: -1.1 (-2.4 to "
+        "+0.2) points of safe recall, +0.0 (+0.0 to +0.0) points of unsafe recall."
+    ) in text

@@ -1,5 +1,3 @@
-"""The table of results: its rows, its file, its renderings and its plot."""
-
 import json
 import math
 
@@ -66,17 +64,13 @@ def test_what_is_written_is_read_again_with_six_digits(tmp_path):
         ({"x.y": [1.0]}, "not enough values"),
     ],
 )
-def test_a_forged_file_is_not_read(tmp_path, figures, words):
+def test_a_forged_file_and_one_of_another_schema_are_not_read(tmp_path, figures, words):
     file = tmp_path / "results.json"
     Results({}, {}).write(file)
     file.write_text(json.dumps(json.loads(file.read_text()) | {"figures": figures}))
     with pytest.raises(ValueError, match=words) as caught:
         Results.read(file)
     assert str(file) in str(caught.value)
-
-
-def test_a_file_of_another_schema_holds_no_results(tmp_path):
-    file = tmp_path / "a.json"
     file.write_text('{"schema": "another", "schema_version": 1}')
     with pytest.raises(ValueError, match=r"holds no results.*another"):
         Results.read(file)

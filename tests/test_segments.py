@@ -17,14 +17,6 @@ def test_the_score_is_discounted_by_the_steps_left_and_zero_when_safe():
     np.testing.assert_allclose(score, [1.0, 0.9, 0.81, 0.0])
 
 
-def test_both_labels_give_segments_from_the_same_rows(episodes):
-    segments = split(episodes, stride=1, discount=0.99)
-    for position, episode in enumerate(episodes):
-        rows = segments.start_row[segments.episode == position]
-        num_starts = min(NUM_STEPS - HORIZON + 1, episode.num_steps)
-        np.testing.assert_array_equal(rows, np.arange(max(num_starts, 0)))
-
-
 def test_a_segment_holds_the_errors_from_its_start_and_its_last_one_when_cut_short(episodes):
     segments = split(episodes, stride=3, discount=0.99)
     assert np.any(segments.length < HORIZON)
@@ -71,32 +63,10 @@ def test_diverged_episodes_are_counted_and_give_no_segments(episodes):
     assert 0 not in split(mixed, stride=1, discount=0.99).episode
 
 
-def test_a_slice_of_a_set_is_a_set_with_the_same_info(episodes):
-    part = episodes[3:5]
-    assert part.info is episodes.info
-    assert [episode.index for episode in part] == [3, 4]
-
-
-def test_an_episode_of_the_wrong_width_is_refused_by_name(episodes):
-    wrong = dataclasses.replace(episodes[7], state=episodes[7].state[:, :-1])
-    with pytest.raises(ValueError, match=r"episode 7 of 'lip': state has shape"):
-        Episodes(episodes.info, [wrong])
-
-
-def test_an_unknown_cause_is_refused_with_those_that_exist(episodes):
-    wrong = dataclasses.replace(episodes[7], is_safe=False, cause="shelf")
-    with pytest.raises(ValueError, match=r"unknown cause 'shelf'.*support.*height"):
-        Episodes(episodes.info, [wrong])
-
-
-def test_a_set_without_one_whole_segment_is_refused(episodes):
-    with pytest.raises(ValueError, match="none of the 0 episodes"):
-        split(episodes[:0], stride=1, discount=0.99)
-
-
-@pytest.mark.parametrize("shortest", [1, 4, HORIZON])
-def test_what_is_left_of_a_whole_episode_is_enough_where_a_segment_may_be_short(episodes, shortest):
-    segments = split(episodes, stride=1, discount=0.99, shortest=shortest)
+@pytest.mark.parametrize("asked", [1, 4, HORIZON, None])
+def test_a_segment_begins_where_enough_of_a_whole_episode_is_left(episodes, asked):
+    segments = split(episodes, stride=1, discount=0.99, shortest=asked)
+    shortest = asked or HORIZON
     for position, episode in enumerate(episodes):
         rows = segments.start_row[segments.episode == position]
         num_starts = min(NUM_STEPS - shortest + 1, episode.num_steps)
@@ -132,12 +102,6 @@ def test_the_longest_episode_stands_in_for_a_length_that_is_not_known(episodes):
         split(Episodes(which, episodes), stride=1, discount=0.99) for which in (info, episodes.info)
     )
     np.testing.assert_array_equal(unknown.start_row, known.start_row)
-
-
-@pytest.mark.parametrize("shortest", [0, -1, HORIZON + 1])
-def test_a_shortest_segment_beyond_the_horizon_is_refused(episodes, shortest):
-    with pytest.raises(ValueError, match=rf"shortest is {shortest}, expected 1\.\.{HORIZON}"):
-        split(episodes, stride=1, discount=0.99, shortest=shortest)
 
 
 def test_episodes_too_short_for_any_segment_are_refused_with_the_length_wanted(episodes):
@@ -180,8 +144,6 @@ def test_samples_of_a_segment_are_a_preview_stride_apart_and_so_are_the_steps_of
         if not one.is_safe:
             expected = 0.9 ** ((one.num_steps - row) / stride)
             assert segments.score[i] == pytest.approx(expected)
-    with pytest.raises(ValueError, match="preview_stride is 0, expected >= 1"):
-        dataclasses.replace(info, preview_stride=0)
 
 
 def test_a_set_says_scenario_plant_and_counts(episodes):
@@ -190,6 +152,8 @@ def test_a_set_says_scenario_plant_and_counts(episodes):
         f"{episodes.num_safe} safe, {episodes.num_unsafe} unsafe)"
     )
     assert repr(episodes[:0]).endswith("0 episodes)")
+    assert episodes[3:5].info is episodes.info
+    assert [episode.index for episode in episodes[3:5]] == [3, 4]
 
 
 @pytest.mark.train
@@ -211,3 +175,32 @@ def test_a_table_has_every_row_and_every_column_by_name(episodes):
     causes = set(np.array(table["cause"].to_pylist())[is_of_it])
     assert causes == {episodes[3].cause}
     assert episodes[:0].to_frame().column_names == table.column_names
+
+
+def changed(episodes, **changes):
+    return Episodes(episodes.info, [dataclasses.replace(episodes[7], **changes)])
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda of: changed(of, state=of[7].state[:, :-1]), "episode 7 of 'lip': state has shape"),
+        (
+            lambda of: changed(of, is_safe=False, cause="shelf"),
+            r"unknown cause 'shelf'.*support.*height",
+        ),
+        (lambda of: split(of[:0], stride=1, discount=0.99), "none of the 0 episodes"),
+        (
+            lambda of: split(of, stride=1, discount=0.99, shortest=0),
+            r"shortest is 0, exp.* 1\.\.10",
+        ),
+        (lambda of: split(of, stride=1, discount=0.99, shortest=11), "shortest is 11, expected 1"),
+        (
+            lambda of: dataclasses.replace(of.info, preview_stride=0),
+            "preview_stride is 0, expected >",
+        ),
+    ],
+)
+def test_what_gives_no_segments_is_refused(episodes, ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask(episodes)

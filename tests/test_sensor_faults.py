@@ -1,5 +1,3 @@
-"""SensorFaults: faults of a vector, between what measures it and what reads it."""
-
 import re
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Confident errors, "don't know" and alarms under shifts are counted as they are defined."""
-
 import dataclasses
 import math
 
@@ -19,8 +17,8 @@ from drake_safety.evaluation.shift_study import (
     shift_estimates,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
-from drake_safety.learning.calibration import PLAN, Calibration
-from lip_assessments import QUICK
+from drake_safety.learning.calibration import PLAN
+from lip_assessments import QUICK, calibration
 from lip_episodes import make_episodes
 from studies.shifts import (
     POSTURES,
@@ -41,20 +39,7 @@ def training():
 @pytest.fixture(scope="module")
 def assessment(training):
     found = SafetyAssessment(AssessmentParameters(**QUICK)).fit(training)
-    found.calibrations_[PLAN] = Calibration(
-        kind=PLAN,
-        miss_rate=0.1,
-        false_alarm_rate=0.1,
-        confidence=None,
-        threshold=0.6,
-        unsafe_below=0.4,
-        num_unsafe=50,
-        num_safe=50,
-        num_missed=4,
-        num_accepted=40,
-        seed=1,
-        scenario_hash="",
-    )
+    found.calibrations_[PLAN] = calibration(miss_rate=0.1, threshold=0.6, unsafe_below=0.4)
     return found
 
 
@@ -226,13 +211,11 @@ def test_the_catalogue_is_scaled_to_the_robot():
     assert "slope" in shifted.variations
     assert "slope" not in scenario.variations
     assert shifted.simulation_hash("slope") != scenario.simulation_hash("nominal")
-
-
-def test_a_plant_of_its_own_has_the_scenarios_variations_alone():
-    scenario = load_scenario("pendulum")
-    shifts = plant_shifts(scenario, scenario.make_loop())
-    assert list(shifts) == [f"variation {n}" for n in scenario.variations if n != "nominal"]
-    assert run_changed_starts(scenario, 2, seed=1) == {}
+    # A plant of its own has the scenario's variations alone.
+    own = load_scenario("pendulum")
+    shifts = plant_shifts(own, own.make_loop())
+    assert list(shifts) == [f"variation {n}" for n in own.variations if n != "nominal"]
+    assert run_changed_starts(own, 2, seed=1) == {}
 
 
 def test_postures_and_falls_are_never_called_safe():

@@ -1,5 +1,3 @@
-"""What studies share: work that is kept, and rows that become a file, a table and a plot."""
-
 import numpy as np
 import pytest
 
@@ -43,12 +41,6 @@ def test_what_is_kept_is_not_called_again_and_a_stopped_study_goes_on(tmp_path):
         kept(tmp_path, work, squared, workers=1)
 
 
-def test_a_fingerprint_is_that_of_every_field():
-    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
-    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
-    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3
-
-
 def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
     with open_study(
         "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda row: row.metric == "auc"
@@ -68,15 +60,14 @@ def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".json", ".png", ".svg"}
 
 
-def test_a_study_that_fails_writes_nothing(tmp_path):
+def test_a_study_that_fails_writes_nothing_and_sizes_are_numbers_between_commas(tmp_path):
     with pytest.raises(RuntimeError), open_study("tried", "pendulum", tmp_path) as study:
         study.rows["pushes.fallen"] = Estimate(0.125, 0.0, 0.5, 8)
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
-
-
-def test_sizes_are_numbers_between_commas():
-    assert parse_sizes("512,1024") == (512, 1024)
-    assert parse_sizes("") == ()
+    assert (parse_sizes("512,1024"), parse_sizes("")) == ((512, 1024), ())
     with pytest.raises(ValueError, match="--sizes 'many': give numbers"):
         parse_sizes("many")
+    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
+    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
+    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3

@@ -86,11 +86,12 @@ def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_i
 
 
 def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(run):
-    belief, margins = timeline_figure(**run).axes[3:5]
+    *_, belief, margins = timeline_figure(**run, angular_constraints=["height"]).axes
     tops = [c.get_paths()[0].vertices[:, 1].max() for c in belief.collections]
     np.testing.assert_allclose(tops, [0.63, 0.93, 1.0])
-    drawn = next(line for line in margins.lines if line.get_label() == "support polygon")
-    np.testing.assert_allclose(drawn.get_ydata()[0], 10.0)
+    drawn = {line.get_label(): line.get_ydata() for line in margins.lines}
+    np.testing.assert_allclose(drawn["support polygon"][0], 10.0)
+    np.testing.assert_allclose(drawn["height [°]"], np.degrees(0.05))
 
 
 def test_the_timeline_marks_a_push_for_as_long_as_it_lasts_and_the_leaving(run):
@@ -102,27 +103,12 @@ def test_the_timeline_marks_a_push_for_as_long_as_it_lasts_and_the_leaving(run):
         trigger_label="alarm",
     )
     for panel in fig.axes[2:5]:
-        spans = [p for p in panel.patches if to_hex(p.get_facecolor()) == BALL_COLOUR]
-        (span,) = spans
+        (span,) = [p for p in panel.patches if to_hex(p.get_facecolor()) == BALL_COLOUR]
         assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((0.8, 0.9))
         assert [1.4, 1.4] in [list(line.get_xdata()) for line in panel.lines]
     labels = {text.get_text() for text in fig.axes[2].texts}
     assert {"push of 500 N for 0.1 s", "alarm", "leaves the safe set"} <= labels
     assert "trigger" not in labels
-
-
-def test_margins_that_are_angles_are_drawn_in_degrees_and_say_so(run):
-    fig = timeline_figure(**run, angular_constraints=["height"])
-    drawn = {line.get_label(): line.get_ydata() for line in fig.axes[4].lines}
-    np.testing.assert_allclose(drawn["height [°]"], np.degrees(0.05))
-    np.testing.assert_allclose(drawn["support polygon"][0], 10.0)
-
-
-def test_the_timeline_needs_no_more_than_the_probability(run):
-    fig = timeline_figure(run["time_s"], run["probability"], 0.6)
-    assert len(fig.axes) == 1
-    gaps = np.where(run["time_s"] < 0.3, np.nan, run["probability"])
-    timeline_figure(run["time_s"], gaps, 0.6, stills=run["stills"]).draw_without_rendering()
 
 
 @pytest.mark.parametrize(

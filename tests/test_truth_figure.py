@@ -1,5 +1,3 @@
-"""truth_figure: Γ of episodes' starts beside their outcomes, for any task."""
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 
+from cart_episodes import ARRAYS
 from cart_pole_task import SCENARIO
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.evaluation.truth_figure import truth_figure
@@ -35,10 +34,7 @@ def started_at(episode, places, outside=False):
     changed = replace(episode, true_state=state)
     if not outside:
         return changed
-    row = slice(0, 1)
-    arrays = ("time_s", "state", "true_state", "output", "desired_output", "desired_preview")
-    arrays += ("features", "margins")
-    first = {name: getattr(changed, name)[row] for name in arrays}
+    first = {name: getattr(changed, name)[:1] for name in ARRAYS}
     return replace(changed, **first, is_safe=False, cause="height", first_step=0)
 
 

@@ -1,5 +1,3 @@
-"""The walking task: published policies walk, episodes begin in mid-stride, and falls are seen."""
-
 from dataclasses import replace
 
 import numpy as np

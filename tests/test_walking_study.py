@@ -1,5 +1,3 @@
-"""Figures of the study of walking, from motions made by hand."""
-
 import math
 from pathlib import Path
 
@@ -7,10 +5,7 @@ import numpy as np
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Results
 from studies.alarms import Alarm
-from studies.documents import render
 from studies.walking import (
     alarm_estimates,
     alarm_thresholds,
@@ -109,27 +104,3 @@ def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: P
     (tmp_path / "00001.npz").write_bytes(b"no motion")
     with pytest.raises(ValueError, match=r"00001\.npz is damaged"):
         run_motions(scenario, "tour", [1], **options)
-
-
-def test_the_table_has_a_row_for_every_alarm_and_branch():
-    estimate = Estimate(0.5, 0.4, 0.6, 10)
-    keys = ["tours.without_fall", "tours.hours", "pushes.fallen", "pushes.push_to_fall_s"]
-    keys.append("pushes.fallen_soon")
-    for alarm in ("sharpened", "tilt"):
-        keys += [f"alarm.{alarm}.{x}" for x in ("announced", "lead_s", "alarms_without_leaving")]
-        keys.append(f"tours.{alarm}.false_alarms_per_hour")
-    for branch in ("stop", "slower"):
-        keys += [f"recovery.{branch}.{x}" for x in ("saved", "impact_m_s", "impact_without_m_s")]
-    results = Results(
-        estimates=dict.fromkeys(keys, estimate),
-        entries={"walking": {"command": "run me", "thresholds": {"sharpened": 1, "tilt": 2}}},
-    )
-    text = render("walking", results)
-    assert text.startswith("```sh\nrun me\n```\n\nOf 10 tours")
-    assert text.count("50.0 % (40.0–60.0)") == 9
-    plans = {f"plans.mlp.{key}": estimate for key in ("auc", "safe_recall", "unsafe_recall")}
-    plans["plans.outcomes.safe"] = estimate
-    with_plans = render("walking", Results({**results, **plans}, results.entries))
-    assert "| MLP | 0.500 (0.400–0.600) | 0.500" in with_plans
-    for row in ("| Γ, `sharpened` |", "| tilt |", "| stop |", "| slower |"):
-        assert row in text

@@ -1,74 +1,104 @@
 """The command ``drake-safety``: train, run and evaluate safety assessments.
 
 Another command is a function of the command's name (its arguments are the command line, its
-docstring the help) and a line in `_COMMANDS`.
+docstring the help) and an entry of `COMMANDS`. Only the module of the command that is called is
+imported.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Container, Mapping, Sequence
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.logging import RichHandler
+from typer.core import TyperCommand
 
-from drake_safety.cli import (
-    adapt,
-    ask,
-    calibrate,
-    evaluate,
-    export,
-    play,
-    prepare,
-    report,
-    run,
-    train,
-)
-from drake_safety.cli.console import command_line, console
-from drake_safety.cli.targets import TargetCommand
+from drake_safety.cli.console import COMMAND, TARGET, ScenarioArgument, command_line, console
 from drake_safety.extras import require_extra
+from drake_safety.learning.segments import EpisodeError, installed_versions
+from drake_safety.robots.reading import is_number
+
+
+class Entry(NamedTuple):
+    """A command.
+
+    Attributes:
+        module: Its module.
+        line: First line of its help.
+        extra: The extra that it needs, said before it does anything.
+        resumed: Option with which the same line continues it after Ctrl-C; None where nothing is
+            kept.
+    """
+
+    module: str
+    line: str
+    extra: str = ""
+    resumed: str | None = None
+
 
 # In the order in which the help lists them.
-_COMMANDS = (
-    prepare.scenarios,
-    prepare.new,
-    prepare.check,
-    train.train,
-    calibrate.calibrate,
-    ask.ask,
-    run.run,
-    play.play,
-    evaluate.evaluate,
-    adapt.adapt,
-    export.export,
-    report.report,
-)
-
-# The extra that a command needs, said before it does anything.
-_NEEDS = {
-    "train": "train",
-    "calibrate": "train",
-    "evaluate": "train",
-    "adapt": "train",
-    "report": "report",
-    "play": "live",
+COMMANDS = {
+    "scenarios": Entry("prepare", "List the scenarios that come with the package."),
+    "new": Entry(
+        "prepare", "Write the folder of a robot and a first scenario from a URDF, for review."
+    ),
+    "check": Entry(
+        "prepare", "Check a scenario and its robot, and print problems with their remedies."
+    ),
+    "train": Entry("train", "Simulate the nominal closed loop and train Γ.", "train", "--resume"),
+    "calibrate": Entry(
+        "calibrate", "Choose thresholds with a promised miss rate on fresh episodes.", "train", ""
+    ),
+    "ask": Entry(
+        "ask", "Print the verdict on a target, or on a command of a walking robot; nothing moves."
+    ),
+    "run": Entry(
+        "run", "Simulate once with Γ in the loop; write a recording, a timeline and the events."
+    ),
+    "play": Entry(
+        "play",
+        "Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.",
+        "live",
+    ),
+    "evaluate": Entry(
+        "evaluate",
+        "Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other "
+        "plants.",
+        "train",
+        "",
+    ),
+    "adapt": Entry(
+        "adapt", "Adapt Γ to an actual robot, and evaluate it before and after.", "train", ""
+    ),
+    "export": Entry(
+        "export", "Write Γ as one ONNX file, which runs without this package and without Drake."
+    ),
+    "report": Entry(
+        "report", "Write RUN/report.html, a self-contained page of what is there.", "report"
+    ),
 }
-# What continues a stopped command that keeps finished episodes: the same line with this option.
-_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "adapt": ""}
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 
 
-class _Command(TargetCommand):
+class _Command(TyperCommand):
     """A command whose extra is installed, and whose ``--cluster`` is connected while it runs."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the arguments with the numbers of a target joined to one word."""
+        return super().parse_args(ctx, join_targets(args))
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
-        if self.name in _NEEDS:
-            require_extra(_NEEDS[self.name], self.name)
+        extra = COMMANDS[self.name or ""].extra
+        if extra:
+            require_extra(extra, self.name or "")
         address = ctx.params.get("cluster")
         if address is None:
             return super().invoke(ctx)
@@ -78,21 +108,63 @@ class _Command(TargetCommand):
             return super().invoke(ctx)
 
 
-app = typer.Typer(
-    help="Learn safety assessments of robot motions from simulations, and use them before and "
-    f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
-for _command in _COMMANDS:
-    app.command(cls=_Command)(_command)
+def join_targets(args: Sequence[str]) -> list[str]:
+    """Joins the numbers of a target or command: an option has a fixed number of words.
+
+    Args:
+        args: The words of a command line.
+    """
+    joined: list[str] = []
+    words = list(args)
+    while words:
+        word = words.pop(0)
+        if word not in (TARGET, COMMAND) or not words:
+            joined.append(word)
+            continue
+        numbers = [words.pop(0)]
+        while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
+            numbers.append(words.pop(0))
+        joined.append(f"{word}={' '.join(numbers)}")
+    return joined
+
+
+def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
+    """The commands.
+
+    Args:
+        called: Those whose modules are imported; the others have a name and a line of help.
+    """
+    app = typer.Typer(
+        help="Learn safety assessments of robot motions from simulations, and use them before and "
+        f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_common)
+    for name, (module, line, *_) in COMMANDS.items():
+        function: Any = _not_called
+        if name in called:
+            function = getattr(import_module(f"drake_safety.cli.{module}"), name)
+        app.command(name, cls=_Command, short_help=line)(function)
+    return app
+
+
+def _not_called(scenario: ScenarioArgument) -> None:
+    """Stands for a command in the help of others, and where a shell completes a scenario."""
+
+
+def _called() -> list[str]:
+    """The words of the command line; where a shell completes a word, only if it is an option."""
+    line = os.environ.get("COMP_WORDS", os.environ.get("_TYPER_COMPLETE_ARGS"))
+    if line is None:
+        return sys.argv[1:]
+    words = line.split()
+    return words if words[-1].startswith("-") else []
 
 
 def _print_version(is_wanted: bool) -> None:
     if is_wanted:
-        from drake_safety.learning.segments import installed_versions
-
         found = installed_versions("drake")
         console.print(
             f"drake-safety {found['drake_safety']}, drake {found['drake']}, "
@@ -102,7 +174,6 @@ def _print_version(is_wanted: bool) -> None:
         raise typer.Exit()
 
 
-@app.callback()
 def _common(
     version: Annotated[
         bool,
@@ -116,7 +187,8 @@ def _common(
 
 def main() -> None:
     """Runs the command."""
-    run_app(app, "drake-safety", _RESUMED)
+    resumed = {name: one.resumed for name, one in COMMANDS.items() if one.resumed is not None}
+    run_app(make_app(_called()), "drake-safety", resumed)
 
 
 def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | None = None) -> None:
@@ -146,8 +218,6 @@ def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | No
             console.print("continue with:", line, highlight=False, soft_wrap=True)
         sys.exit(_STOPPED)
     except Exception as error:
-        from drake_safety.learning.segments import EpisodeError
-
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
             console.print("error", error, style="red", highlight=False, soft_wrap=True)
             if isinstance(error, EpisodeError):

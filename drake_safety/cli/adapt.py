@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -33,16 +33,18 @@ from drake_safety.cli.training_folder import (
     feedback_folder,
     load_assessment,
 )
+from drake_safety.evaluation.metrics import Estimate, segment_estimates
+from drake_safety.evaluation.results import Results
 from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import ADAPTATION
-
-if TYPE_CHECKING:
-    from drake_safety.evaluation.metrics import Estimate
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import Episodes
-    from drake_safety.logs.robot_log import LogPieces, RobotLog
-    from drake_safety.simulation.feedback import EpisodePairs
-    from drake_safety.simulation.scenario import Scenario
+from drake_safety.learning.segments import Episodes, split
+from drake_safety.logs.episodes import cut_log
+from drake_safety.logs.robot_log import LogPieces, RobotLog, read_log, read_pieces
+from drake_safety.models import load_robot
+from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pairs
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _JUDGED = {"before": "before feedback", "after": "after feedback"}
 _COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
@@ -93,9 +95,6 @@ def adapt(
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
-    from drake_safety.evaluation.results import Results
-    from drake_safety.simulation.scenario import load_scenario
-
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
     priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
@@ -187,8 +186,6 @@ def paired_episodes(
         workers: Number of worker processes; None for one a core.
         stages: Progress bars.
     """
-    from drake_safety.simulation.feedback import run_pairs
-
     return run_pairs(
         scenario,
         num_pairs,
@@ -223,8 +220,6 @@ def fresh_actual_episodes(
         stages: Progress bars.
         what: Name of the stage.
     """
-    from drake_safety.simulation.rollouts import run_episodes
-
     return run_episodes(
         scenario,
         num_episodes,
@@ -241,10 +236,6 @@ def fresh_actual_episodes(
 def _logged_pairs(
     scenario: Scenario, logs: list[Path], log_map: Path, seed: int, *, is_strict: bool
 ) -> EpisodePairs:
-    from drake_safety.logs.episodes import cut_log
-    from drake_safety.logs.robot_log import read_log, read_pieces
-    from drake_safety.models import load_robot
-    from drake_safety.simulation.feedback import pair_starts
 
     robot = load_robot(scenario.robot)
     pieces: list[RobotLog] = []
@@ -300,9 +291,6 @@ def _print_cuts(log: Path, found: LogPieces) -> None:
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
     """Estimates of the probability on every segment of fresh episodes."""
-    from drake_safety.evaluation.metrics import segment_estimates
-    from drake_safety.learning.segments import split
-
     segments = split(fresh, stride=1, discount=1.0, shortest=assessment.parameters.shortest)
     is_plain = not assessment.parameters.is_sharpened and fresh.info.variation == "nominal"
     result = assessment.predict(

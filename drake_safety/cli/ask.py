@@ -18,6 +18,8 @@ from drake_safety.cli.targets import (
     print_verdict,
 )
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.planning.goal_verdict import assess_goal
+from drake_safety.simulation.scenario import load_scenario
 
 
 def ask(
@@ -39,9 +41,6 @@ def ask(
     Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    from drake_safety.planning.goal_verdict import assess_goal
-    from drake_safety.simulation.scenario import load_scenario
-
     if target is None:
         raise ValueError(f"ask: pass {TARGET}, or for a walking robot {COMMAND}")
     loaded = load_scenario(scenario)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.table import Table
 
 from drake_safety.cli.console import (
     AssessmentOption,
@@ -27,13 +28,13 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
+from drake_safety.evaluation.scorers import assessment_scorer
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import KINDS, Calibration, episode_scores
+from drake_safety.learning.calibration import calibrate as choose
 from drake_safety.learning.seeds import CALIBRATION
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.calibration import Calibration
+from drake_safety.learning.segments import split
+from drake_safety.simulation.scenario import load_scenario
 
 
 def calibrate(
@@ -69,12 +70,6 @@ def calibrate(
     continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
     copy is written to runs/SCENARIO-shipped.
     """
-    from drake_safety.evaluation.scorers import assessment_scorer
-    from drake_safety.learning.calibration import KINDS, episode_scores
-    from drake_safety.learning.calibration import calibrate as choose
-    from drake_safety.learning.segments import split
-    from drake_safety.simulation.scenario import load_scenario
-
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment)
     print_shipped(folder)

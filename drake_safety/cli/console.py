@@ -69,6 +69,8 @@ HostOption = Annotated[
     ),
 ]
 
+TARGET, COMMAND = "--target", "--command"
+
 # Square brackets are units here, not markup. Output to a file has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
 

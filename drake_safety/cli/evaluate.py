@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from matplotlib.figure import Figure
 
 from drake_safety.cli.console import (
     ClusterOption,
@@ -32,23 +33,29 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
+from drake_safety.evaluation import shift_study
+from drake_safety.evaluation.embedding_figure import embedding_figure
+from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.evaluation.results import Results
-from drake_safety.learning.seeds import EVALUATION, SHIFTS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from drake_safety.evaluation.metrics import Estimate
-    from drake_safety.evaluation.scorers import Scorer
-    from drake_safety.evaluation.shift_study import Judge, JudgedShift, Motion, MotionSet
-    from drake_safety.evaluation.tables import Table
-    from drake_safety.evaluation.throw_study import TriggerRule
-    from drake_safety.files.progress import StageProgress
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.seeds import SeedBlock
-    from drake_safety.learning.segments import Episodes, Segments
-    from drake_safety.simulation.scenario import Scenario
-    from drake_safety.simulation.throws import ThrowLog
+from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.shift_study import Judge, JudgedShift, Motion, MotionSet, shifts_tables
+from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.tables import Table
+from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
+from drake_safety.evaluation.verdict_tables import verdict_tables
+from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.calibration import PLAN, episode_scores
+from drake_safety.learning.seeds import EVALUATION, SHIFTS, SeedBlock
+from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.throws import ThrowLog
 
 SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
@@ -79,8 +86,6 @@ class Evaluation:
     @property
     def scorers(self) -> list[Scorer]:
         """The probability of either mode."""
-        from drake_safety.evaluation.scorers import assessment_scorer
-
         return [assessment_scorer(mode, one) for mode, one in self.assessments.items()]
 
     @property
@@ -103,8 +108,6 @@ class Evaluation:
 
     def add(self, estimates: Mapping[str, Estimate], **figures: Figure) -> None:
         """Adds results, and figures by name, which are written."""
-        from drake_safety.evaluation.figure_style import save
-
         self.estimates |= estimates
         for name, figure in figures.items():
             self.pictures += save(figure, self.folder / name)
@@ -144,11 +147,6 @@ def evaluate(
     It gives AUC, recalls and reliability, in every row and in the first of an episode, and falls
     with and without recovery. Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
-    from drake_safety.evaluation.shift_study import shifts_tables
-    from drake_safety.evaluation.verdict_tables import verdict_tables
-    from drake_safety.simulation.capabilities import HasBall, HasGoals, require
-    from drake_safety.simulation.scenario import load_scenario
-
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
     if shifts:
@@ -207,10 +205,6 @@ def add_verdicts(
     Returns:
         Unsafe scores by scorer, (N,), and the N judged segments.
     """
-    from drake_safety.evaluation.embedding_figure import embedding_figure
-    from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
-    from drake_safety.simulation.capabilities import HasGoals
-
     if isinstance(evaluation.scenario.make_loop(), HasGoals):
         thresholds = evaluation.plan_thresholds
         found, scores, rows = evaluate_plans(scorers, calibration, test, thresholds)
@@ -223,10 +217,6 @@ def add_verdicts(
 
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
     """Evaluates the reliability of either mode, and its stored calibrations."""
-    from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
-    from drake_safety.learning.calibration import PLAN, episode_scores
-    from drake_safety.learning.segments import split
-
     segments = split(test, stride=1, discount=1.0, shortest=1)
     found, curves = {}, {}
     for scorer in evaluation.scorers:
@@ -247,8 +237,6 @@ def add_throws(
     evaluation: Evaluation, num_throws: int, rules: Sequence[TriggerRule] = ()
 ) -> list[ThrowLog]:
     """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
-    from drake_safety.evaluation.throw_study import evaluate_throws, trigger_rules
-
     recovery = evaluation.scenario.parameters.recovery
     own = trigger_rules(*evaluation.assessments.values(), threshold=recovery.threshold)
     found, logs = evaluate_throws(
@@ -285,10 +273,6 @@ def add_shifts(
     Returns:
         The kind of each shift.
     """
-    from drake_safety.evaluation import shift_study
-    from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
-    from drake_safety.simulation.rollouts import run_episodes
-
     gamma, paper = evaluation.assessments.values()
     if judges is None:
         modes = {"gamma": gamma, "paper": paper}
@@ -329,8 +313,6 @@ def write(
     entries: Mapping[str, Any],
 ) -> None:
     """Writes what was found to a file of results, and prints its tables."""
-    from drake_safety.learning.assessment_file import file_hash
-
     sharpened = evaluation.assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
     files = {mode: assessment_file(evaluation.run_folder, mode) for mode in MODES}

@@ -21,6 +21,7 @@ from drake_safety.cli.training_folder import (
     check_writable,
     load_assessment,
 )
+from drake_safety.simulation.scenario import load_scenario
 
 
 def export(
@@ -34,8 +35,6 @@ def export(
     It holds the maps, the grid, the beliefs and the correction of the assessment, adapted or not;
     its metadata say what its inputs are and what its thresholds promise.
     """
-    from drake_safety.simulation.scenario import load_scenario
-
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment)
     gamma = load_assessment(folder.path, mode)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from rich.table import Table
 
 from drake_safety.cli.console import cause_words
 from drake_safety.cli.run_settings import (
@@ -12,14 +12,11 @@ from drake_safety.cli.run_settings import (
     events_table,
     first_below,
 )
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from drake_safety.cli.training_folder import GoalThreshold
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.free_motion import FreeMotion
+from drake_safety.cli.training_folder import GoalThreshold
+from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.free_motion import FreeMotion, run_free
 
 _PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 
@@ -34,9 +31,6 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
     Raises:
         ValueError: The task exports a port of the assessor under another name, or not at all.
     """
-    from drake_safety.evaluation.timeline_figure import timeline_figure
-    from drake_safety.simulation.free_motion import run_free
-
     recording = Recording(settings)
     loop = settings.make_loop(recording.viewer)
     recording.start()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -21,9 +21,10 @@ from drake_safety.cli.console import (
 from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 from drake_safety.learning.seeds import DEMONSTRATION
-
-if TYPE_CHECKING:
-    from drake_safety.live.session import LiveSession
+from drake_safety.live.session import LiveSession
+from drake_safety.live.task_sessions import LiveCommands, LiveEpisodes, LiveGoals, LiveThrows
+from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
+from drake_safety.simulation.scenario import load_scenario
 
 _FIRST_PORT = 7000
 
@@ -53,10 +54,7 @@ def play(
     push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
     verdict are shown.
     """
-    from drake_safety.live.page import serve_page
-    from drake_safety.live.task_sessions import LiveCommands, LiveEpisodes, LiveGoals, LiveThrows
-    from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
-    from drake_safety.simulation.scenario import load_scenario
+    from drake_safety.live.page import serve_page  # Of the extra "live".
 
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment)

@@ -15,7 +15,15 @@ from drake_safety.cli.console import (
     open_stages,
     print_path,
 )
+from drake_safety.control.policy_template import survey_policy
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.robot_figure import robot_figure
+from drake_safety.extras import MissingExtraError
 from drake_safety.learning.seeds import DEMONSTRATION
+from drake_safety.robots.robot_template import write_robot
+from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.scenario import load_scenario, scenario_names
+from drake_safety.simulation.scenario_check import check_scenario
 
 # By whether a check passed, and whether with a warning.
 _WORDS = {
@@ -27,9 +35,6 @@ _WORDS = {
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
-    from drake_safety.extras import MissingExtraError
-    from drake_safety.simulation.scenario import load_scenario, scenario_names
-
     table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")
     for name in scenario_names():
         try:
@@ -79,9 +84,6 @@ def new(
 
     Values that a URDF does not have are marked ASK in the files, with their units.
     """
-    from drake_safety.control.policy_template import survey_policy
-    from drake_safety.robots.robot_template import write_robot
-
     if (task == "walking") != (policy is not None):
         raise ValueError(
             f"new: --policy is that of --task walking, and of no other; got task '{task}' and "
@@ -163,8 +165,6 @@ def check(
 
     The exit code is 1 if there is a problem.
     """
-    from drake_safety.simulation.scenario_check import check_scenario
-
     if picture is not None and not import_:
         raise ValueError("check: --picture needs the task, which --no-import does not import")
     num_problems = 0
@@ -204,11 +204,6 @@ def _draw(scenario: str, picture: Path) -> None:
     Raises:
         ValueError: The scenario has no legged robot, or its diagram cannot be built.
     """
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.robot_figure import robot_figure
-    from drake_safety.simulation.legged_loop import LeggedLoop
-    from drake_safety.simulation.scenario import load_scenario
-
     loop = load_scenario(scenario).make_loop()
     if not isinstance(loop, LeggedLoop):
         raise ValueError(

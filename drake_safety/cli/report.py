@@ -9,13 +9,12 @@ import typer
 
 from drake_safety.cli.console import print_path, versions
 from drake_safety.cli.training_folder import episodes_folder
+from drake_safety.evaluation.report import write_report
 
 
 def report(
     run: Annotated[Path, typer.Argument(help="Folder written by `train` and other commands.")],
 ) -> None:
     """Write RUN/report.html, a self-contained page of what is there."""
-    from drake_safety.evaluation.report import write_report
-
     page = write_report(run, episodes=episodes_folder(run), versions=versions())
     print_path("page", page)

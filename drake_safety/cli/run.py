@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
+from matplotlib.figure import Figure
+from rich.table import Table
 
 from drake_safety.cli.console import (
     LOOPBACK,
@@ -27,17 +29,17 @@ from drake_safety.cli.run_settings import (
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
+from drake_safety.evaluation.path_figure import path_figure
+from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
+from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import DEMONSTRATION
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
-
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.plants.balls import Throw
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.scenario import Scenario
-    from drake_safety.simulation.throws import ThrowLog
+from drake_safety.plants.balls import Throw
+from drake_safety.robots.reading import did_you_mean
+from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.throws import ThrowLog, run_throw
 
 _DURATION_S = 5.0  # Of a run with balls.
 _AROUND_IMPACT_S = (-0.02, 0.16)  # The ball in the air, and its effect.
@@ -113,9 +115,6 @@ def run(
 
     If Γ refuses a target, nothing moves and the exit code is 1; --force goes there.
     """
-    from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
-    from drake_safety.simulation.scenario import load_scenario
-
     given = {"hand": hand, "recovery": recovery, "guard": guard or None}
     loaded = load_scenario(scenario)
     learned = assessment_folder(loaded, assessment)
@@ -156,7 +155,6 @@ def run(
 
 
 def _run_with_balls(settings: RunSettings) -> None:
-    from drake_safety.simulation.throws import run_throw
 
     throws = parse_pushes(settings.scenario, settings.pushes)
     recording = Recording(settings)
@@ -194,9 +192,6 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
     Raises:
         ValueError: A key is unknown, a value is not a number, or a ball is invalid.
     """
-    from drake_safety.plants.balls import Throw
-    from drake_safety.robots.reading import did_you_mean
-
     throws: list[Throw] = []
     for text in pushes:
         if text == "ball":
@@ -224,7 +219,6 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
 def _path(
     loop: ClosedLoop, assessment: SafetyAssessment, log: ThrowLog, throws: list[Throw]
 ) -> Figure:
-    from drake_safety.evaluation.path_figure import path_figure
 
     events = {f"ball {i}": throw.time_s for i, throw in enumerate(throws, start=1)}
     starts = [start for start, _ in log.recovery_intervals_s]
@@ -240,8 +234,6 @@ def _path(
 
 
 def _timeline(loop: ClosedLoop, log: ThrowLog, throws: list[Throw]) -> Figure:
-    from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
-    from drake_safety.evaluation.timeline_figure import timeline_figure
 
     positions = stack_positions(
         loop, {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}

@@ -6,9 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from pydrake.geometry import Meshcat
+from rich.table import Table
 
 from drake_safety.cli.console import (
     LOOPBACK,
@@ -20,15 +23,10 @@ from drake_safety.cli.console import (
     versions,
     warn_of_empty_scene,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pydrake.geometry import Meshcat
-    from rich.table import Table
-
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.scenario import Scenario
+from drake_safety.evaluation.figure_style import save
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.scenario import Scenario
 
 LOG_PERIOD_S = 0.02
 
@@ -109,8 +107,6 @@ class Recording:
             events: Table of the events.
             threshold: The threshold of triggers or alarms in words: value, quantity, origin.
         """
-        from drake_safety.evaluation.figure_style import save
-
         warn_of_empty_scene(self.viewer, self._settings.scenario.task)
         self.viewer.StopRecording()
         self.viewer.PublishRecording()

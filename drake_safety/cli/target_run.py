@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
 
 from drake_safety.cli.console import cause_words, console
 from drake_safety.cli.run_settings import (
@@ -16,17 +17,16 @@ from drake_safety.cli.run_settings import (
     first_below,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
+from drake_safety.cli.training_folder import GoalThreshold
+from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
+from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.planning.goal_verdict import assess_goal
+from drake_safety.plants.pushes import Push
 from drake_safety.robots.reading import did_you_mean
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
-
-    from drake_safety.cli.training_folder import GoalThreshold
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.plants.pushes import Push
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.goal_motion import GoalMotion
+from drake_safety.simulation.capabilities import CanBePushed, HasGoals, goal_words, require
+from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 
 _MOTION_PORTS = (
     "safety_probability",
@@ -63,9 +63,6 @@ def run_to_target(
     Raises:
         ValueError: The task has no goals, or no such target, hand or push.
     """
-    from drake_safety.planning.goal_verdict import assess_goal
-    from drake_safety.simulation.goal_motion import run_to_goal
-
     # The verdict is on what is asked, whatever a guard would pass on.
     options = {name: value for name, value in settings.options.items() if name != "guard"}
     loop = replace(settings, options=options).make_loop()
@@ -118,8 +115,6 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
     Raises:
         ValueError: The push does not exist, or there is more than one.
     """
-    from drake_safety.simulation.capabilities import CanBePushed, require
-
     if not names:
         return None
     if len(names) > 1:
@@ -148,9 +143,6 @@ def draw_motion(loop: ClosedLoop, motion: GoalMotion, threshold: float) -> Figur
         motion: Log of the motion, with the assessor's outputs.
         threshold: Probability below which a row is an alarm.
     """
-    from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
-    from drake_safety.evaluation.timeline_figure import timeline_figure
-
     positions = stack_positions(loop, {loop.robot.name: motion.plant_state})
     events = [motion.leave_time_s] if motion.has_left else []
     if motion.has_fallen:
@@ -187,8 +179,6 @@ def table_of_motion(
         motion: Log of the motion, with the assessor's outputs.
         threshold: Probability below which a row is an alarm.
     """
-    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
-
     words = goal_words(require(loop, HasGoals))
     probability = motion.extra["safety_probability"][:, 0]
     events = [(0.0, f"{words.subject} starts")]

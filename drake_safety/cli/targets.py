@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
-from typer.core import TyperCommand
 
-from drake_safety.cli.console import console
+from drake_safety.cli.console import COMMAND, TARGET, console
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import describe_margin
+from drake_safety.planning.goal_verdict import GoalVerdict
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.robots.reading import did_you_mean, is_number
+from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
+from drake_safety.simulation.closed_loop import ClosedLoop
 
-if TYPE_CHECKING:
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.planning.goal_verdict import GoalVerdict
-    from drake_safety.simulation.capabilities import GoalWords
-    from drake_safety.simulation.closed_loop import ClosedLoop
-
-TARGET, COMMAND = "--target", "--command"
 TargetOption = Annotated[
     str | None,
     typer.Option(
@@ -37,34 +34,6 @@ HandOption = Annotated[
 _SEARCH_SEED = 0  # Fixed, so that results are reproducible.
 
 
-class TargetCommand(TyperCommand):
-    """A command whose targets are three numbers, possibly negative, or one name."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the arguments with the numbers of a target joined to one word."""
-        return super().parse_args(ctx, join_targets(args))
-
-
-def join_targets(args: Sequence[str]) -> list[str]:
-    """Joins the numbers of a target or command: an option has a fixed number of words.
-
-    Args:
-        args: The words of a command line.
-    """
-    joined: list[str] = []
-    words = list(args)
-    while words:
-        word = words.pop(0)
-        if word not in (TARGET, COMMAND) or not words:
-            joined.append(word)
-            continue
-        numbers = [words.pop(0)]
-        while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
-            numbers.append(words.pop(0))
-        joined.append(f"{word}={' '.join(numbers)}")
-    return joined
-
-
 def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     """The goal of ``--target`` or ``--command``, (3,).
 
@@ -75,8 +44,6 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     Raises:
         ValueError: The plans of the task have no goal, or the text is neither.
     """
-    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
-
     with_goals = require(loop, HasGoals, TARGET)
     named_targets, words = with_goals.named_targets, goal_words(with_goals)
     if text in named_targets:
@@ -96,8 +63,6 @@ def nearest_accepted(
     loop: ClosedLoop, assessment: SafetyAssessment, verdict: GoalVerdict
 ) -> GoalVerdict | None:
     """The nearest target accepted with reserve to a refused one, if any."""
-    from drake_safety.planning.nearest_goal import nearest_accepted_goal
-
     return nearest_accepted_goal(
         loop,
         assessment,
@@ -118,8 +83,6 @@ def print_verdict(
         nearest: The nearest accepted target, for a refusal.
         origin: Where the threshold comes from.
     """
-    from drake_safety.simulation.capabilities import HasGoals, goal_words, require
-
     words = goal_words(require(loop, HasGoals))
     of = f" of {words.subject}" if words.is_point else ""
     lines = {words.goal: f"{words.value(verdict.goal)}{of}"}
@@ -145,7 +108,6 @@ def print_verdict(
 def _refusal(
     loop: ClosedLoop, words: GoalWords, verdict: GoalVerdict, nearest: GoalVerdict | None
 ) -> dict[str, str]:
-    from drake_safety.learning.causes import describe_margin
 
     lines = {}
     if np.isfinite(verdict.cause_margin):

@@ -9,9 +9,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from drake_safety.cli.console import (
     ClusterOption,
@@ -31,10 +33,13 @@ from drake_safety.cli.training_folder import (
     training_options,
 )
 from drake_safety.files.progress import StageProgress
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import TRAINING
-
-if TYPE_CHECKING:
-    from drake_safety.simulation.scenario import Scenario
+from drake_safety.learning.training import segments_for
+from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.worker_processes import end_with_parent
 
 
 def train(
@@ -55,10 +60,6 @@ def train(
 
     Episodes are kept as they finish: a stopped run continues with --resume.
     """
-    from drake_safety.simulation.dataset import completed
-    from drake_safety.simulation.rollouts import run_episodes
-    from drake_safety.simulation.scenario import load_scenario
-
     if mode not in (*MODES, "both"):
         raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
     modes = MODES if mode == "both" else (mode,)
@@ -108,11 +109,6 @@ def train(
 @contextlib.contextmanager
 def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
     """Yields a function that submits calls to workers, which end on an error or Ctrl-C."""
-    from joblib.externals.loky import ProcessPoolExecutor
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    from drake_safety.simulation.worker_processes import end_with_parent
-
     executor = ProcessPoolExecutor(
         max_workers=max(num_workers, 1), initializer=end_with_parent, initargs=(os.getpid(),)
     )
@@ -146,9 +142,6 @@ def _learn(
     Returns:
         The number of segments, the share of unsafe episodes, and the CPU time [s].
     """
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.training import segments_for
-    from drake_safety.simulation.dataset import load_episodes
 
     def report(stage: str, done: int, wanted: int) -> None:
         if stages is not None:

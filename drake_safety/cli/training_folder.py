@@ -5,13 +5,14 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import Episodes
-    from drake_safety.simulation.scenario import Scenario
-    from drake_safety.simulation.worker_processes import Progress
+from drake_safety.assessments import assessed_scenarios, shipped_folder
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import Progress
 
 
 class AssessmentFolder(NamedTuple):
@@ -104,8 +105,6 @@ def run_fresh_episodes(
         variation: The plant.
         **loop_options: Options of the diagram, besides those of evaluations.
     """
-    from drake_safety.simulation.rollouts import run_episodes
-
     options = {**scenario.task_class().judging_options, **loop_options}
     return run_episodes(
         scenario,
@@ -158,7 +157,6 @@ def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolde
     """
     if given is not None:
         return AssessmentFolder(given, given)
-    from drake_safety.assessments import assessed_scenarios, shipped_folder
 
     advice = "`drake-safety train` learns one, in a folder to be passed as --assessment"
     if scenario.name not in assessed_scenarios():
@@ -184,8 +182,6 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     Raises:
         ValueError: The folder does not hold it.
     """
-    from drake_safety.learning.assessment import SafetyAssessment
-
     path = assessment_file(folder, mode)
     if not path.is_file():
         there = sorted(file.stem for file in folder.glob("*.safetensors"))

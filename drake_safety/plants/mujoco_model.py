@@ -238,10 +238,6 @@ def build_model(
     defaults, with an elliptic friction cone.
 
     Args:
-        robot: The robot.
-        plant: A finalised Drake plant of the robot and its scene.
-        scene_graph: The plant's scene graph.
-        variation: Differences from the published robot.
         time_step_s: Step [s].
         servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
 
@@ -249,10 +245,6 @@ def build_model(
         The model, and for each of its controls the index of its value in the command: joint
         positions and velocities with servos, joint torques without, in the order of
         :func:`~drake_safety.robots.robot.servo_joints`.
-
-    Raises:
-        ValueError: The robot's model is not a URDF or MuJoCo cannot read it, its base is not the
-            root, MuJoCo does not have a shape, or another body in the scene moves.
     """
     mujoco = import_mujoco()
     spec = _read_robot(robot)
