@@ -194,9 +194,9 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
+        of_robot = super().model_files(scenario)
         path = policy_file(scenario)
-        network = network_file(read_policy_file(path), str(path.parent))
-        return [*super().model_files(scenario), path, network]
+        return [*of_robot, path, network_file(read_policy_file(path), str(path.parent))]
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
