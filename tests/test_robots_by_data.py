@@ -69,8 +69,7 @@ def test_without_the_extra_a_scenario_and_their_list_say_what_to_install(monkeyp
     monkeypatch.setenv("COLUMNS", "200")
     scenarios()
     lines = capsys.readouterr().out.splitlines()
-    # Of one that walks the package of its policy may be missing too.
-    for name in (one for one in scenario_names() if not one.endswith("_walking")):
+    for name in scenario_names():
         (line,) = [one for one in lines if f" {name} " in one]
         of_extra = name.rpartition("_")[0] in OF_THE_EXTRA
         assert ("drake_safety[robots]" in line) == of_extra
