@@ -24,8 +24,8 @@ class Bench:
         line = PiecewisePolynomial.FirstOrderHold([0.0, 9.0], 5.0 + np.outer(RATES, [0.0, 9.0]))
         source = builder.AddSystem(TrajectorySource(line))
         self.system = builder.AddSystem(SensorFaults(NAMES, faults, period_s=period_s))
-        builder.Connect(source.get_output_port(), self.system.get_input_port())
-        builder.ExportOutput(self.system.get_output_port(), "output")
+        builder.Connect(source.get_output_port(), self.system.GetInputPort("input"))
+        builder.ExportOutput(self.system.GetOutputPort("output"), "output")
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.own = self.system.GetMyMutableContextFromRoot(self.context)
@@ -60,6 +60,7 @@ def test_without_faults_and_before_their_start_the_bits_pass(faults):
 
 def test_without_faults_nothing_is_updated():
     bench = Bench()
+    assert bench.system.HasAnyDirectFeedthrough()
     bench.at(1.0)
     assert bench.simulator.get_num_discrete_updates() == 0
     assert bench.own.num_discrete_state_groups() == 0
@@ -149,10 +150,7 @@ def test_all_memory_is_in_the_context():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: Fault(kind="freze"),
-            r"one of .*; got 'freze' \(did you mean 'freeze'",
-        ),
+        (lambda: Fault(kind="freze"), r"one of .*; got 'freze' \(did you mean 'freeze'"),
         (lambda: Fault(kind="drift"), "'drift' needs a value; got None"),
         (lambda: Fault(kind="zero", value=1.0), "'zero' has no value; got 1.0"),
         (lambda: Fault(kind="delay", value=-0.1), "value of 'delay' is out of range; got -0.1"),
