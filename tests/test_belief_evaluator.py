@@ -1,15 +1,12 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from gliding_task import evaluated
+from system_doubles import NOVELTY, AssessmentDouble, correction
 
-PERIOD_S, NOVELTY = 0.04, 0.7
+PERIOD_S = 0.04
 STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0, 8.0, 9.0])
 INPUTS = {
     "state": STATE,
@@ -18,54 +15,6 @@ INPUTS = {
     "margins": np.ones(2),
     "alarm": np.zeros(1),
 }
-
-
-def correction(size):
-    """One of maps with three activations, for six cells."""
-    return Correction(
-        change=np.full(3, size),
-        hidden=np.full((1, 4), size),
-        hidden_range=np.array([-size, size]),
-        guard=np.ones((1, 6)),
-    )
-
-
-class AssessmentDouble:
-    """b_safe is the state's first entry times the first belief; it keeps what it was asked."""
-
-    def __init__(self, uses_features=True):
-        self.info_ = SimpleNamespace(
-            state_names=["a", "b"],
-            output_names=["x", "y", "z"],
-            feature_names=["f", "g", "h"],
-            constraint_names=["left", "right"],
-            horizon=2,
-        )
-        self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
-        self.correction_ = correction(0.0)
-        self.base_logit_ = object()
-        self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limits=np.ones(3), plan=slice(0))
-        self.embedding_ = SimpleNamespace(is_same=lambda other: False)
-        self.uses_features = uses_features
-        self.asked, self.novelties = [], []
-
-    def predict_one(self, state, desired_preview, features, *, beliefs, correction, novelty):
-        self.novelties.append(novelty)
-        self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
-        if not np.isfinite(state).all():
-            safe, belief = 0.0, [0.0, 0.0, 1.0]
-        else:
-            safe = state[0] * beliefs[0, 0, 0]
-            belief = [safe, 0.9 - safe, 0.1]
-        probability = safe + correction.hidden[0, 3] * correction.guard[0, 5]
-        return Assessment(
-            belief=np.array(belief),
-            probability=probability,
-            cause_probability=np.array([0.2, 0.3]),
-            embedding=np.array([3.0, -4.0]),
-            predicted_margins=np.array([0.01, np.nan]),
-            novelty=NOVELTY,
-        )
 
 
 def fix(evaluator, context, without=()):

@@ -1,53 +1,10 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.control.policy import CommandLimits
-from drake_safety.learning.assessment import Assessments
-from drake_safety.systems.command_guard import CommandGuard
-
-LIMITS = CommandLimits(lowest=[-1.0, -0.5, -1.0], highest=[1.0, 0.5, 1.0])
-HORIZON, OUTLOOK = 4, 3
-
-
-class SlowIsSafe:
-    """Γ is 1 up to a forward speed, and 0 beyond; its features are the command."""
-
-    parameters = SimpleNamespace(initial_uncertainty=0.3)
-    info_ = SimpleNamespace(horizon=HORIZON, state_names=["s"], feature_names=["x", "y", "yaw"])
-
-    def __init__(self, fastest=1.5, novelty=0.0):
-        self.fastest, self.novelty = fastest, novelty
-        self.seen = []
-
-    def predict(self, state, desired_preview, features):
-        np.testing.assert_array_equal(desired_preview, np.tile(features, HORIZON))
-        self.seen.append(len(state))
-        gamma = (features[:, 0] <= self.fastest + 1e-9).astype(float)
-        n = len(gamma)
-        if self.novelty > 1.0:
-            gamma = np.zeros(n)
-        return Assessments(
-            belief=np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(n, 0.3)]),
-            embedding=np.zeros((n, 2)),
-            cause_probability=np.zeros((n, 1)),
-            probability=gamma,
-            predicted_margins=np.zeros((n, 1)),
-            novelty=np.full(n, self.novelty),
-        )
-
-
-def guard(assessment, **options):
-    return CommandGuard(
-        assessment,
-        lambda features, commands: commands,
-        LIMITS,
-        **{"threshold": 0.5, "period_s": 0.1, "num_outlook": OUTLOOK, **options},
-    )
+from system_doubles import HORIZON, LIMITS, OUTLOOK, SlowIsSafe, guard
 
 
 def passed_on(system, command, state=0.0, features=(0.0, 0.0, 0.0), is_acting=True):

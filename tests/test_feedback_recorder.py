@@ -5,25 +5,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from gliding_task import declare_outputs
+from system_doubles import INFO, STEP_S
 
-STEP_S, WATCH_S, NUM_STEPS = 0.04, 0.01, 5
-
-INFO = EpisodesInfo(
-    scenario="drift",
-    scenario_hash="hash",
-    variation="actual",
-    seed=0,
-    step_s=STEP_S,
-    horizon=3,
-    constraint_names=["right", "left"],
-    state_names=["x"],
-    output_names=["x", "y", "z"],
-    feature_names=["f"],
-    versions={},
-)
+WATCH_S, NUM_STEPS = 0.01, 5
 
 
 class Drift(LeafSystem):

@@ -1,34 +1,10 @@
-from unittest import mock
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.control.policy import GaitClock, ObservationTerm, Policy, PolicyParameters
-from drake_safety.control.policy_network import PolicyNetwork
-from drake_safety.robots.robot_model import JointGains
-from drake_safety.systems.policy_controller import ACTING, HELD, PolicyController
+from drake_safety.systems.policy_controller import ACTING, HELD
 from gliding_task import evaluated
-
-
-class Kinematics:
-    num_positions, num_velocities, num_joints = 9, 8, 2
-
-
-def controller(evaluate=lambda batch: batch[:, :2] + 1.0):
-    network = PolicyNetwork(None, evaluate, (9, 2))
-    terms = ["velocity_commands", "last_action", "sin_phase", "cos_phase"]
-    parameters = PolicyParameters(
-        network="net.onnx",
-        joints=["b", "a"],
-        default_positions={".*": 0.0},
-        action_scale={".*": 0.5},
-        gains={".*": JointGains(stiffness=1.0)},
-        observation=[ObservationTerm(name=name) for name in terms],
-        gait=GaitClock(period_s=0.2),
-    )
-    with mock.patch("drake_safety.control.policy.load_network", lambda path: network):
-        return PolicyController(Kinematics(), Policy(parameters, ["a", "b"]))
+from system_doubles import controller
 
 
 def started(system, command=(0.2, 0.4, 0.0), state=None):

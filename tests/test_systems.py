@@ -25,10 +25,7 @@ from drake_safety.systems.state_observer import StateObserver
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 from drake_safety.systems.whole_body_controller import WholeBodyController
 from legged_robots import ROBOT_NAMES, robot_kinematics
-from test_belief_evaluator import AssessmentDouble
-from test_command_guard import SlowIsSafe, guard
-from test_feedback_recorder import INFO
-from test_policy_controller import controller
+from system_doubles import INFO, AssessmentDouble, SlowIsSafe, controller, guard
 
 PERIOD = {"period_s": 0.01}
 LATE = PERIOD | {"offset_s": 0.002}
