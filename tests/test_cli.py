@@ -33,7 +33,7 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
     monkeypatch.setattr(sys, "argv", arguments)
     with pytest.raises(EpisodeError) as caught:
         main()
-    assert isinstance(caught.value.__cause__, ValueError)
+    assert isinstance(caught.value.__cause__, RuntimeError)
 
 
 def test_every_command_says_in_a_sentence_what_it_does():
