@@ -145,11 +145,7 @@ def some(episodes: Episodes) -> Episodes:
 @pytest.mark.benchmark(timer=time.process_time)
 @pytest.mark.parametrize("case", list(CASES))
 def test_one_evaluation_inside_a_diagram(
-    benchmark: Any,
-    report: Callable[..., None],
-    scenario: Scenario,
-    some: Episodes,
-    case: str,
+    benchmark: Any, report: Callable[..., None], scenario: Scenario, some: Episodes, case: str
 ) -> None:
     parameters = copy.deepcopy(scenario.assessment)
     for name, value in CASES[case].items():
@@ -198,10 +194,7 @@ def test_one_evaluation_inside_a_diagram(
 
 @pytest.mark.benchmark(timer=time.process_time)
 def test_novelty_and_monitor_beside_an_evaluation(
-    benchmark: Any,
-    report: Callable[..., None],
-    scenario: Scenario,
-    some: Episodes,
+    benchmark: Any, report: Callable[..., None], scenario: Scenario, some: Episodes
 ) -> None:
     assessment = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(some)
     assessment.info_ = dataclasses.replace(assessment.info_, step_s=PERIOD_S)

@@ -65,10 +65,7 @@ def test_reaching_beside_its_bare_plant(
         loop_s.sum() / spans.sum(),
         "CPU-s",
         at_most=0.28 if everything else 0.25,
-        peers={
-            "bare plant": plant_s.sum() / spans.sum(),
-            "ratio": loop_s.sum() / plant_s.sum(),
-        },
+        peers={"bare plant": plant_s.sum() / spans.sum(), "ratio": loop_s.sum() / plant_s.sum()},
         note=f"{1 / reaching.control_period_s:.0f} Hz control, "
         f"{1e3 * reaching.time_step_s:g} ms plant, {len(motions)} episodes",
     )

@@ -156,11 +156,7 @@ def peer_cost(folder: Path, num_episodes: int, num_segments: int) -> dict[str, f
 
 @pytest.mark.parametrize("mode", list(MAX_CPU_S))
 def test_learning_from_the_nominal_episodes(
-    benchmark: Any,
-    report: Callable[..., None],
-    episodes_folder: Path,
-    num_episodes: int,
-    mode: str,
+    benchmark: Any, report: Callable[..., None], episodes_folder: Path, num_episodes: int, mode: str
 ) -> None:
     peer_s = in_fresh_process(classifier_cost, episodes_folder, num_episodes)
     cost = benchmark.pedantic(
@@ -197,10 +193,7 @@ def test_dtw_and_tsne_beside_other_packages(
         costs[whose].append(in_fresh_process(function, *arguments))
 
     benchmark.pedantic(
-        measure,
-        args=("ours", our_cost),
-        setup=lambda: measure("peers", peer_cost),
-        rounds=ROUNDS,
+        measure, args=("ours", our_cost), setup=lambda: measure("peers", peer_cost), rounds=ROUNDS
     )
     (num_segments,) = {cost["n"] for both in costs.values() for cost in both}
     for name, key, peer, factor in (

@@ -63,12 +63,7 @@ def test_recovery_from_the_demonstrations_strong_ball_is_short_and_holds_the_hea
     loop = packaged_loop("actual", ball=True, recovery=True)
     throw = loop.scenario.parameters.demonstration[1]
     log = run_throw(
-        loop,
-        0,
-        seed=0,
-        throws=[replace(throw, time_s=0.5)],
-        trigger_time_s=0.52,
-        duration_s=2.6,
+        loop, 0, seed=0, throws=[replace(throw, time_s=0.5)], trigger_time_s=0.52, duration_s=2.6
     )
     assert not log.has_fallen
     ((start_s, end_s),) = log.recovery_intervals_s

@@ -18,24 +18,10 @@ from drake_safety.simulation.rollouts import run_episode
 from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
 
-ASKED = (
-    HasGoals,
-    HasBall,
-    CanFall,
-    CanBePushed,
-    FollowsCommands,
-    OffersPlans,
-    CanStartAnywhere,
-)
+ASKED = (HasGoals, HasBall, CanFall, CanBePushed, FollowsCommands, OffersPlans, CanStartAnywhere)
 HAS = {
     "laikago_balancing": {HasBall, CanFall, OffersPlans, CanStartAnywhere},
-    "atlas_reaching": {
-        HasGoals,
-        CanFall,
-        CanBePushed,
-        OffersPlans,
-        CanStartAnywhere,
-    },
+    "atlas_reaching": {HasGoals, CanFall, CanBePushed, OffersPlans, CanStartAnywhere},
     "go2_walking": {HasGoals, CanFall, CanBePushed, FollowsCommands, CanStartAnywhere},
     "pendulum": {CanStartAnywhere},
 }
@@ -58,10 +44,7 @@ def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
 
 @pytest.mark.parametrize(
     ("capability", "lacked"),
-    [
-        (HasBall, "ball to throw"),
-        (CanStartAnywhere, "episodes from a given start"),
-    ],
+    [(HasBall, "ball to throw"), (CanStartAnywhere, "episodes from a given start")],
 )
 def test_what_a_task_lacks_is_told_with_what_was_asked_and_what_it_has(capability, lacked):
     with pytest.raises(ValueError, match=f"^run: task 'Shuttling' has no {lacked}; it has plans "):

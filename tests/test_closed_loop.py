@@ -4,11 +4,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.simulation.closed_loop import (
-    ASSESSMENT_PORTS,
-    REQUIRED_PORTS,
-    ClosedLoop,
-)
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, REQUIRED_PORTS, ClosedLoop
 from gliding_task import Gliding, gliding
 
 ALL_PORTS = REQUIRED_PORTS + ASSESSMENT_PORTS

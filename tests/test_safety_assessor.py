@@ -4,12 +4,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety import (
-    AddSafetyAssessor,
-    AssessmentParameters,
-    SafetyAssessment,
-    SafetyAssessor,
-)
+from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, SafetyAssessor
 from gliding_task import evaluated
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes

@@ -140,10 +140,7 @@ def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run
         ("robot: none", "must be a mapping with the key 'task'"),
         (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
         (BALANCING + "variations: {nominal: {mass_scal: 1}}", "nominal.mass_scal'.*'mass_scale'"),
-        (
-            BALANCING + "parameters: {push: {sharee: 1}}",
-            "push.sharee' .* keys there are .*'share'",
-        ),
+        (BALANCING + "parameters: {push: {sharee: 1}}", "push.sharee' .* keys there are .*'share'"),
         (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
         (
             BALANCING + "parameters: {demonstration: [{mas_kg: 1}]}",
@@ -166,10 +163,7 @@ def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run
             "'safe_set.height_m' must be a list; got 3",
         ),
         (BALANCING + "assessment: {horizon: 1.5}", "'assessment.horizon' must be an integer"),
-        (
-            BALANCING + "assessment: {horzon: 3}",
-            r"horzon' \(did you mean 'horizon'\?\)",
-        ),
+        (BALANCING + "assessment: {horzon: 3}", r"horzon' \(did you mean 'horizon'\?\)"),
         (BALANCING + "assessment: {mode: dull}", r"unknown mode 'dull'.*'paper', 'sharpened'"),
         (BALANCING + "on_alarm: stop", "on_alarm must be one of .*got 'stop'"),
         (BALANCING + "step_s: 0", "step_s must be positive and finite; got 0"),
@@ -205,10 +199,7 @@ def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):
         (lambda: laikago().make_loop(ball=1, target=3), r"no options .*; it has .*'ball'\]"),
         (lambda: laikago().make_loop(recovry=False), r"\['recovry'\] \(did you mean 'recovery'\?"),
         (lambda: load_robot("laikgo"), r"'laikgo' does not exist \(did you mean 'laikago'"),
-        (
-            lambda: parsed(NOBODY).make_loop(),
-            "robot 'nobody' does not exist; robots are",
-        ),
+        (lambda: parsed(NOBODY).make_loop(), "robot 'nobody' does not exist; robots are"),
     ],
 )
 def test_a_name_that_does_not_exist_is_answered_with_those_that_do(ask, message):

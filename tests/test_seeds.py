@@ -129,10 +129,7 @@ def test_who_is_judged_has_not_seen_the_episodes(assessment):
     calibrated(assessment, 30)
     gamma = assessment_scorer("gamma", assessment)
     fresh = make_episodes(20, seed=5)
-    for calibration, test in (
-        (fresh, make_episodes(20, seed=30)),
-        (make_episodes(20), fresh),
-    ):
+    for calibration, test in ((fresh, make_episodes(20, seed=30)), (make_episodes(20), fresh)):
         with pytest.raises(ValueError, match=r"'gamma': seed \d+ gives"):
             evaluate_episodes([gamma], calibration, test)
     stranger = Scorer(name="stranger", probability=gamma.probability)

@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.stills import (
-    StillCamera,
-    render_stills,
-    stack_positions,
-    still_times,
-)
+from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions, still_times
 from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.scenario import load_scenario
 
