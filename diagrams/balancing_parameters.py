@@ -87,12 +87,7 @@ _QUANTITIES: dict[str, Any] = {
 
 
 def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict[str, Any]:
-    """Merges the file's parameters with defaults scaled to the robot.
-
-    Args:
-        stated: The task's part of the scenario file.
-        kinematics: The robot.
-    """
+    """Merges the file's parameters with defaults scaled to the robot."""
     half_length_m, half_width_m = np.abs(kinematics.nominal_contacts).max(axis=0).tolist()
     size = RobotSize(
         height_m=kinematics.standing_height,
@@ -109,11 +104,7 @@ def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict
 
 
 def largest_twist(kinematics: RobotKinematics) -> float:
-    """Largest yaw twist of the standing base by half of its legs before their feet slip [rad].
-
-    Args:
-        kinematics: The robot, with its servo stiffness and foot friction.
-    """
+    """Largest yaw twist of the standing base by half of its legs before their feet slip [rad]."""
     robot = kinematics.robot
     stiffness = [
         getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)

@@ -63,10 +63,6 @@ class PendulumSafeSet:
     The features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
     pendulum cannot return. Following the plan takes the torque (l/g) φ̈ - sin φ, in units of the
     torque that holds the pendulum horizontally.
-
-    Args:
-        parameters: The task's parameters.
-        preview_step_s: Time between two samples of the outlook [s].
     """
 
     names = ("front", "back")
@@ -184,10 +180,7 @@ class Pendulum(PlannedLoop):
     The output is the bob's position relative to the hinge, which follows a plan of points.
 
     Args:
-        scenario: The scenario.
         variation: Name of the plant variation; mass and damping can vary.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
     """
 
     Parameters = PendulumParameters

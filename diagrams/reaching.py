@@ -39,10 +39,6 @@ class Reaching(LeggedLoop):
     image, so that one assessment applies to both hands. All other ports are not mirrored.
 
     Args:
-        scenario: The scenario.
-        variation: Name of the plant variation.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
         hand: The hand that reaches; the scenario's by default.
         exploring: Whether episodes with random goals have the scenario's random detours and pushes;
             otherwise every plan is straight and undisturbed.
@@ -104,8 +100,7 @@ class Reaching(LeggedLoop):
                 "preview_reflection",
                 MatrixGain(
                     D=np.kron(
-                        np.eye(scenario.assessment.horizon),
-                        np.diag(self.mirror.points(np.ones(3))),
+                        np.eye(scenario.assessment.horizon), np.diag(self.mirror.points(np.ones(3)))
                     )
                 ),
             )
@@ -218,10 +213,6 @@ class Reaching(LeggedLoop):
 
         Returns:
             The first step after the initial push; 0 without one.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-            RuntimeError: No sampled posture is in the safe set.
         """
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
@@ -266,11 +257,7 @@ class Reaching(LeggedLoop):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts in the standing posture with a plan to a target; without initial noise.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-        """
+        """Starts in the standing posture with a plan to a target; without initial noise."""
         self._set(context, self.kinematics.standing_positions(), goal)
         self._observers.reseed(context, rng)
         self._observers.silence(context)
@@ -279,11 +266,7 @@ class Reaching(LeggedLoop):
         return self._controller.model.reaching_position(q)
 
     def _set(
-        self,
-        context: Context,
-        q: np.ndarray,
-        goal: np.ndarray,
-        detour: np.ndarray | None = None,
+        self, context: Context, q: np.ndarray, goal: np.ndarray, detour: np.ndarray | None = None
     ) -> None:
         goal = np.asarray(goal, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():

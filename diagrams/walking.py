@@ -13,12 +13,7 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import (
-    load_policy,
-    network_file,
-    read_policy_file,
-    with_policy,
-)
+from drake_safety.control.policy import load_policy, network_file, read_policy_file, with_policy
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -46,10 +41,6 @@ class Walking(LeggedLoop):
     the measured velocity, and a goal is a constant command.
 
     Args:
-        scenario: The scenario.
-        variation: Name of the plant variation.
-        assessment: Adds an assessor.
-        meshcat: Adds a visualiser.
         disturbed: Whether some episodes begin with an offset of the state.
         command_s: Duration of a goal's command [s], after which the command is zero; that of the
             episode by default.
@@ -148,10 +139,7 @@ class Walking(LeggedLoop):
             builder,
             safe_set,
             outlook=desired["desired_outlook"],
-            controller_features=(
-                controller.GetOutputPort("action_state"),
-                controller.action_names,
-            ),
+            controller_features=(controller.GetOutputPort("action_state"), controller.action_names),
             has_stance=False,
         )
         assessor = self._export_robot(
@@ -206,9 +194,9 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
+        of_robot = super().model_files(scenario)
         path = policy_file(scenario)
-        network = network_file(read_policy_file(path), str(path.parent))
-        return [*super().model_files(scenario), path, network]
+        return [*of_robot, path, network_file(read_policy_file(path), str(path.parent))]
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
@@ -240,11 +228,7 @@ class Walking(LeggedLoop):
         return episode.desired_output[0]
 
     def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
-        """The plan of a constant command (3,) [m/s, rad/s].
-
-        Raises:
-            ValueError: The command is not three finite numbers.
-        """
+        """The plan of a constant command (3,) [m/s, rad/s]."""
         command = np.asarray(command, dtype=float)
         if command.shape != (3,) or not np.isfinite(command).all():
             raise ValueError(
@@ -288,24 +272,11 @@ class Walking(LeggedLoop):
         self._observers.silence(context)
 
     def set_command(self, context: Context, command: np.ndarray) -> None:
-        """Sets a constant command from now on.
-
-        Args:
-            context: The root Context.
-            command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
-        """
+        """Sets a constant command (v_x, v_y, ω_z) (3,) [m/s, rad/s] from now on."""
         self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether the guard acts.
-
-        Args:
-            context: The root Context.
-            is_guarded: Whether it does.
-
-        Raises:
-            ValueError: The diagram was built without a guard.
-        """
+        """Sets whether the guard acts."""
         if self._guard is None:
             raise ValueError("walking: the diagram was built without a guard: pass guard=True")
         self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)
@@ -340,9 +311,6 @@ class Walking(LeggedLoop):
             command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
             duration_s: For how long [s]; rounded to the policy's period, so that the controller's
                 next update is due.
-
-        Returns:
-            The state at the end, above the origin, with the controller's memory.
         """
         if self._rehearsal is None:
             self._rehearsal = type(self)(self.scenario)

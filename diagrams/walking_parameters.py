@@ -42,13 +42,7 @@ class CommandSampling:
     def sample_command(
         self, limits: CommandLimits, rng: np.random.Generator, reach: float = 1.0
     ) -> np.ndarray:
-        """Samples a command, (3,) [m/s, rad/s].
-
-        Args:
-            limits: The policy's ranges.
-            rng: Random generator.
-            reach: Factor on the ranges.
-        """
+        """Samples a command, (3,) [m/s, rad/s]."""
         low, high = reach * np.array(limits.lowest), reach * np.array(limits.highest)
         drawn = rng.uniform(low, high)
         return np.zeros(3) if rng.random() < self.standing_share else drawn
@@ -56,13 +50,7 @@ class CommandSampling:
     def sample(
         self, limits: CommandLimits, rng: np.random.Generator, duration_s: float
     ) -> PiecewisePolynomial:
-        """Samples a profile of constant commands with short ramps between them.
-
-        Args:
-            limits: The policy's ranges.
-            rng: Random generator.
-            duration_s: Of the profile [s].
-        """
+        """Samples a profile of constant commands with short ramps between them."""
         reach = 1.0 if rng.random() < self.inside_share else self.reach
         count = int(rng.integers(self.num_segments[0], self.num_segments[1] + 1))
         commands = [self.sample_command(limits, rng, reach) for _ in range(count)]
@@ -73,13 +61,7 @@ class CommandSampling:
 def profile(
     commands: list[np.ndarray], changes_s: list[float], duration_s: float
 ) -> PiecewisePolynomial:
-    """A profile of constant commands.
-
-    Args:
-        commands: (v_x, v_y, ω_z) each, (3,) [m/s, rad/s].
-        changes_s: Ascending times at which the next command begins [s].
-        duration_s: Of the profile [s].
-    """
+    """A profile of constant commands (3,) [m/s, rad/s] that change at ascending times."""
     times, values = [0.0], [commands[0]]
     for change_s, before, after in zip(changes_s, commands[:-1], commands[1:], strict=True):
         begins = max(change_s, times[-1] + 1e-3)
@@ -118,12 +100,7 @@ class WalkingStart:
             raise ValueError(f"start: walked_s must be [least, largest]; got {[low, high]}")
 
     def offset_velocities(self, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Samples an offset of the base's velocities, and returns the sum.
-
-        Args:
-            v: Velocities, angular first, in the world, (n_v,) [rad/s, m/s].
-            rng: Random generator.
-        """
+        """Returns velocities, of the base in the world and angular first, with a sampled offset."""
         v = v.copy()
         speed, direction = rng.uniform(0, self.velocity_m_s), rng.uniform(-math.pi, math.pi)
         v[:3] += rng.uniform(-1, 1, 3) * self.angular_velocity_rad_s
@@ -131,12 +108,7 @@ class WalkingStart:
         return v
 
     def offset_positions(self, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Samples an offset of tilt and joints, and returns the sum.
-
-        Args:
-            q: Positions: quaternion, base position, joints, (n_q,).
-            rng: Random generator.
-        """
+        """Samples an offset of tilt and joints, and returns the sum."""
         q = q.copy()
         half = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
         w, x, y, z = q[:4]

@@ -60,11 +60,7 @@ def animation(
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment).path
     gamma = load_assessment(folder, MODES[0])
-    options: dict[str, Any] = {
-        "seed": seed,
-        "duration_s": duration,
-        "log_period_s": LOG_PERIOD_S,
-    }
+    options: dict[str, Any] = {"seed": seed, "duration_s": duration, "log_period_s": LOG_PERIOD_S}
     log: Any
     if target is None:
         loop = loaded.make_loop(variation, assessment=gamma, ball=True)

@@ -34,12 +34,7 @@ class DirectClassifier:
     """
 
     def __init__(
-        self,
-        kind: str,
-        *,
-        uses_features: bool = True,
-        seed: int = 0,
-        shortest: int | None = None,
+        self, kind: str, *, uses_features: bool = True, seed: int = 0, shortest: int | None = None
     ):
         self.kind = kind
         self.uses_features = uses_features
@@ -64,10 +59,7 @@ class DirectClassifier:
         return self
 
     def predict_unsafe(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> np.ndarray:
         """Probability of an unsafe end.
 

@@ -68,9 +68,7 @@ def converged(
                 study.scenario,
                 [
                     TriggerRule(
-                        name=name,
-                        scorer=assessment_scorer(name, one),
-                        threshold=PAPER_THRESHOLD,
+                        name=name, scorer=assessment_scorer(name, one), threshold=PAPER_THRESHOLD
                     )
                     for name, one in literal.items()
                 ],

@@ -30,10 +30,7 @@ from drake_safety.cli.evaluate import (
     begun,
     write,
 )
-from drake_safety.cli.training_folder import (
-    check_writable,
-    episodes_folder,
-)
+from drake_safety.cli.training_folder import check_writable, episodes_folder
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
@@ -193,12 +190,7 @@ def _add_plans(
             rules[name] = reachability_rule(reach)
             thresholds[name] = 0.5
     found, limits = evaluate_plans(
-        rules,
-        thresholds,
-        gamma,
-        calibration,
-        sets,
-        [key for key in sets if key != "plans"],
+        rules, thresholds, gamma, calibration, sets, [key for key in sets if key != "plans"]
     )
     evaluation.add(found)
     if plane_step and goal_words(require(loop, HasGoals)).is_point:

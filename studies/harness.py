@@ -19,13 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    command_line,
-    console,
-    open_stages,
-    print_path,
-    versions,
-)
+from drake_safety.cli.console import command_line, console, open_stages, print_path, versions
 from drake_safety.cli.training_folder import check_fresh, load_assessment, run_fresh_episodes
 from drake_safety.evaluation.figure_style import label_of, save, spoken
 from drake_safety.evaluation.interval_figure import interval_figure

@@ -70,9 +70,7 @@ def plan_study(
         rule = goal_threshold(learned.path, gamma)
         print_shipped(learned)
         console.print(
-            f"threshold {rule.threshold:.3f}, {rule.origin}",
-            highlight=False,
-            soft_wrap=True,
+            f"threshold {rule.threshold:.3f}, {rule.origin}", highlight=False, soft_wrap=True
         )
         trials = run_trials(
             study.scenario,

@@ -1,5 +1,7 @@
 """Made-up episodes of a cart, and the names of what an episode holds row by row."""
 
+import dataclasses
+
 import numpy as np
 
 from drake_safety.learning.segments import Episode, EpisodesInfo
@@ -42,5 +44,18 @@ def make_episode(index, info=None, num_rows=5, **changes):
         is_safe=index % 2 == 0,
         cause="" if index % 2 == 0 else info.constraint_names[0],
         first_step=index % 3,
+        num_controller_failures=index % 4,
     )
     return Episode(**fields | changes)
+
+
+def assert_identical(episodes, others):
+    """Bit for bit."""
+    for one, other in zip(episodes, others, strict=True):
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
+            if field.name in ARRAYS:
+                assert (a.dtype, a.shape) == (b.dtype, b.shape)
+                assert a.dtype == np.float64
+                a, b = a.tobytes(), b.tobytes()
+            assert a == b, field.name

@@ -29,6 +29,20 @@ class GlidingParameters:
             raise ValueError(f"gliding: unknown failure '{self.failure}'")
 
 
+def declare_outputs(system, ports, read):
+    """Declares output ports: of each name its size, and what it says of what is read."""
+    for name, (size, calc) in ports.items():
+        system.DeclareVectorOutputPort(
+            name,
+            BasicVector(size),
+            lambda context, output, calc=calc: output.SetFromVector(calc(*read(context))),
+        )
+
+
+def evaluated(system, context, name):
+    return system.GetOutputPort(name).Eval(context)
+
+
 class Mass(LeafSystem):
     """x, v of a mass without forces."""
 
@@ -38,29 +52,17 @@ class Mass(LeafSystem):
         self.DeclareDiscreteState(2)
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(CONTROL_PERIOD_S, 0.0, self._update)
-        position = self._position
         ports = {
-            "state": (2, lambda context: context.get_discrete_state_vector().get_value()),
-            "true_state": (2, lambda context: context.get_discrete_state_vector().get_value()),
-            "output": (3, lambda context: [position(context), 0.0, 0.0]),
-            "desired_output": (3, lambda context: [0.0, 0.0, 0.0]),
-            "desired_preview": (3 * horizon, lambda context: np.zeros(3 * horizon)),
-            "features": (1, lambda context: [1.0 - position(context)]),
-            "margins": (2, self._margins),
-            "safe": (1, lambda context: [float(min(self._margins(context)) >= 0)]),
+            "state": (2, lambda *xv: xv),
+            "true_state": (2, lambda *xv: xv),
+            "output": (3, lambda x, v: [x, 0.0, 0.0]),
+            "desired_output": (3, lambda x, v: np.zeros(3)),
+            "desired_preview": (3 * horizon, lambda x, v: np.zeros(3 * horizon)),
+            "features": (1, lambda x, v: [1.0 - x]),
+            "margins": (2, lambda x, v: [1.0 - x, x + 1.0]),
+            "safe": (1, lambda x, v: [float(min(1.0 - x, x + 1.0) >= 0)]),
         }
-        for name, (size, calc) in ports.items():
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(size),
-                lambda context, output, calc=calc: output.SetFromVector(calc(context)),
-            )
-
-    def _position(self, context):
-        return context.get_discrete_state_vector()[0]
-
-    def _margins(self, context):
-        return [1.0 - self._position(context), self._position(context) + 1.0]
+        declare_outputs(self, ports, lambda context: context.get_discrete_state_vector().value())
 
     def _start(self, context, discrete_state):
         if self.parameters.fails_at_start:
@@ -73,7 +75,7 @@ class Mass(LeafSystem):
             if self.parameters.failure == "raise":
                 raise DivergenceError("the solver failed")
             if self.parameters.failure == "bug":
-                raise ValueError("operands could not be broadcast together")
+                raise RuntimeError("operands could not be broadcast together")
             if self.parameters.failure:
                 x = float(self.parameters.failure)
         discrete_state.set_value([x, v])

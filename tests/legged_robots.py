@@ -51,6 +51,10 @@ def _write(folder, name, parts, robot):
     return path
 
 
+def _frame(body, joints, radius_m, **points):
+    return {"body": body, "joints": joints, "radius_m": radius_m} | points
+
+
 def write_hexapod(folder: Path) -> Path:
     """Writes a spider of six three-joint legs without transmissions; returns its robot.yaml."""
     parts = [_link("body", 6.0, (0.4, 0.4, 0.08), (0, 0, 0), [((0, 0, 0), 0.05)])]
@@ -67,31 +71,23 @@ def write_hexapod(folder: Path) -> Path:
             _joint(f"lift_{i}", coxa, femur, (0.05, 0, 0), "0 1 0"),
             _joint(f"knee_{i}", femur, tibia, (0.15, 0, 0), "0 1 0"),
         ]
-        feet[f"foot_{i}"] = {
-            "body": tibia,
-            "contact_points": [[0.2, 0.0, 0.0]],
-            "radius_m": 0.02,
-            "joints": [f"swing_{i}", f"lift_{i}", f"knee_{i}"],
-        }
-    return _write(
-        folder,
-        "hexapod",
-        parts,
-        {
-            "base": "body",
-            "posture": {"lift_.*": -0.4, "knee_.*": 1.6},
-            "feet": feet,
-            "joint_gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
-            "effort_limits": {".*": 40.0},
-            "foot_friction": 0.9,
-            "whole_body": {"orientation": {"body": {"weight": 20.0}}},
-        },
-    )
+        joints = [f"swing_{i}", f"lift_{i}", f"knee_{i}"]
+        feet[f"foot_{i}"] = _frame(tibia, joints, 0.02, contact_points=[[0.2, 0.0, 0.0]])
+    robot = {
+        "base": "body",
+        "posture": {"lift_.*": -0.4, "knee_.*": 1.6},
+        "feet": feet,
+        "joint_gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
+        "effort_limits": {".*": 40.0},
+        "foot_friction": 0.9,
+        "whole_body": {"orientation": {"body": {"weight": 20.0}}},
+    }
+    return _write(folder, "hexapod", parts, robot)
 
 
 def _legs():
-    """Two six-joint legs under a pelvis, whose feet touch at four points each: parts and feet."""
-    parts, feet = [], {}
+    """A pelvis on two six-joint legs, whose feet touch at four points each: parts and robot."""
+    parts, feet = [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1))], {}
     corners = [[x, y, -0.05] for x in (-0.06, 0.1) for y in (-0.04, 0.04)]
     for side, y in (("left", 0.1), ("right", -0.1)):
         links = [f"{side}_{n}" for n in ("yaw", "roll", "thigh", "shin", "ankle", "sole")]
@@ -112,34 +108,25 @@ def _legs():
         parts += [
             _joint(*values) for values in zip(joints, parents, links, origins, axes, strict=True)
         ]
-        feet[side] = {
-            "body": links[5],
-            "contact_points": corners,
-            "radius_m": 0.005,
-            "joints": joints,
-        }
-    return parts, feet
+        feet[side] = _frame(links[5], joints, 0.005, contact_points=corners)
+    robot = {
+        "base": "pelvis",
+        "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
+        "feet": feet,
+        "effort_limits": {".*": 80.0},
+        "mirror": {"left_(.*)": r"right_\1"},
+        "whole_body": {"orientation": {"pelvis": {"weight": 20.0}}},
+    }
+    return parts, robot
 
 
 def write_biped(folder: Path) -> Path:
     """Writes a pelvis on two legs; returns its robot.yaml."""
-    legs, feet = _legs()
-    return _write(
-        folder,
-        "biped",
-        [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1)), *legs],
-        {
-            "base": "pelvis",
-            "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
-            "feet": feet,
-            "joint_gains": {".*": {"stiffness": 400.0, "damping": 8.0}},
-            "effort_limits": {".*": 80.0},
-            "mirror": {"left_(.*)": r"right_\1"},
-            # It has no arms, so it reaches with its head.
-            "reaching_frames": {"head": {"body": "pelvis", "point": [0.0, 0.0, 0.25]}},
-            "whole_body": {"orientation": {"pelvis": {"weight": 20.0}}},
-        },
-    )
+    parts, robot = _legs()
+    robot["joint_gains"] = {".*": {"stiffness": 400.0, "damping": 8.0}}
+    # It has no arms, so it reaches with its head.
+    robot["reaching_frames"] = {"head": {"body": "pelvis", "point": [0.0, 0.0, 0.25]}}
+    return _write(folder, "biped", parts, robot)
 
 
 HAND_POINT, HAND_RADIUS_M = (0.22, 0.0, 0.0), 0.04
@@ -150,9 +137,9 @@ def write_porter(folder: Path) -> Path:
 
     The wrists turn without stops. A hand is a sphere, and nothing else of an arm can be touched.
     """
-    legs, feet = _legs()
-    parts = [_link("pelvis", 12.0, (0.2, 0.3, 0.3), (0, 0, 0.1)), *legs]
-    hands = {}
+    parts, robot = _legs()
+    robot["whole_body"]["reaching"] = {"weight": 200.0}
+    hands = robot["reaching_frames"] = {}
     for side, y in (("left", 1), ("right", -1)):
         links = [f"{side}_{n}" for n in ("shoulder", "upper_arm", "forearm", "palm")]
         joints = [f"{side}_{n}" for n in ("shoulder_y", "shoulder_x", "elbow", "wrist")]
@@ -168,29 +155,8 @@ def write_porter(folder: Path) -> Path:
             _joint(joints[2], links[1], links[2], (0, 0, -0.25), "0 1 0", (-1.5, 1.5)),
             _joint(joints[3], links[2], links[3], (0, 0, 0), "1 0 0", None),
         ]
-        hands[side] = {
-            "body": links[3],
-            "point": list(HAND_POINT),
-            "radius_m": HAND_RADIUS_M,
-            "joints": joints,
-        }
-    return _write(
-        folder,
-        "porter",
-        parts,
-        {
-            "base": "pelvis",
-            "posture": {".*_hip_y": -0.4, ".*_knee": 0.8, ".*_ankle_y": -0.4},
-            "feet": feet,
-            "effort_limits": {".*": 80.0},
-            "mirror": {"left_(.*)": r"right_\1"},
-            "reaching_frames": hands,
-            "whole_body": {
-                "orientation": {"pelvis": {"weight": 20.0}},
-                "reaching": {"weight": 200.0},
-            },
-        },
-    )
+        hands[side] = _frame(links[3], joints, HAND_RADIUS_M, point=list(HAND_POINT))
+    return _write(folder, "porter", parts, robot)
 
 
 def edited(path, **changes):

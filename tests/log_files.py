@@ -107,19 +107,8 @@ joint_positions: {template: "{joint}_pos", unit: deg}
 joint_velocities: {template: "{joint}_vel"}
 desired_output: {columns: [goal_x, goal_y, goal_z]}
 foot_positions:
-  columns:
-    - feet_0
-    - feet_1
-    - feet_2
-    - feet_3
-    - feet_4
-    - feet_5
-    - feet_6
-    - feet_7
-    - feet_8
-    - feet_9
-    - feet_10
-    - feet_11
+  columns: [feet_0, feet_1, feet_2, feet_3, feet_4, feet_5,
+            feet_6, feet_7, feet_8, feet_9, feet_10, feet_11]
 """
 
 MESSAGE_MAP = """
@@ -149,19 +138,8 @@ desired_output: {topic: /goal, columns: [point.x, point.y, point.z]}
 foot_positions:
   topic: /feet
   columns:
-    - "position[0]"
-    - "position[1]"
-    - "position[2]"
-    - "position[3]"
-    - "position[4]"
-    - "position[5]"
-    - "position[6]"
-    - "position[7]"
-    - "position[8]"
-    - "position[9]"
-    - "position[10]"
-    - "position[11]"
 """
+MESSAGE_MAP += "".join(f'    - "position[{i}]"\n' for i in range(12))
 
 
 def map_text(kind):
@@ -170,21 +148,15 @@ def map_text(kind):
 
 def write(log, joints, kind, folder):
     """Writes a log in one of the `FORMATS`; returns its path."""
+    path = folder / {"ros1": "run.bag", "ros2": "run_ros2"}.get(kind, f"run.{kind}")
     if kind == "csv":
-        path = folder / "run.csv"
         frame_of(log, joints).to_csv(path, index=False)
     elif kind == "parquet":
-        path = folder / "run.parquet"
         frame_of(log, joints).to_parquet(path)
     elif kind == "mcap":
-        path = folder / "run.mcap"
         _write_mcap(log, joints, path)
-    elif kind == "ros2":
-        path = folder / "run_ros2"
-        _write_ros2(log, joints, path)
     else:
-        path = folder / "run.bag"
-        _write_ros1(log, joints, path)
+        _write_bag(log, joints, path, kind)
     return path
 
 
@@ -202,68 +174,53 @@ TYPES = {
 }
 
 
-def messages(log, joints, store, array=np.asarray):
+def messages(log, joints, store, array=np.ascontiguousarray):
     """Every message as (topic, stamp, message); joints stand in an order of their own."""
-    types = store.types
-    point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
-    quaternion = types["geometry_msgs/msg/Quaternion"]
-    time_type = types["builtin_interfaces/msg/Time"]
-    header_type = types["std_msgs/msg/Header"]
-    pose, twist = types["geometry_msgs/msg/Pose"], types["geometry_msgs/msg/Twist"]
-    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"]
-    twist_with_covariance = types["geometry_msgs/msg/TwistWithCovariance"]
-    joint_state = types[TYPES["/joint_states"]]
+
+    def of(kind, *values, **named):
+        return store.types[kind.replace("/", "/msg/")](*values, **named)
+
     rotations = Rotation.from_quat(log.q[:, :4], scalar_first=True).inv()
     w, v = rotations.apply(log.v[:, :3]), rotations.apply(log.v[:, 3:6])
-    order = np.arange(len(joints))[::-1]
-    none, covariance = array(np.zeros(0)), array(np.zeros(36))
+    names, none, covariance = joints[::-1], array(np.zeros(0)), array(np.zeros(36))
+    fields = store.types["std_msgs/msg/Header"].__dataclass_fields__
     for i, stamp in enumerate(stamps_ns(log).tolist()):
-        time = time_type(*divmod(stamp, 1_000_000_000))
-        sequence = {"seq": i} if "seq" in header_type.__dataclass_fields__ else {}
-        header = header_type(stamp=time, frame_id="world", **sequence)
-        qw, qx, qy, qz = log.q[i, :4]
-        odometry = types[TYPES["/odom"]](
-            header=header,
-            child_frame_id="base",
-            pose=with_covariance(
-                pose(point(*log.q[i, 4:7]), quaternion(qx, qy, qz, qw)), covariance
-            ),
-            twist=twist_with_covariance(twist(vector(*v[i]), vector(*w[i])), covariance),
+        time = of("builtin_interfaces/Time", *divmod(stamp, 1_000_000_000))
+        sequence = {"seq": i} if "seq" in fields else {}
+        header = of("std_msgs/Header", stamp=time, frame_id="world", **sequence)
+        qw, *q_xyz = log.q[i, :4]
+        pose = of(
+            "geometry_msgs/Pose",
+            of("geometry_msgs/Point", *log.q[i, 4:7]),
+            of("geometry_msgs/Quaternion", *q_xyz, qw),
         )
-        yield "/odom", stamp, odometry
-        names = [joints[j] for j in order]
-        state = joint_state(
-            header, names, array(log.q[i, 7:][order]), array(log.v[i, 6:][order]), none
-        )
+        rates = (of("geometry_msgs/Vector3", *vector[i]) for vector in (v, w))
+        pose = of("geometry_msgs/PoseWithCovariance", pose, covariance)
+        twist = of("geometry_msgs/Twist", *rates)
+        twist = of("geometry_msgs/TwistWithCovariance", twist, covariance)
+        yield "/odom", stamp, of("nav_msgs/Odometry", header, "base", pose, twist)
+        positions, velocities = array(log.q[i, :6:-1]), array(log.v[i, :5:-1])
+        state = of("sensor_msgs/JointState", header, names, positions, velocities, none)
         yield "/joint_states", stamp, state
-        yield "/goal", stamp, types[TYPES["/goal"]](header, point(*log.desired_output[i]))
-        yield "/feet", stamp, joint_state(header, [], array(log.foot_positions[i]), none, none)
+        point = of("geometry_msgs/Point", *log.desired_output[i])
+        yield "/goal", stamp, of("geometry_msgs/PointStamped", header, point)
+        feet = array(log.foot_positions[i])
+        yield "/feet", stamp, of("sensor_msgs/JointState", header, [], feet, none, none)
 
 
-def _write_ros2(log, joints, path):
-    from rosbags.rosbag2 import Writer
+def _write_bag(log, joints, path, kind):
+    from rosbags import rosbag1, rosbag2
 
-    store = _typestore()
-    with Writer(path, version=9) as writer:
+    store = _typestore(ros1=kind == "ros1")
+    serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+    bag = rosbag1.Writer(path) if kind == "ros1" else rosbag2.Writer(path, version=9)
+    with bag as writer:
         topics = {
             topic: writer.add_connection(topic, name, typestore=store)
             for topic, name in TYPES.items()
         }
         for topic, stamp, message in messages(log, joints, store):
-            writer.write(topics[topic], stamp, store.serialize_cdr(message, TYPES[topic]))
-
-
-def _write_ros1(log, joints, path):
-    from rosbags.rosbag1 import Writer
-
-    store = _typestore(ros1=True)
-    with Writer(path) as writer:
-        topics = {
-            topic: writer.add_connection(topic, name, typestore=store)
-            for topic, name in TYPES.items()
-        }
-        for topic, stamp, message in messages(log, joints, store):
-            writer.write(topics[topic], stamp, store.serialize_ros1(message, TYPES[topic]))
+            writer.write(topics[topic], stamp, serialize(message, TYPES[topic]))
 
 
 def _write_mcap(log, joints, path):

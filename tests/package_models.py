@@ -45,13 +45,9 @@ class Scene:
             (instance,) = parser.AddModelsFromUrl(f"package://drake_safety_models/scenes/{scene}")
             body = self.plant.get_body(self.plant.GetBodyIndices(instance)[0])
             self.plant.WeldFrames(self.plant.world_frame(), body.body_frame())
-        self.plant.RegisterCollisionGeometry(
-            self.plant.world_body(),
-            RigidTransform(),
-            HalfSpace(),
-            "ground",
-            CoulombFriction(0.8, 0.8),
-        )
+        world, friction = self.plant.world_body(), CoulombFriction(0.8, 0.8)
+        X_WG, half_space = RigidTransform(), HalfSpace()
+        self.plant.RegisterCollisionGeometry(world, X_WG, half_space, "ground", friction)
         self.plant.Finalize()
         self.diagram = builder.Build()
         self.root = self.diagram.CreateDefaultContext()
@@ -104,19 +100,14 @@ class Scene:
     def contact_spheres(self) -> dict[str, GeometryId]:
         """Those of them that stand at a contact point of robot.yaml."""
         inspector = self.scene_graph.model_inspector()
-        points = {
-            foot.body: np.array(foot.contact_points).reshape(-1, 3)
-            for foot in self.robot.feet.values()
-        }
-        return {
-            name: geometry
-            for name, geometry in self.collision_geometries().items()
-            if (body := name.split("/")[0]) in points
-            and np.linalg.norm(
-                points[body] - inspector.GetPoseInFrame(geometry).translation(), axis=1
-            ).min()
-            < 1e-9
-        }
+        points = [(foot.body, p) for foot in self.robot.feet.values() for p in foot.contact_points]
+
+        def is_contact(name: str, geometry: GeometryId) -> bool:
+            centre = inspector.GetPoseInFrame(geometry).translation()
+            near = (body for body, p in points if np.allclose(centre, p, rtol=0, atol=1e-9))
+            return name.split("/")[0] in near
+
+        return {n: g for n, g in self.collision_geometries().items() if is_contact(n, g)}
 
     def touching(self) -> set[tuple[str, ...]]:
         """The sorted names of every pair of geometries that penetrate each other."""

@@ -12,6 +12,7 @@ import yaml
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.robots.robot import PlantVariation
+from gliding_task import evaluated
 from legged_robots import write_porter
 
 SCENES = "package://drake_safety_models/scenes"
@@ -87,10 +88,6 @@ def easy_episode(variation="nominal", hand="left"):
     """The porter's first episode towards an easy target."""
     loop = porter(variation, hand=hand)
     return run_episode(loop, 0, goal=EASY if loop.mirror is None else EASY * [1, -1, 1])
-
-
-def evaluated(loop, context, name):
-    return loop.GetOutputPort(name).Eval(context)
 
 
 def started(loop, seed=0, goal=None):

@@ -14,6 +14,7 @@ from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario, parse_scenario
+from gliding_task import declare_outputs
 
 SIDES = {"left": 1.0, "right": -1.0}
 BOX = np.array([[0.6, -0.3, 0.2], [1.4, 1.4, 1.0]])
@@ -60,12 +61,7 @@ class Shuttle(LeafSystem):
                 lambda p, v, left_s: [float(v[2] * self.duration_s > FAILING_Z_M)],
             ),
         }
-        for name, (size, calc) in ports.items():
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(size),
-                lambda context, output, calc=calc: output.SetFromVector(calc(*self.read(context))),
-            )
+        declare_outputs(self, ports, self.read)
 
     def read(self, context):
         value = context.get_discrete_state_vector().get_value()

@@ -1,5 +1,3 @@
-"""Balancing: any legged robot stands, sees what its variation says, and steps when it must."""
-
 import functools
 import math
 from pathlib import Path
@@ -14,10 +12,9 @@ from balancing_loops import PACKAGED, packaged_loop, scenario_of, standing_loop,
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.closed_loop import REQUIRED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.scenario import parse_scenario
-from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
+from legged_robots import ROBOT_NAMES, edited, robot_kinematics, write_hexapod
 
 
 @functools.cache
@@ -44,37 +41,14 @@ def test_the_packaged_robot_stands_on_the_actual_plant_too():
     assert np.abs(true_height - robot_kinematics(PACKAGED).standing_height).max() < 0.01
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_the_contract_is_kept_port_by_port(name):
-    loop = standing_loop(name)
-    horizon = loop.scenario.assessment.horizon
-    sizes = {
-        "state": len(loop.state_names),
-        "true_state": len(loop.state_names),
-        "output": len(loop.output_names),
-        "desired_output": len(loop.output_names),
-        "desired_preview": horizon * len(loop.output_names),
-        "features": len(loop.feature_names),
-        "margins": len(loop.constraint_names),
-        "safe": 1,
-    }
-    assert set(sizes) == set(REQUIRED_PORTS)
-    assert {port: loop.GetOutputPort(port).size() for port in sizes} == sizes
-    assert loop.fall_name in loop.constraint_names
-
-
 def test_without_an_assessment_or_recovery_nothing_is_promised_of_them():
     loop = standing_loop()
     assert not loop.HasOutputPort("recovery_active")
-    assert not loop.HasOutputPort("safety_probability")
     assert loop.num_input_ports() == 0
 
 
 def test_a_robot_without_gains_is_refused(tmp_path):
-    folder = Path(robot_model("hexapod").source_dir)
-    (tmp_path / "hexapod.urdf").write_text((folder / "hexapod.urdf").read_text())
-    text = yaml.safe_load((folder / "robot.yaml").read_text())
-    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(text | {"joint_gains": {}}))
+    edited(write_hexapod(tmp_path), joint_gains={})
     scenario = parse_scenario(
         "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
         "variations: {nominal: {}}",
@@ -143,7 +117,6 @@ def test_dry_friction_is_no_part_of_the_nominal_plant():
 
 
 def test_every_servo_follows_its_own_joint():
-    """The set points of one joint move that joint and no other."""
     for variation in ("nominal", "rough"):
         loop = standing_loop("biped", variation)
         simulator, context = started(loop)
@@ -234,7 +207,6 @@ def test_starts_are_inside_the_ranges_that_the_scenario_gives():
 
 
 def test_feet_are_at_rest_in_a_moving_start():
-    """0 = J v: what the base does, the legs allow for."""
     scenario = scenario_of(PACKAGED)
     text = yaml.safe_load(scenario.to_yaml())
     text["parameters"]["start"] |= {

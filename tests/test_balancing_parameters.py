@@ -1,5 +1,3 @@
-"""Defaults of balancing fit the robot that they were chosen on, and grow with another one."""
-
 import copy
 import math
 from dataclasses import asdict

@@ -1,18 +1,12 @@
-"""BeliefEvaluator: Γ inside a diagram, evaluated on time, with beliefs that live in the Context."""
-
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import Assessment, Correction
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
+from gliding_task import evaluated
+from system_doubles import NOVELTY, AssessmentDouble, correction
 
-PERIOD_S, NOVELTY = 0.04, 0.7
+PERIOD_S = 0.04
 STATE, PREVIEW, FEATURES = np.array([0.25, 0.5]), np.arange(6.0), np.array([7.0, 8.0, 9.0])
 INPUTS = {
     "state": STATE,
@@ -21,54 +15,6 @@ INPUTS = {
     "margins": np.ones(2),
     "alarm": np.zeros(1),
 }
-
-
-def correction(size):
-    """One of maps with three activations, for six cells."""
-    return Correction(
-        change=np.full(3, size),
-        hidden=np.full((1, 4), size),
-        hidden_range=np.array([-size, size]),
-        guard=np.ones((1, 6)),
-    )
-
-
-class AssessmentDouble:
-    """b_safe is the state's first entry times the first belief; it keeps what it was asked."""
-
-    def __init__(self, uses_features=True):
-        self.info_ = SimpleNamespace(
-            state_names=["a", "b"],
-            output_names=["x", "y", "z"],
-            feature_names=["f", "g", "h"],
-            constraint_names=["left", "right"],
-            horizon=2,
-        )
-        self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
-        self.correction_ = correction(0.0)
-        self.base_logit_ = object()
-        self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limits=np.ones(3), plan=slice(0))
-        self.embedding_ = SimpleNamespace(is_same=lambda other: False)
-        self.uses_features = uses_features
-        self.asked, self.novelties = [], []
-
-    def predict_one(self, state, desired_preview, features, *, beliefs, correction, novelty):
-        self.novelties.append(novelty)
-        self.asked.append((state.copy(), desired_preview.copy(), features, beliefs.copy()))
-        if not np.isfinite(state).all():
-            safe, belief = 0.0, [0.0, 0.0, 1.0]
-        else:
-            safe = state[0] * beliefs[0, 0, 0]
-            belief = [safe, 0.9 - safe, 0.1]
-        probability = safe + correction.hidden[0, 3] * correction.guard[0, 5]
-        return Assessment(
-            belief=np.array(belief),
-            probability=probability,
-            cause_probability=np.array([0.2, 0.3]),
-            embedding=np.array([3.0, -4.0]),
-            predicted_margins=np.array([0.01, np.nan]),
-            novelty=NOVELTY,
-        )
 
 
 def fix(evaluator, context, without=()):
@@ -85,31 +31,6 @@ def running(assessment=None, without=()):
     return assessment, evaluator, simulator, context
 
 
-def value(evaluator, context, name):
-    return evaluator.GetOutputPort(name).Eval(context)
-
-
-def test_its_ports_have_the_sizes_the_assessment_was_learned_with():
-    evaluator = BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
-    outputs = {
-        "safety_probability": 1,
-        "belief": 3,
-        "embedding": 2,
-        "cause_probability": 2,
-        "predicted_margins": 2,
-        "novelty": 1,
-    }
-    assert evaluator.num_input_ports() == len(INPUTS)
-    for name, numbers in INPUTS.items():
-        assert evaluator.GetInputPort(name).size() == len(numbers)
-    assert {n: evaluator.GetOutputPort(n).size() for n in outputs} == outputs
-    assert evaluator.num_output_ports() == len(outputs)
-
-
-def test_no_input_feeds_through():
-    assert not BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S).HasAnyDirectFeedthrough()
-
-
 def test_every_part_of_the_verdict_comes_out_at_its_own_port():
     _, evaluator, simulator, context = running()
     simulator.Initialize()
@@ -122,13 +43,13 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port():
         "novelty": [NOVELTY],
     }
     for name, numbers in expected.items():
-        np.testing.assert_allclose(value(evaluator, context, name), numbers)
+        np.testing.assert_allclose(evaluated(evaluator, context, name), numbers)
 
 
 def test_before_the_first_evaluation_nothing_is_known():
     _, evaluator, _, context = running()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0.0, 0.0, 1.0])
-    assert value(evaluator, context, "safety_probability") == [0.0]
+    np.testing.assert_array_equal(evaluated(evaluator, context, "belief"), [0.0, 0.0, 1.0])
+    assert evaluated(evaluator, context, "safety_probability") == [0.0]
 
 
 def test_the_assessment_is_asked_with_what_stands_at_the_ports():
@@ -149,13 +70,6 @@ def test_an_assessment_without_features_needs_none():
     assert assessment.asked[0][2] is None
 
 
-@pytest.mark.parametrize("name", INPUTS)
-def test_a_port_that_is_needed_and_not_connected_is_named(name):
-    _, _, simulator, _ = running(without=[name])
-    with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}\).*is not connected"):
-        simulator.Initialize()
-
-
 def test_who_wants_neither_check_nor_alarm_says_so():
     evaluator = BeliefEvaluator(
         AssessmentDouble(), period_s=PERIOD_S, checks_margins=False, heeds_alarm=False
@@ -165,17 +79,7 @@ def test_who_wants_neither_check_nor_alarm_says_so():
     simulator = Simulator(evaluator)
     fix(evaluator, simulator.get_mutable_context(), without=["margins", "alarm"])
     simulator.Initialize()
-    assert value(evaluator, simulator.get_context(), "belief")[0] == 0.25
-
-
-def test_the_verdict_is_held_for_a_period():
-    _, evaluator, simulator, context = running()
-    simulator.AdvanceTo(0.01)
-    evaluator.GetInputPort("state").FixValue(context, [0.75, 0.0])
-    simulator.AdvanceTo(0.039)
-    assert value(evaluator, context, "safety_probability")[0] == 0.25
-    simulator.AdvanceTo(0.041)
-    assert value(evaluator, context, "safety_probability")[0] == 0.75
+    assert evaluated(evaluator, simulator.get_context(), "belief")[0] == 0.25
 
 
 def test_it_is_evaluated_once_a_period():
@@ -194,8 +98,8 @@ def test_new_beliefs_change_the_verdict_of_one_context_only():
     evaluator.set_beliefs(context, 2 * assessment.beliefs_)
     simulator.Initialize()
     other.Initialize()
-    assert value(evaluator, context, "safety_probability")[0] == 0.5
-    assert value(evaluator, other_context, "safety_probability")[0] == 0.25
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.5
+    assert evaluated(evaluator, other_context, "safety_probability")[0] == 0.25
     np.testing.assert_array_equal(evaluator.get_beliefs(context), 2 * assessment.beliefs_)
     np.testing.assert_array_equal(evaluator.get_beliefs(other_context), assessment.beliefs_)
 
@@ -208,9 +112,9 @@ def test_what_feedback_has_shown_is_adopted_while_the_simulation_runs():
     adapted.beliefs_ = 2 * assessment.beliefs_
     adapted.correction_ = correction(0.125)
     evaluator.adopt(context, adapted)
-    assert value(evaluator, context, "safety_probability")[0] == 0.25
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.25
     simulator.AdvanceTo(PERIOD_S + 0.001)
-    assert value(evaluator, context, "safety_probability")[0] == 0.625
+    assert evaluated(evaluator, context, "safety_probability")[0] == 0.625
     assert assessment.novelties[0] is assessment.novelty_
     assert assessment.novelties[-1] is adapted.novelty_
 
@@ -227,38 +131,14 @@ def test_beliefs_of_another_shape_are_refused_with_both_named():
         evaluator.set_beliefs(context, np.zeros((6, 5)))
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_state_that_is_not_finite_is_not_known_to_be_anything(number):
-    _, evaluator, simulator, context = running()
-    evaluator.GetInputPort("state").FixValue(context, [number, 0.0])
-    simulator.Initialize()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0, 0, 1])
-    assert value(evaluator, context, "safety_probability")[0] == 0
-
-
-def test_it_is_usable_alone_in_any_diagram():
-    builder = DiagramBuilder()
-    evaluator = builder.AddNamedSystem(
-        "belief_evaluator", BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
-    )
-    for name, numbers in INPUTS.items():
-        source = builder.AddSystem(ConstantVectorSource(numbers))
-        builder.Connect(source.get_output_port(), evaluator.GetInputPort(name))
-    builder.ExportOutput(evaluator.GetOutputPort("safety_probability"), "safety_probability")
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    simulator.AdvanceTo(0.1)
-    assert diagram.GetOutputPort("safety_probability").Eval(simulator.get_context())[0] == 0.25
-
-
 def test_an_alarm_makes_the_belief_unknown():
     _, evaluator, simulator, context = running()
     evaluator.GetInputPort("alarm").FixValue(context, [1.0])
     simulator.Initialize()
-    np.testing.assert_array_equal(value(evaluator, context, "belief"), [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(evaluated(evaluator, context, "belief"), [0.0, 0.0, 1.0])
     for name in ("safety_probability", "cause_probability"):
-        assert not value(evaluator, context, name).any()
-    assert value(evaluator, context, "novelty") == NOVELTY
+        assert not evaluated(evaluator, context, name).any()
+    assert evaluated(evaluator, context, "novelty") == NOVELTY
 
 
 @pytest.mark.parametrize("margins", [[0.1, -0.02], [-1.0, -2.0]])
@@ -267,10 +147,10 @@ def test_outside_the_safe_set_nothing_is_safe_until_it_has_been_entered_again(ma
     port = evaluator.GetInputPort("margins")
     port.FixValue(context, margins)
     simulator.Initialize()
-    np.testing.assert_allclose(value(evaluator, context, "belief"), [0.0, 0.9, 0.1])
+    np.testing.assert_allclose(evaluated(evaluator, context, "belief"), [0.0, 0.9, 0.1])
     # The mass goes to the most violated constraint.
-    np.testing.assert_allclose(value(evaluator, context, "cause_probability"), [0.2, 0.55])
-    assert value(evaluator, context, "safety_probability") == 0.0
+    np.testing.assert_allclose(evaluated(evaluator, context, "cause_probability"), [0.2, 0.55])
+    assert evaluated(evaluator, context, "safety_probability") == 0.0
     port.FixValue(context, [0.1, 0.2])
     simulator.AdvanceTo(PERIOD_S)
-    np.testing.assert_allclose(value(evaluator, context, "belief"), [0.25, 0.65, 0.1])
+    np.testing.assert_allclose(evaluated(evaluator, context, "belief"), [0.25, 0.65, 0.1])

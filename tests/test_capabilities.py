@@ -1,9 +1,7 @@
-"""What a task can do is told by its members; what it cannot, by one message with what it can."""
-
 import numpy as np
 import pytest
 
-from drake_safety import load_scenario
+from drake_safety import check_contract, load_scenario
 from drake_safety.simulation import capabilities
 from drake_safety.simulation.capabilities import (
     CanBePushed,
@@ -15,6 +13,7 @@ from drake_safety.simulation.capabilities import (
     OffersPlans,
     require,
 )
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.rollouts import run_episode
 from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
@@ -46,6 +45,9 @@ HAS = {
 def test_a_task_of_the_package_has_what_it_says_and_no_more(name):
     loop = load_scenario(name).make_loop()
     assert {one for one in ASKED if isinstance(loop, one)} == HAS[name]
+    assert [finding for finding in check_contract(loop) if not finding.is_ok] == []
+    assert CanFall not in HAS[name] or loop.fall_name in loop.constraint_names
+    assert not any(loop.HasOutputPort(port) for port in ASSESSMENT_PORTS)
 
 
 def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
@@ -77,10 +79,6 @@ def test_asking_for_what_a_task_has_evaluates_none_of_its_properties():
             raise AssertionError("evaluated")
 
     assert isinstance(Counting(shuttling()), HasGoals)
-
-
-def test_every_required_capability_has_a_description():
-    assert set(ASKED) == set(capabilities._DESCRIPTIONS)
 
 
 def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():

@@ -1,5 +1,3 @@
-"""Simulation on a cluster: a scheduler and workers in processes of their own."""
-
 import contextlib
 import json
 import os
@@ -9,10 +7,9 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from cart_episodes import ARRAYS
+from cart_episodes import assert_identical
 from command_line import call
 from drake_safety import load_scenario, run_episodes
 from drake_safety.simulation import cluster, worker_processes
@@ -68,14 +65,6 @@ def two_workers(tmp_path):
                 worker.wait(PATIENCE_S)
 
 
-def assert_same(found, expected):
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
-        assert (one.index, one.cause) == (other.index, other.cause)
-        for name in ARRAYS:
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
 @pytest.mark.train
 def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     address, workers = two_workers
@@ -96,8 +85,8 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     assert workers[0].poll() == -signal.SIGKILL
     assert seen == sorted(seen)
     assert seen[-1] == NUM_EPISODES
-    assert_same(found, run_episodes(pendulum, NUM_EPISODES, num_workers=1))
-    assert_same(glided, run_episodes(own_task, 8, num_workers=1))
+    assert_identical(found, run_episodes(pendulum, NUM_EPISODES, num_workers=1))
+    assert_identical(glided, run_episodes(own_task, 8, num_workers=1))
 
 
 @pytest.mark.train

@@ -1,5 +1,3 @@
-"""Episodes that begin with a given state and plan: the twin of what another loop did."""
-
 import copy
 import dataclasses
 import gc
@@ -7,7 +5,6 @@ import weakref
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
 
 from balancing_loops import PACKAGED, standing_loop
 from cart_episodes import ARRAYS
@@ -143,19 +140,3 @@ def test_the_context_of_an_episode_is_freed_so_that_memory_does_not_grow(balanci
     del context
     gc.collect()
     assert alive() is None
-
-
-def test_a_loop_in_a_larger_diagram_finds_its_own_context():
-    builder = DiagramBuilder()
-    loop = builder.AddSystem(short_balancing())
-    diagram = builder.Build()
-    root = diagram.CreateDefaultContext()
-    loop.reset(root, np.random.default_rng(0))
-    assert loop.GetMyContextFromRoot(root) is not root
-    alone = short_balancing()
-    context = alone.CreateDefaultContext()
-    alone.reset(context, np.random.default_rng(0))
-    np.testing.assert_array_equal(
-        loop.GetOutputPort("true_state").Eval(loop.GetMyContextFromRoot(root)),
-        alone.GetOutputPort("true_state").Eval(alone.GetMyContextFromRoot(context)),
-    )

@@ -1,5 +1,3 @@
-"""Pairs of rollouts: actual episodes and nominal twins that begin alike."""
-
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder

@@ -1,30 +1,15 @@
-"""FeedbackRecorder: windows of a running robot, labelled by how they end."""
-
 import copy
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
+from gliding_task import declare_outputs
+from system_doubles import INFO, STEP_S
 
-STEP_S, WATCH_S, NUM_STEPS = 0.04, 0.01, 5
-
-INFO = EpisodesInfo(
-    scenario="drift",
-    scenario_hash="hash",
-    variation="actual",
-    seed=0,
-    step_s=STEP_S,
-    horizon=3,
-    constraint_names=["right", "left"],
-    state_names=["x"],
-    output_names=["x", "y", "z"],
-    feature_names=["f"],
-    versions={},
-)
+WATCH_S, NUM_STEPS = 0.01, 5
 
 
 class Drift(LeafSystem):
@@ -45,14 +30,10 @@ class Drift(LeafSystem):
             "plant_state": lambda x, v: [x, v],
             "recovery_active": lambda x, v: [float(0.2 < x < 0.3)],
         }
-        for name, calc in ports.items():
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(len(calc(0.0, 0.0))),
-                lambda context, output, calc=calc: output.SetFromVector(
-                    calc(*context.get_continuous_state_vector().CopyToVector())
-                ),
-            )
+        sized = {name: (len(calc(0.0, 0.0)), calc) for name, calc in ports.items()}
+        declare_outputs(
+            self, sized, lambda context: context.get_continuous_state_vector().CopyToVector()
+        )
 
     def DoCalcTimeDerivatives(self, context, derivatives):
         v = context.get_continuous_state_vector()[1]
@@ -139,22 +120,15 @@ def test_windows_with_recovery_are_dropped_as_their_twins_have_none():
     assert [window.start_time_s for window in without] != pytest.approx(starts)
 
 
-def test_a_jump_in_time_drops_the_open_window():
-    running = Running(0.0, 0.0).advance(0.1)
-    running.root.SetTime(0.0)
-    running.simulator.Initialize()
-    (window,) = running.advance(NUM_STEPS * STEP_S + 0.001).take()
-    assert window.start_time_s == 0.0
-    assert len(window.episode.time_s) == NUM_STEPS + 1
-
-
-def test_a_jump_in_time_forgets_that_the_safe_set_was_left_before():
-    running = Running(0.985, 1.0).advance(0.03)  # Left at 0.02 s, seen by no row.
+@pytest.mark.parametrize(("x", "v", "until_s"), [(0.0, 0.0, 0.1), (0.985, 1.0, 0.03)])
+def test_a_jump_in_time_drops_the_open_window_and_forgets_what_was_left(x, v, until_s):
+    running = Running(x, v).advance(until_s)  # The second leaves at 0.02 s, seen by no row.
     running.set(0.0, 0.0)
     running.root.SetTime(0.0)
     running.simulator.Initialize()
     (window,) = running.advance(NUM_STEPS * STEP_S + 0.001).take()
     assert window.start_time_s == 0.0
+    assert len(window.episode.time_s) == NUM_STEPS + 1
     assert window.episode.is_safe
 
 

@@ -18,6 +18,8 @@ pytestmark = pytest.mark.train
 JOINTS = ["tail", "hip", "knee"]  # The robot's.
 MOTORS = ["knee", "tail", "hip"]
 
+RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.2, 0.2]}
+RANGES |= {"heading": None}
 # The network's joints are hip and knee.
 DEPLOY = {
     "joint_ids_map": [2, 0],
@@ -25,24 +27,10 @@ DEPLOY = {
     "stiffness": [30.0, 0.0, 20.0],
     "damping": [3.0, 0.0, 2.0],
     "default_joint_pos": [0.1, -0.2],
-    "commands": {
-        "base_velocity": {
-            "ranges": {
-                "lin_vel_x": [-0.5, 1.0],
-                "lin_vel_y": [-0.3, 0.3],
-                "ang_vel_z": [-0.2, 0.2],
-                "heading": None,
-            }
-        }
-    },
+    "commands": {"base_velocity": {"ranges": RANGES}},
     "actions": {
-        "JointPositionAction": {
-            "clip": None,
-            "joint_names": [".*"],
-            "scale": [0.25, 0.5],
-            "offset": [0.1, -0.2],
-            "joint_ids": None,
-        }
+        "JointPositionAction": {"scale": [0.25, 0.5], "offset": [0.1, -0.2]}
+        | {"clip": None, "joint_names": [".*"], "joint_ids": None}
     },
     "observations": {
         "base_ang_vel": {"params": {}, "clip": [-10.0, 10.0], "scale": [0.2] * 3},
@@ -72,14 +60,8 @@ CONFIG = {
     }
 }
 BASE = {
-    "beast": {
-        "dt": 0.005,
-        "decimation": 4,
-        "num_of_dofs": 2,
-        "default_dof_pos": [0.1, -0.2],
-        "joint_names": ["knee", "hip"],
-        "joint_mapping": [1, 0],
-    }
+    "beast": {"dt": 0.005, "decimation": 4, "num_of_dofs": 2, "default_dof_pos": [0.1, -0.2]}
+    | {"joint_names": ["knee", "hip"], "joint_mapping": [1, 0]}
 }
 
 
@@ -99,8 +81,8 @@ def deploy(folder, change=None):
     return dump(folder / "params" / "deploy.yaml", content)
 
 
-def rl_sar(folder, change=None, lab="lab"):
-    """A config.yaml beside its network, with the base.yaml of its robot in a folder above."""
+def rl_sar(folder, change=None, lab="lab/walk"):
+    """A config.yaml beside its network, with the base.yaml of its robot two folders above."""
     content = copy.deepcopy(CONFIG)
     if change is not None:
         change(content["beast/lab"])
@@ -108,6 +90,18 @@ def rl_sar(folder, change=None, lab="lab"):
     config = dump(folder / "beast" / lab / "config.yaml", content)
     save_network(config.parent / "walk.pt", 16, 2)
     return config
+
+
+def action(content, **changes):
+    content["actions"]["JointPositionAction"].update(changes)
+
+
+def rates(content, **changes):
+    content["observations"]["base_ang_vel"].update(changes)
+
+
+def observations(content, **changes):
+    content["observations"].update(changes)
 
 
 def loaded(path, motors=()):
@@ -170,30 +164,12 @@ def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
         (lambda c: c.pop("step_dt"), r"has no 'step_dt'; it has \['joint_ids_map'"),
         (lambda c: c.update(joint_ids_map=[0, 0]), "must be different integers"),
         (lambda c: c.update(actions={"JointVelocityAction": {}}), "unknown keys"),
-        (
-            lambda c: c["actions"]["JointPositionAction"].update(offset=[0.0, 0.0]),
-            "offset must equal default_joint_pos",
-        ),
-        (
-            lambda c: c["actions"]["JointPositionAction"].update(clip=[[-1, 1], [-1, 1]]),
-            "clip of joint positions must be null",
-        ),
-        (
-            lambda c: c["actions"]["JointPositionAction"].update(joint_ids=[0]),
-            "joint_ids must be all 2 joints",
-        ),
-        (
-            lambda c: c["observations"]["base_ang_vel"].update(clip=[-1.0, 2.0]),
-            "clip must be symmetric",
-        ),
-        (
-            lambda c: c["observations"]["base_ang_vel"].update(scale=[1.0] * 4),
-            "'scale' must have 3 entries; got 4",
-        ),
-        (
-            lambda c: c["observations"].update(use_gym_history=True),
-            r"needs terms of one history_length; got \[1, 2\]",
-        ),
+        (lambda c: action(c, offset=[0.0, 0.0]), "offset must equal default_joint_pos"),
+        (lambda c: action(c, clip=[[-1, 1]] * 2), "clip of joint positions must be null"),
+        (lambda c: action(c, joint_ids=[0]), "joint_ids must be all 2 joints"),
+        (lambda c: rates(c, clip=[-1.0, 2.0]), "clip must be symmetric"),
+        (lambda c: rates(c, scale=[1.0] * 4), "'scale' must have 3 entries; got 4"),
+        (lambda c: observations(c, use_gym_history=True), r"one history_length; got \[1, 2\]"),
     ],
 )
 def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, change, message):
@@ -201,18 +177,6 @@ def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, change, message
     with pytest.raises(ValueError, match=message) as error:
         converted_policy(path, MOTORS)
     assert "deploy.yaml" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("motors", "message"),
-    [
-        ([], "has 2 joints; got 0 names.*name their joints in that order by --motors"),
-        (["knee", "tail"], "'names of motors' must have an entry for each motor, up to 2"),
-    ],
-)
-def test_joints_without_names_are_asked_for(tmp_path, motors, message):
-    with pytest.raises(ValueError, match=message):
-        converted_policy(deploy(tmp_path), motors)
 
 
 def test_slices_that_an_exporter_writes_are_read(tmp_path):
@@ -230,11 +194,20 @@ def test_slices_that_an_exporter_writes_are_read(tmp_path):
             converted_policy(file, MOTORS)
 
 
-def test_a_network_is_looked_for_beside_the_file(tmp_path):
+@pytest.mark.parametrize(
+    ("motors", "message"),
+    [
+        (MOTORS, "no network beside it, expected one of"),
+        ([], "has 2 joints; got 0 names.*name their joints in that order by --motors"),
+        (["knee", "tail"], "'names of motors' must have an entry for each motor, up to 2"),
+    ],
+)
+def test_names_of_joints_and_a_network_beside_the_file_are_asked_for(tmp_path, motors, message):
     path = deploy(tmp_path)
-    (tmp_path / "exported" / "policy.pt").unlink()
-    with pytest.raises(ValueError, match="no network beside it, expected one of"):
-        converted_policy(path, MOTORS)
+    if motors == MOTORS:
+        (tmp_path / "exported" / "policy.pt").unlink()
+    with pytest.raises(ValueError, match=message):
+        converted_policy(path, motors)
 
 
 def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
@@ -260,10 +233,6 @@ def test_a_config_of_rl_sar_says_all_but_the_commands(tmp_path):
     assert policy.parameters.history.ages == [0, 1]
 
 
-def test_the_robots_file_may_be_two_folders_up(tmp_path):
-    assert loaded(rl_sar(tmp_path, lab="lab/walk")).joint_names == ["hip", "knee"]
-
-
 def test_history_by_term_is_read_too(tmp_path):
     policy = loaded(rl_sar(tmp_path, lambda c: c.update(observations_history_priority="term")))
     expected = [1.0, 0.2, 0.05] * 2 + [0.3, 0.5] * 2 + [0.0, 0.0, -1.0] * 2
@@ -276,10 +245,7 @@ def test_history_by_term_is_read_too(tmp_path):
         (lambda c: c.update(num_observations=45), "num_observations is 45, but its .* 8 entries"),
         (lambda c: c.update(wheel_indices=[1]), r"wheels are not supported; got .*\[1\]"),
         (lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
-        (
-            lambda c: c.update(clip_actions_upper=[8, 9]),
-            "between joints .* Write one for all",
-        ),
+        (lambda c: c.update(clip_actions_upper=[8, 9]), "between joints .* Write one for all"),
         (lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
         (lambda c: c.update(terrain=1), r"unknown keys \['terrain'\]"),
         (lambda c: c.update(rows=1, framework="isaacsim"), "rows and cols of old files"),
@@ -306,19 +272,18 @@ def test_a_phase_has_a_clock_whose_period_is_asked_for(tmp_path):
     policy = load_policy(file, SimpleNamespace(joint_names=JOINTS, robot=SimpleNamespace(name="")))
     np.testing.assert_allclose(inputs(policy)[5:7], [0.0, 1.0])
     # It runs while the robot stands, too.
-    assert policy.next_phases(policy.initial_phases, np.zeros(3))[0] == pytest.approx(
-        2 * math.pi * 0.02 / 0.8
-    )
+    after = policy.next_phases(policy.initial_phases, np.zeros(3))[0]
+    assert after == pytest.approx(2 * math.pi * 0.02 / 0.8)
+
+
+LAB = CONFIG["beast/lab"]
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ({"a": 1}, r"odd.yaml' is neither a deploy.yaml .*keys are \['a'\]"),
-        (
-            {"a": CONFIG["beast/lab"], "b": CONFIG["beast/lab"]},
-            r"one policy in a file is expected; got \['a', 'b'\]",
-        ),
+        ({"a": LAB, "b": LAB}, r"one policy in a file is expected; got \['a', 'b'\]"),
     ],
 )
 def test_files_of_other_forms_are_told_apart(tmp_path, content, message):

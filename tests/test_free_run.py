@@ -1,5 +1,3 @@
-"""`run` for a task that has neither a goal nor a ball: a module beside its scenario."""
-
 import json
 import sys
 from pathlib import Path
@@ -36,12 +34,8 @@ def test_an_episode_is_recorded_with_its_timeline_and_events(monkeypatch, capsys
     file, folder = cart
     assert call(monkeypatch, "run", file, "--assessment", folder) in (0, None)
     run = folder / "run"
-    assert {path.name for path in run.iterdir()} == {
-        "recording.html",
-        "run.json",
-        "timeline.png",
-        "timeline.svg",
-    }
+    names = {path.name for path in run.iterdir()}
+    assert names == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
     rows = json.loads((run / "run.json").read_text())["rows"]
     assert rows[0][:2] == ["0.00", "the episode starts"]
     assert "end" in rows[-1][1] or "left" in rows[-1][1]

@@ -69,12 +69,9 @@ def formats(tmp_path_factory):
         inner = path if path.is_file() else next(path.glob("*.db3"))
         found[kind] = path, inner, lambda p, m=log_map: read_log(p, m, robot)
     found["map"] = *[folder / "csv.yaml"] * 2, load_log_map
-    found["robot"] = (
-        ROOT / "models/laikago",
-        ROOT / "models/laikago/robot.yaml",
-        lambda p: load_robot(str(p / "robot.yaml")),
-    )
-    found["urdf"] = *[next((ROOT / "models/laikago").glob("*.urdf"))] * 2, simulatable_copy
+    laikago = ROOT / "models/laikago"
+    found["robot"] = laikago, laikago / "robot.yaml", lambda p: load_robot(str(p / "robot.yaml"))
+    found["urdf"] = *[next(laikago.glob("*.urdf"))] * 2, simulatable_copy
     for name in ("laikago_balancing", "atlas_reaching"):
         found[name] = *[ROOT / f"diagrams/{name}.yaml"] * 2, load_scenario
     episodes = folder / "episodes"

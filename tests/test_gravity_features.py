@@ -1,5 +1,3 @@
-"""GravityFeatures: a slope is seen before the first step."""
-
 import dataclasses
 import math
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from pydrake.geometry import Role, SceneGraph
+from pydrake.geometry import Role
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
@@ -30,10 +30,8 @@ def test_the_ground_is_level_at_zero_and_has_no_edge(grounded):
 def test_the_ground_has_the_friction_that_was_asked_for_and_is_seen(grounded):
     plant, scene_graph, _ = grounded
     inspector = scene_graph.model_inspector()
-    assert isinstance(scene_graph, SceneGraph)
     (collision,) = plant.GetCollisionGeometriesForBody(plant.world_body())
-    friction = inspector.GetProximityProperties(collision).GetProperty(
-        "material", "coulomb_friction"
-    )
+    properties = inspector.GetProximityProperties(collision)
+    friction = properties.GetProperty("material", "coulomb_friction")
     assert (friction.static_friction(), friction.dynamic_friction()) == (0.7, 0.7)
     assert inspector.GetAllGeometryIds(Role.kIllustration)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -44,9 +43,8 @@ def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinemat
         np.testing.assert_allclose(J @ v, difference.ravel() / (2 * step), atol=1e-7)
 
 
-def test_standing_puts_the_lowest_sphere_on_the_ground(kinematics):
+def test_standing_puts_every_sphere_on_the_ground(kinematics):
     p_WC = kinematics.contact_positions(standing(kinematics))
-    assert np.min(p_WC[:, 2] - kinematics.foot_radii) == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(p_WC[:, 2], kinematics.foot_radii, atol=1e-9)
 
 
@@ -67,7 +65,7 @@ def test_no_answer_depends_on_an_earlier_call(kinematics):
 
 
 def test_the_gravity_torques_and_ground_forces_carry_the_weight(kinematics):
-    """Inverse dynamics: zero acceleration needs exactly these torques and a total force m g."""
+    # Inverse dynamics: zero acceleration needs exactly these torques and a total force m g.
     q = standing(kinematics)
     is_stance = np.ones(kinematics.num_contacts, bool)
     torques = kinematics.gravity_torques(q, is_stance)
@@ -116,9 +114,8 @@ def test_a_lighter_robot_needs_less_torque_in_proportion():
     full, light = RobotKinematics(robot), RobotKinematics(robot, PlantVariation(mass_scale=0.8))
     assert light.total_mass == pytest.approx(0.8 * full.total_mass)
     q, is_stance = standing(full), np.ones(full.num_contacts, bool)
-    np.testing.assert_allclose(
-        light.gravity_torques(q, is_stance), 0.8 * full.gravity_torques(q, is_stance), atol=1e-9
-    )
+    torques = full.gravity_torques(q, is_stance)
+    np.testing.assert_allclose(light.gravity_torques(q, is_stance), 0.8 * torques, atol=1e-9)
 
 
 def test_the_centre_of_mass_is_the_mean_of_the_bodies(kinematics):
@@ -180,17 +177,19 @@ def test_the_stance_is_the_least_squares_fit():
 
 
 def test_yaw_is_the_angle_about_the_vertical():
-    assert yaw_of(RotationMatrix.MakeZRotation(2.5)) == pytest.approx(2.5)
     assert yaw_of(RollPitchYaw(0.1, -0.2, -1.0).ToRotationMatrix()) == pytest.approx(-1.0)
 
 
-def test_a_base_that_does_not_float_is_refused(tmp_path):
-    path = write_hexapod(tmp_path)
-    text = yaml.safe_load(path.read_text())
-    text["base"] = "tibia_0"
-    path.write_text(yaml.safe_dump(text))
-    with pytest.raises(ValueError, match="base 'tibia_0' must be the floating body"):
-        RobotKinematics(load_robot_file(path))
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"base": "tibia_0"}, "base 'tibia_0' must be the floating body"),
+        ({"feet": {}}, "robot 'hexapod' has no feet to stand on"),
+    ],
+)
+def test_a_base_that_does_not_float_and_a_robot_without_feet_are_refused(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        RobotKinematics(load_robot_file(edited(write_hexapod(tmp_path), **change)))
 
 
 def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
@@ -204,9 +203,3 @@ def test_a_robot_alone_and_in_a_plant_agree_about_joint_order():
     joints = [joint for joint in joints if joint.num_velocities() == 1]
     joints.sort(key=lambda joint: joint.velocity_start())
     assert [joint.name() for joint in joints] == kinematics.joint_names
-
-
-def test_a_robot_without_feet_is_refused(tmp_path):
-    robot = load_robot_file(edited(write_hexapod(tmp_path), feet={}))
-    with pytest.raises(ValueError, match="robot 'hexapod' has no feet to stand on"):
-        RobotKinematics(robot)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
+from command_line import call
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
-from drake_safety.cli import main
 from drake_safety.cli.console import LOOPBACK, open_viewer
 from drake_safety.live.session import STOP, TICK_S, Pace
 from drake_safety.live.task_sessions import LiveGoals, LiveThrows
@@ -30,16 +30,10 @@ def meshcat():
 
 
 @pytest.fixture(scope="module")
-def balancing():
+def throws_loop(meshcat):
     scenario = quick(load_scenario("laikago_balancing"))
-    return scenario, SafetyAssessment(scenario.assessment).fit(
-        run_episodes(scenario, 8, num_workers=1)
-    )
-
-
-@pytest.fixture(scope="module")
-def throws_loop(balancing, meshcat):
-    scenario, assessment = balancing
+    episodes = run_episodes(scenario, 8, num_workers=1)
+    assessment = SafetyAssessment(scenario.assessment).fit(episodes)
     return scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat, ball=True)
 
 
@@ -179,22 +173,15 @@ def test_a_loop_without_gamma_cannot_be_played_with(meshcat):
         LiveThrows(loop, meshcat, threshold=0.4)
 
 
-def test_play_without_an_assessment_says_what_to_do_first(monkeypatch, capsys, tmp_path):
-    line = ["drake-safety", "play", "laikago_balancing", "--assessment", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", line)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first(
+    monkeypatch, capsys, tmp_path
+):
+    play = ("play", "laikago_balancing", "--assessment", tmp_path)
+    assert call(monkeypatch, *play) == 2
     assert "run `drake-safety train` first" in capsys.readouterr().out
-
-
-def test_play_without_a_library_for_pages_says_how_to_install_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "nicegui", None)
     monkeypatch.delitem(sys.modules, "drake_safety.live.page", raising=False)
-    monkeypatch.setattr(sys, "argv", ["drake-safety", "play", "laikago_balancing"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+    assert call(monkeypatch, *play[:2]) == 2
     assert "pip install 'drake_safety[live]'" in capsys.readouterr().out
 
 
@@ -215,9 +202,8 @@ def test_the_robot_stays_in_the_middle_of_the_picture(throws, monkeypatch):
 
 def test_only_this_machine_reaches_a_page_unless_it_is_asked_for(capsys):
     here, everywhere = open_viewer(LOOPBACK), open_viewer("0.0.0.0")
-    listening = {
-        line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line
-    }
+    lines = Path("/proc/net/tcp").read_text().splitlines()
+    listening = {line.split()[1] for line in lines if " 0A " in line}
     assert f"0100007F:{here.port():04X}" in listening
     assert f"00000000:{everywhere.port():04X}" in listening
     assert f"00000000:{here.port():04X}" not in listening

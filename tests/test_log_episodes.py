@@ -70,9 +70,8 @@ def test_a_longer_log_gives_an_episode_after_the_other_and_drops_a_short_rest():
     np.testing.assert_allclose(episodes[0].true_state[-1], episodes[1].true_state[0], atol=1e-9)
     np.testing.assert_allclose(starts[1].q, log.q[80], atol=1e-12)
     # Of the previews the first stays in the second's frame, whose feet have not moved.
-    np.testing.assert_allclose(
-        episodes[0].desired_preview[-1], episodes[1].desired_preview[0], atol=1e-9
-    )
+    first, second = (episode.desired_preview for episode in episodes)
+    np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
 
 
 def test_after_the_last_row_the_desired_output_stays_as_it_is():

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+import urdf_files
 from drake_safety.cli import make_app
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.robots.urdf_survey import Survey
@@ -26,10 +27,7 @@ def shaped(folder, **meshes):
     text = urdf.read_text()
     for link, mesh in meshes.items():
         mesh.export(folder / f"{link}.stl")
-        head, found, tail = text.partition(f'<link name="{link}">')
-        assert found
-        shape = f'<collision><geometry><mesh filename="{link}.stl"/></geometry></collision></link>'
-        text = head + found + tail.replace("</link>", shape, 1)
+        text = urdf_files.with_shape(text, link, urdf_files.mesh("collision", f"{link}.stl"))
     urdf.write_text(text)
     return urdf
 
@@ -68,15 +66,18 @@ def test_lost_meshes_become_shapes_which_readme_lists(spider):
 def test_the_robot_stands_with_them(spider):
     findings = list(check_scenario(spider.folder / "balancing.yaml", num_episodes=0))
     assert [f.item for f in findings if not f.is_ok] == []
-    survey = Survey(spider.files[0])
-    survey.set_joints(spider.posture)
+    assert_nothing_overlaps(spider)
+
+
+def assert_nothing_overlaps(written):
+    survey = Survey(written.files[0])
+    survey.set_joints(written.posture)
     assert survey.overlaps() == set()
 
 
 def test_a_foot_keeps_its_contact_spheres_alone(spider):
-    assert [shape.get("name") for shape in collisions(spider, "tibia_2")] == [
-        shape.get("name") for shape in collisions(spider, "tibia_3")
-    ]
+    of_mesh, of_sphere = (collisions(spider, name) for name in ("tibia_2", "tibia_3"))
+    assert [one.get("name") for one in of_mesh] == [one.get("name") for one in of_sphere]
 
 
 def test_where_a_primitive_would_touch_the_hull_is_taken_and_what_still_does_is_ignored(tmp_path):
@@ -85,12 +86,9 @@ def test_where_a_primitive_would_touch_the_hull_is_taken_and_what_still_does_is_
     written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
     assert written.fitted == {"hull": 1}
     assert "<member" not in (tmp_path / "hexapod.urdf").read_text()
-    survey = Survey(written.files[0])
-    survey.set_joints(written.posture)
-    assert survey.overlaps() == set()
-    assert (
-        "collisions of the overlapping links" in (written.folder / "README.md").read_text().lower()
-    )
+    assert_nothing_overlaps(written)
+    readme = (written.folder / "README.md").read_text().lower()
+    assert "collisions of the overlapping links" in readme
 
 
 def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_path, monkeypatch):

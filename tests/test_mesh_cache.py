@@ -6,12 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from drake_safety.robots.mesh_cache import (
-    cache_folder,
-    is_shown,
-    mesh_points,
-    shown_mesh,
-)
+from drake_safety.robots.mesh_cache import cache_folder, is_shown, mesh_points, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -34,6 +29,13 @@ def tower(tmp_path):
     path = tmp_path / "tower.stl"
     trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
     return path
+
+
+def assert_colour(path, rgba):
+    (material,) = json.loads(path.read_text())["materials"]
+    # trimesh keeps colours as bytes.
+    found = material["pbrMetallicRoughness"]["baseColorFactor"]
+    np.testing.assert_allclose(found, rgba, atol=1 / 255)
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
@@ -68,11 +70,6 @@ def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
     assert np.ptp(mesh_points(path), axis=0) == pytest.approx(extents)
 
 
-def test_a_mesh_that_drake_shows_stays_where_it_is(cache, tmp_path):
-    assert shown_mesh(tmp_path / "trunk.obj") == tmp_path / "trunk.obj"
-    assert not cache.exists()
-
-
 @pytest.mark.parametrize(
     ("materials", "shown"),
     [
@@ -91,19 +88,14 @@ def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path
         path.with_suffix(".mtl").write_text(materials)
     assert is_shown(path) == shown
     found = shown_mesh(path, "0.2 0.4 0.6 1")
-    assert (found == path) == shown
+    assert (found == path) == shown == (not cache.exists())
     if not shown:
-        gltf = json.loads(found.read_text())
-        (colour,) = [one["pbrMetallicRoughness"]["baseColorFactor"] for one in gltf["materials"]]
-        np.testing.assert_allclose(colour, [0.2, 0.4, 0.6, 1.0], atol=1 / 255)
+        assert_colour(found, [0.2, 0.4, 0.6, 1.0])
 
 
 def test_up_stays_up_and_the_colour_is_the_models(cache, tower):
     converted = shown_mesh(tower, "0.1 0.2 0.3 1")
-    gltf = json.loads(converted.read_text())
-    (colour,) = [one["pbrMetallicRoughness"]["baseColorFactor"] for one in gltf["materials"]]
-    # trimesh keeps colours as bytes.
-    np.testing.assert_allclose(colour, [0.1, 0.2, 0.3, 1.0], atol=1 / 255)
+    assert_colour(converted, [0.1, 0.2, 0.3, 1.0])
     # A glTF file's y axis points up.
     extents = trimesh.load_scene(converted).extents
     np.testing.assert_allclose(extents, [1.0, 4.0, 2.0], atol=1e-6)
@@ -120,15 +112,19 @@ def test_a_mesh_is_converted_once_until_it_or_its_colour_changes(cache, tower):
     assert [path for path in first.parent.iterdir() if path.suffix != ".gltf"] == []
 
 
-def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path):
-    with pytest.raises(ValueError, match=r"gone\.stl' does not exist"):
-        shown_mesh(tmp_path / "gone.stl")
-    (tmp_path / "text.dae").write_text("no mesh")
-    with pytest.raises(ValueError, match=r"text\.dae' cannot be read"):
-        shown_mesh(tmp_path / "text.dae")
-    (tmp_path / "nothing.dae").write_text(NOTHING)
-    with pytest.raises(ValueError, match=r"nothing\.dae' is empty, or has no surface"):
-        shown_mesh(tmp_path / "nothing.dae")
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("gone.stl", None, r"gone\.stl' does not exist"),
+        ("text.dae", "no mesh", r"text\.dae' cannot be read"),
+        ("nothing.dae", NOTHING, r"nothing\.dae' is empty, or has no surface"),
+    ],
+)
+def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path, name, text, message):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        shown_mesh(tmp_path / name)
     assert list(cache.rglob("*.gltf")) == []
 
 

@@ -1,4 +1,3 @@
-import json
 import math
 
 import numpy as np
@@ -7,7 +6,6 @@ from scipy.stats import poisson
 
 from drake_safety.evaluation.metrics import (
     Bootstrap,
-    Estimate,
     area_under_curve,
     auc,
     median,
@@ -41,11 +39,6 @@ def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_five_percent()
     nothing = proportion(0, 0)
     assert math.isnan(nothing.value)
     assert (nothing.low, nothing.high, nothing.n) == (0.0, 1.0, 0)
-
-
-def test_a_figure_is_valid_json_even_where_it_is_unknown():
-    text = json.dumps(Estimate(math.nan, 0.0, math.inf, np.int64(3)).to_json(), allow_nan=False)
-    assert json.loads(text) == {"value": None, "low": 0.0, "high": None, "n": 3}
 
 
 def test_the_median_lies_in_its_interval_and_more_values_narrow_it():

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
@@ -10,9 +9,10 @@ from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
 from drake_safety.models import load_robot, robot_names
 from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import robot_kinematics, write_biped, write_hexapod
+from legged_robots import edited, robot_kinematics, write_biped, write_hexapod
 
 SYMMETRIC = [name for name in robot_names() if load_robot(name).mirror]
+assert "laikago" in SYMMETRIC
 
 
 @pytest.fixture(params=[*SYMMETRIC, "biped"])
@@ -34,10 +34,6 @@ def same_points(p, others):
     """Whether each point of one set is in the other."""
     distance = np.linalg.norm(p[:, np.newaxis] - others, axis=-1)
     return distance.min(axis=0).max() < 1e-6 and distance.min(axis=1).max() < 1e-6
-
-
-def test_the_robots_of_the_package_that_have_two_sides_say_so():
-    assert "laikago" in SYMMETRIC
 
 
 def test_reflecting_twice_changes_nothing(kinematics):
@@ -67,16 +63,10 @@ def test_reflecting_the_robot_reflects_its_feet_and_hands(kinematics):
         feet = kinematics.contact_positions(q)
         assert same_points(kinematics.contact_positions(mirrored), reflected(feet))
         for name in kinematics.robot.reaching_frames:
-            hand = hand_position(kinematics, q, name)
-            other = hand_position(kinematics, mirrored, mirror.hand(name))
+            frames = kinematics.robot.reaching_frames
+            hand = kinematics.reaching_position(q, frames[name])
+            other = kinematics.reaching_position(mirrored, frames[mirror.hand(name)])
             np.testing.assert_allclose(other, reflected(hand), atol=1e-6)
-
-
-def hand_position(kinematics, q, name):
-    frame = kinematics.robot.reaching_frames[name]
-    kinematics.plant.SetPositions(kinematics.context, q)
-    X_WB = kinematics.plant.GetBodyByName(frame.body).EvalPoseInWorld(kinematics.context)
-    return X_WB @ np.array([frame.point]).T[:, 0]
 
 
 def test_reflecting_the_velocities_reflects_the_velocities_of_the_feet(kinematics):
@@ -91,29 +81,23 @@ def test_reflecting_the_velocities_reflects_the_velocities_of_the_feet(kinematic
     assert same_points(np.concatenate([mirrored_feet, mirrored_rates], axis=1), reflected)
 
 
-def test_the_state_of_the_mirrored_robot_is_the_mirrored_state(kinematics):
+def test_the_state_of_the_mirrored_robot_is_the_mirrored_state_in_the_same_stance(kinematics):
     mirror = Mirror(kinematics)
     for planted in (True, False):
         q, v = random_state(kinematics, np.random.default_rng(3), planted)
-        mirrored = stance_state(kinematics, *mirror.plant_state(q, v))
+        mirrored = mirror.plant_state(q, v)
         expected = mirror.stance_state(stance_state(kinematics, q, v))
-        np.testing.assert_allclose(mirrored, expected, atol=1e-6)
-
-
-def test_the_mirrored_robot_stands_in_the_same_stance(kinematics):
-    q, v = random_state(kinematics, np.random.default_rng(4), planted=False)
-    mirrored, _ = Mirror(kinematics).plant_state(q, v)
-    stances = [
-        fit_stance(kinematics.contact_positions(p), kinematics.nominal_contacts)
-        for p in (q, mirrored)
-    ]
-    np.testing.assert_allclose(stances[0], stances[1], atol=1e-6)
+        np.testing.assert_allclose(stance_state(kinematics, *mirrored), expected, atol=1e-6)
+        stances = [
+            fit_stance(kinematics.contact_positions(p), kinematics.nominal_contacts)
+            for p in (q, mirrored[0])
+        ]
+        np.testing.assert_allclose(stances[0], stances[1], atol=1e-6)
 
 
 def test_the_standing_posture_is_its_own_reflection(kinematics):
-    np.testing.assert_allclose(
-        Mirror(kinematics).joints(kinematics.posture), kinematics.posture, atol=1e-9
-    )
+    reflected = Mirror(kinematics).joints(kinematics.posture)
+    np.testing.assert_allclose(reflected, kinematics.posture, atol=1e-9)
 
 
 def test_many_states_are_reflected_as_one_by_one(kinematics):
@@ -131,16 +115,14 @@ def test_many_states_are_reflected_as_one_by_one(kinematics):
     ],
 )
 def test_joints_that_are_not_each_others_reflection_are_refused(tmp_path, mirror, message):
-    path = write_hexapod(tmp_path)
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"mirror": mirror}))
+    robot = load_robot_file(edited(write_hexapod(tmp_path), mirror=mirror))
     with pytest.raises(ValueError, match=message):
-        Mirror(RobotKinematics(load_robot_file(path)))
+        Mirror(RobotKinematics(robot))
 
 
 def test_a_hand_without_a_partner_is_answered_with_the_hands_there_are(tmp_path):
-    path = write_biped(tmp_path)
-    change = {"reaching_frames": {"left": {"body": "left_shin", "joints": ["left_knee"]}}}
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    frames = {"left": {"body": "left_shin", "joints": ["left_knee"]}}
+    path = edited(write_biped(tmp_path), reaching_frames=frames)
     mirror = Mirror(RobotKinematics(load_robot_file(path)))
     with pytest.raises(ValueError, match=r"joints \['right_knee'\] opposite hand 'left'; there"):
         mirror.hand("left")

@@ -14,8 +14,7 @@ from package_models import PUBLISHED, Scene
 LEGS = ("FR", "FL", "RR", "RL")
 LAIKAGO_LINKS = ("hip", "thigh", "calf")
 LAIKAGO_STANDING = (0.0, 0.67, -1.3)
-SAMPLED_LOWER = np.array([-0.4, 0.2, -2.0])
-SAMPLED_UPPER = np.array([0.4, 1.3, -0.7])
+SAMPLED = ((-0.4, 0.4, 5), (0.2, 1.3, 6), (-2.0, -0.7, 6))
 
 
 @pytest.fixture(params=sorted(PUBLISHED))
@@ -34,9 +33,8 @@ def atlas() -> Scene:
 
 
 def set_leg(scene: Scene, leg: str, angles) -> None:
-    scene.set_joints(
-        {f"{leg}_{link}_joint": angle for link, angle in zip(LAIKAGO_LINKS, angles, strict=True)}
-    )
+    joints = (f"{leg}_{link}_joint" for link in LAIKAGO_LINKS)
+    scene.set_joints(dict(zip(joints, angles, strict=True)))
 
 
 def lowest_of(scene: Scene) -> float:
@@ -115,10 +113,8 @@ def test_every_signed_distance_within_the_robot_can_be_computed(scene):
 
 def test_the_robot_can_be_seen_and_what_is_seen_can_be_rendered(scene):
     inspector = scene.scene_graph.model_inspector()
-    assert inspector.NumGeometriesWithRole(Role.kIllustration) > len(scene.bodies)
-    assert inspector.NumGeometriesWithRole(Role.kPerception) == (
-        inspector.NumGeometriesWithRole(Role.kIllustration)
-    )
+    seen, rendered = map(inspector.NumGeometriesWithRole, (Role.kIllustration, Role.kPerception))
+    assert rendered == seen > len(scene.bodies)
 
 
 @pytest.mark.parametrize("name", [n for n in sorted(PUBLISHED) if load_robot(n).reaching_frames])
@@ -126,32 +122,20 @@ def test_a_reaching_point_is_the_centre_of_the_hands_sphere(name):
     scene = Scene(name)
     inspector = scene.scene_graph.model_inspector()
     for frame in scene.robot.reaching_frames.values():
-        spheres = [
-            geometry
-            for geometry in scene.plant.GetCollisionGeometriesForBody(scene.bodies[frame.body])
-            if isinstance(inspector.GetShape(geometry), Sphere)
-        ]
-        (sphere,) = spheres
+        shapes = scene.plant.GetCollisionGeometriesForBody(scene.bodies[frame.body])
+        (sphere,) = (g for g in shapes if isinstance(inspector.GetShape(g), Sphere))
         assert inspector.GetShape(sphere).radius() == frame.radius_m
-        np.testing.assert_allclose(
-            inspector.GetPoseInFrame(sphere).translation(), frame.point, rtol=0, atol=1e-12
-        )
+        centre = inspector.GetPoseInFrame(sphere).translation()
+        np.testing.assert_allclose(centre, frame.point, rtol=0, atol=1e-12)
 
 
 def test_a_laikago_leg_never_touches_itself_or_the_trunk_where_legs_are_sampled(laikago):
     laikago.set_base_height(1.0)
-    hips = np.linspace(SAMPLED_LOWER[0], SAMPLED_UPPER[0], 5)
-    thighs = np.linspace(SAMPLED_LOWER[1], SAMPLED_UPPER[1], 6)
-    calves = np.linspace(SAMPLED_LOWER[2], SAMPLED_UPPER[2], 6)
     for leg in LEGS:
-        for angles in itertools.product(hips, thighs, calves):
+        for angles in itertools.product(*(np.linspace(*sampled) for sampled in SAMPLED)):
             set_leg(laikago, leg, angles)
-            own = {
-                pair
-                for pair in laikago.touching()
-                if all(name.startswith((leg, "trunk")) for name in pair)
-            }
-            assert own == set(), angles
+            touching = laikago.touching()
+            assert not any(all(n.startswith((leg, "trunk")) for n in p) for p in touching), angles
         set_leg(laikago, leg, LAIKAGO_STANDING)
 
 
@@ -174,10 +158,8 @@ def test_laikagos_calf_ends_short_of_its_foot(laikago):
     shapes = laikago.collision_geometries()
     shin, foot = shapes["FR_calf/shin"], shapes["FR_calf/foot"]
     capsule, radius = inspector.GetShape(shin), inspector.GetShape(foot).radius()
-    shin_end = (
-        inspector.GetPoseInFrame(shin).translation()[2] - capsule.length() / 2 - capsule.radius()
-    )
-    assert shin_end > inspector.GetPoseInFrame(foot).translation()[2] + radius
+    shin_z, foot_z = (inspector.GetPoseInFrame(one).translation()[2] for one in (shin, foot))
+    assert shin_z - capsule.length() / 2 - capsule.radius() > foot_z + radius
     assert capsule.radius() < radius
 
 
@@ -197,9 +179,7 @@ def test_a_front_foot_of_laikago_reaching_back_collides_with_the_hind_leg(laikag
     laikago.set_base_height(1.0)
     set_leg(laikago, "FR", (0.0, 1.3, -0.7))
     set_leg(laikago, "RR", (0.0, 0.2, -2.0))
-    assert any(
-        first.startswith("FR") and second.startswith("RR") for first, second in laikago.touching()
-    )
+    assert any(one[:2] == "FR" and other[:2] == "RR" for one, other in laikago.touching())
 
 
 def test_atlas_touches_the_world_only_and_never_itself(atlas):
@@ -210,11 +190,8 @@ def test_atlas_touches_the_world_only_and_never_itself(atlas):
 def test_only_the_forearms_of_atlas_are_anything_but_spheres(atlas):
     # Between a half space and any other shape Drake finds contact, but no signed distance.
     inspector = atlas.scene_graph.model_inspector()
-    others = {
-        name
-        for name, geometry in atlas.collision_geometries().items()
-        if not isinstance(inspector.GetShape(geometry), Sphere)
-    }
+    shapes = {name: inspector.GetShape(g) for name, g in atlas.collision_geometries().items()}
+    others = {name for name, shape in shapes.items() if not isinstance(shape, Sphere)}
     assert others == {"l_ufarm/forearm", "r_ufarm/forearm"}
 
 
@@ -233,11 +210,9 @@ def test_no_board_fits_between_the_hand_and_the_forearm_of_atlas(atlas, side):
         query = atlas.query()
         X_WF, X_WH = query.GetPoseInWorld(forearm), query.GetPoseInWorld(hand)
         p_FH = X_WF.inverse() @ X_WH.translation()
-        outside = [
-            max(np.hypot(*p_FH[:2]) - cylinder.radius(), 0.0),
-            max(abs(p_FH[2]) - cylinder.length() / 2, 0.0),
-        ]
-        gap = np.hypot(*outside) - inspector.GetShape(hand).radius()
+        beside = max(np.hypot(*p_FH[:2]) - cylinder.radius(), 0.0)
+        beyond = max(abs(p_FH[2]) - cylinder.length() / 2, 0.0)
+        gap = np.hypot(beside, beyond) - inspector.GetShape(hand).radius()
         assert 0.0 < gap < board
 
 

@@ -3,14 +3,15 @@ import logging
 import mujoco
 import numpy as np
 import pytest
-from pydrake.geometry import Mesh, SceneGraph
+from pydrake.geometry import Mesh
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
     CoulombFriction,
     ExternallyAppliedSpatialForce,
-    MultibodyPlant,
 )
+from pydrake.systems.framework import DiagramBuilder
 
 import legged_robots
 from drake_safety.plants.mujoco_dynamics import MujocoDynamics
@@ -28,19 +29,12 @@ class Bench:
         self.robot = legged_robots.robot_model(name)
         self.kinematics = legged_robots.robot_kinematics(name)
         self.variation = variation or PlantVariation()
-        scene_graph = SceneGraph()
-        self.plant = MultibodyPlant(STEP_S)
-        self.plant.RegisterAsSourceForSceneGraph(scene_graph)
+        self.plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), STEP_S)
         add_robot(self.plant, self.robot, self.variation, scene_graph=scene_graph, servos=servos)
         add_ground(self.plant, self.robot.foot_friction)
         self.plant.Finalize()
         self.dynamics = MujocoDynamics(
-            self.robot,
-            self.plant,
-            scene_graph,
-            self.variation,
-            time_step_s=STEP_S,
-            servos=servos,
+            self.robot, self.plant, scene_graph, self.variation, time_step_s=STEP_S, servos=servos
         )
         self.model = self.dynamics.model
         self.scratch = mujoco.MjData(self.model)
@@ -90,9 +84,8 @@ def test_a_turn_of_a_rolled_base_is_in_the_body_in_mujoco_and_in_the_world_in_dr
 
 
 def test_masses_are_drakes(bench):
-    assert bench.model.body_subtreemass[0] == pytest.approx(
-        bench.kinematics.total_mass, rel=0, abs=1e-8
-    )
+    mass = pytest.approx(bench.kinematics.total_mass, rel=0, abs=1e-8)
+    assert bench.model.body_subtreemass[0] == mass
 
 
 def test_mass_matrix_and_bias_are_drakes_through_the_velocity_conventions(bench):
@@ -161,16 +154,13 @@ def test_friction_of_feet_and_everything_else_is_drakes(bench):
         of_foot = bench.model.geom_bodyid == bench.model.body(foot.body).id
         is_contact = of_foot & np.isclose(bench.model.geom_size[:, 0], foot.radius_m)
         assert is_contact.sum() == len(foot.contact_points)
-        np.testing.assert_allclose(
-            bench.model.geom_friction[is_contact, 0], bench.robot.foot_friction
-        )
+        friction = bench.model.geom_friction[is_contact, 0]
+        np.testing.assert_allclose(friction, bench.robot.foot_friction)
 
 
 def test_a_variation_changes_mass_friction_and_damping():
-    nominal = Bench("laikago").model
-    varied = Bench(
-        "laikago", PlantVariation(mass_scale=1.5, joint_friction_nm=0.4, joint_damping=0.2)
-    ).model
+    variation = PlantVariation(mass_scale=1.5, joint_friction_nm=0.4, joint_damping=0.2)
+    nominal, varied = Bench("laikago").model, Bench("laikago", variation).model
     np.testing.assert_allclose(varied.body_mass, 1.5 * nominal.body_mass)
     np.testing.assert_allclose(varied.body_inertia, 1.5 * nominal.body_inertia)
     assert varied.body_subtreemass[0] == pytest.approx(1.5 * nominal.body_subtreemass[0])
@@ -233,14 +223,9 @@ def test_servos_pull_with_their_gains_until_the_effort_limit():
 
 
 def test_a_force_at_the_centre_of_mass_accelerates_it(bench):
-    state = bench.dynamics.state_from(
-        np.concatenate(
-            [
-                bench.kinematics.standing_positions() + 2.0 * np.eye(bench.model.nq)[6],
-                np.zeros(bench.model.nv),
-            ]
-        )
-    )
+    plant = bench.kinematics.plant
+    q = bench.kinematics.standing_positions() + 2.0 * np.eye(bench.model.nq)[6]
+    state = bench.dynamics.state_from(np.concatenate([q, np.zeros(bench.model.nv)]))
     command = np.zeros(bench.dynamics.num_command)
     force = ExternallyAppliedSpatialForce()
     force.body_index = bench.plant.GetBodyByName(bench.robot.base).index()
@@ -248,20 +233,13 @@ def test_a_force_at_the_centre_of_mass_accelerates_it(bench):
     force.F_Bq_W = SpatialForce(np.zeros(3), np.array([30.0, 0.0, 0.0]))
 
     def momentum(state):
-        plant_state = bench.dynamics.plant_state(state)
-        plant = bench.kinematics.plant
         context = plant.CreateDefaultContext()
-        plant.SetPositionsAndVelocities(context, plant_state)
-        return bench.kinematics.total_mass * plant.CalcCenterOfMassTranslationalVelocityInWorld(
-            context
-        )
+        plant.SetPositionsAndVelocities(context, bench.dynamics.plant_state(state))
+        return plant.CalcSpatialMomentumInWorldAboutPoint(context, np.zeros(3)).translational()
 
     pushed = bench.dynamics.step(state, command, [force])
-    alone = bench.dynamics.step(state, command)
-    gained = momentum(pushed) - momentum(alone)
-    np.testing.assert_allclose(
-        gained, STEP_S * force.F_Bq_W.translational(), atol=5e-3 * 30 * STEP_S
-    )
+    gained = momentum(pushed) - momentum(bench.dynamics.step(state, command))
+    np.testing.assert_allclose(gained, [30.0 * STEP_S, 0.0, 0.0], atol=5e-3 * 30 * STEP_S)
     with pytest.raises(ValueError, match="no body 'ground' to push"):
         force.body_index = bench.plant.GetBodyByName("ground").index()
         bench.dynamics.step(state, command, [force])
@@ -288,19 +266,12 @@ def test_a_step_from_nothing_finite_or_into_instability_is_an_error(
 
 def test_what_mujoco_cannot_read_is_refused_by_name(tmp_path):
     robot = legged_robots.load_robot_file(legged_robots.write_hexapod(tmp_path))
-    scene_graph = SceneGraph()
-    plant = MultibodyPlant(STEP_S)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), STEP_S)
     add_robot(plant, robot)
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
-    plant.RegisterCollisionGeometry(
-        plant.GetBodyByName("tibia_0"),
-        RigidTransform(),
-        Mesh(str(mesh)),
-        "mesh",
-        CoulombFriction(0.5, 0.5),
-    )
+    body, friction = plant.GetBodyByName("tibia_0"), CoulombFriction(0.5, 0.5)
+    plant.RegisterCollisionGeometry(body, RigidTransform(), Mesh(str(mesh)), "mesh", friction)
     plant.Finalize()
     options = {"time_step_s": STEP_S, "servos": False}
     with pytest.raises(ValueError, match=r"body 'tibia_0'.*no collision shape Mesh.*'Sphere'"):

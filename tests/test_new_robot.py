@@ -13,7 +13,7 @@ from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
-from urdf_files import stl
+from urdf_files import mesh, stl, with_shape
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,14 @@ def own(spider, tmp_path):
     return shutil.copytree(spider.folder, tmp_path / "own")
 
 
-def problems(scenario, **options):
-    options = {"num_episodes": 0} | options
-    return {f.item: f for f in check_scenario(scenario, **options) if not f.is_ok}
+def problems(scenario, num_episodes=0):
+    findings = check_scenario(scenario, num_episodes=num_episodes)
+    return {f.item: f for f in findings if not f.is_ok}
+
+
+def assert_told(found, message, remedy=""):
+    assert message in found.message
+    assert remedy in found.remedy
 
 
 def test_what_new_writes_passes_its_check_as_it_is(spider):
@@ -68,12 +73,14 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
     write_porter(tmp_path)
     written = write_robot("carrier", tmp_path / "porter.urdf", "reaching", tmp_path / "carrier")
     robot = yaml.safe_load((written.folder / "robot.yaml").read_text())
-    assert {frame["body"] for frame in robot["reaching_frames"].values()} == {
-        "left_palm",
-        "right_palm",
-    }
+    hands = {frame["body"] for frame in robot["reaching_frames"].values()}
+    assert hands == {"left_palm", "right_palm"}
     assert robot["mirror"]["left_elbow"] == "right_elbow"
     assert problems(written.folder / "reaching.yaml") == {}
+
+
+WEAK = {".*": {"stiffness": 0.05, "damping": 0.05}}
+POSTURE = "'posture' in robot.yaml [rad]"
 
 
 @pytest.mark.parametrize(
@@ -82,48 +89,21 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
         ({"base": "trunk"}, "scenario", "has no body 'trunk'", "the message"),
         ({"urdf": "gone.urdf"}, "scenario", "gone.urdf' does not exist", "the message"),
         ({"feed": {}}, "scenario", "unknown key 'feed'", "the message"),
-        (
-            {"posture": {"knee_.*": 1.6, "knee_0": 9.0}},
-            "scenario",
-            "matches ['knee_.*', 'knee_0']",
-            "the message",
-        ),
-        (
-            {"posture": {"knee_0": 9.0}},
-            "joint stops",
-            "knee_0 at 9, between -2.5 and 2.5",
-            "'posture' in robot.yaml [rad]",
-        ),
-        ({"posture": {"lift_0": 0.9}}, "feet level", "hang up to", "'posture' in robot.yaml [rad]"),
-        (
-            {"joint_gains": {"lift_.*": {"stiffness": 50.0}}},
-            "servo gains",
-            "'swing_0'",
-            "'joint_gains'",
-        ),
+        ({"posture": {"knee_.*": 1.6, "knee_0": 9.0}}, "scenario", "matches ['knee_.*'", "message"),
+        ({"posture": {"knee_0": 9.0}}, "joint stops", "knee_0 at 9, between -2.5 and 2.5", POSTURE),
+        ({"posture": {"lift_0": 0.9}}, "feet level", "hang up to", POSTURE),
+        ({"joint_gains": {"lift_.*": {}}}, "servo gains", "'swing_0'", "'joint_gains'"),
+        ({"joint_gains": WEAK}, "stands for 1 s", "it has sunk", "raise 'joint_gains' in robot"),
         ({"effort_limits": {".*": 0.01}}, "effort against gravity", "of 0.0 N·m", "limits"),
         ({"effort_limits": {}}, "motors", "have none", "'effort_limits' in robot.yaml [N·m]"),
-        (
-            {"effort_limits": {}},
-            "diagram",
-            "have no motor: 'spider.urdf' has no transmission",
-            "the message",
-        ),
-        (
-            {"joint_gains": {".*": {"stiffness": 0.05, "damping": 0.05}}},
-            "stands for 1 s",
-            "it has sunk",
-            "raise 'joint_gains' in robot.yaml",
-        ),
+        ({"effort_limits": {}}, "diagram", "have no motor: 'spider.urdf' has no", "the message"),
     ],
 )
 def test_each_mistake_in_robot_yaml_is_found_and_comes_with_a_remedy(
     own, change, item, message, remedy
 ):
     edited(own / "robot.yaml", **change)
-    found = problems(own / "balancing.yaml")[item]
-    assert message in found.message
-    assert remedy in found.remedy
+    assert_told(problems(own / "balancing.yaml")[item], message, remedy)
 
 
 @pytest.mark.parametrize(
@@ -140,73 +120,77 @@ def test_a_scenario_that_does_not_scale_is_read_before_its_robot(own, change, it
     assert message in problems(own / "balancing.yaml")[item].message
 
 
-def test_feet_that_do_not_surround_the_centre_of_mass_are_found(own):
-    robot = yaml.safe_load((own / "robot.yaml").read_text())
-    names = list(robot["feet"])
-    # On one line.
-    edited(own / "robot.yaml", feet={name: robot["feet"][name] for name in (names[0], names[3])})
-    found = problems(own / "balancing.yaml")["centre of mass over the feet"]
-    assert "outside their polygon, at (" in found.message
-    assert "'contact_points' under 'feet' [m]" in found.remedy
+def with_foot_larger(own, feet):
+    next(iter(feet.values()))["radius_m"] = 0.03
+    edited(own / "robot.yaml", feet=feet)
 
 
-def edit_urdf(own, edit):
-    """Changes the element tree of the spider's URDF."""
-    urdf = own / "spider.urdf"
-    root = ElementTree.parse(urdf).getroot()
-    edit(root)
-    urdf.write_text(ElementTree.tostring(root, encoding="unicode"))
+def with_feet_on_a_line(own, feet):
+    edited(own / "robot.yaml", feet={name: feet[name] for name in list(feet)[::3]})
 
 
-def bare_base(own):
-    def edit(root):
-        body = root.find("link[@name='body']")
-        body.remove(body.find("collision"))
-
-    edit_urdf(own, edit)
-
-
-def unlimited_motor(own):
+def with_motor_unlimited(own, feet):
     motor = (
         "<transmission><type>transmission_interface/SimpleTransmission</type>"
         '<joint name="knee_2"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>'
         '<actuator name="knee_2"/></transmission>'
     )
-
-    def edit(root):
-        root.find("joint[@name='knee_2']/limit").attrib.pop("effort")
-        root.append(ElementTree.fromstring(motor))
-
-    edit_urdf(own, edit)
+    root = ElementTree.parse(own / "spider.urdf").getroot()
+    root.find("joint[@name='knee_2']/limit").attrib.pop("effort")
+    root.append(ElementTree.fromstring(motor))
+    (own / "spider.urdf").write_text(ElementTree.tostring(root, encoding="unicode"))
     limits = yaml.safe_load((own / "robot.yaml").read_text())["effort_limits"]
-    del limits["knee_2"]
-    edited(own / "robot.yaml", effort_limits=limits)
+    edited(own / "robot.yaml", effort_limits={k: v for k, v in limits.items() if k != "knee_2"})
 
 
-def larger_foot(own):
-    feet = yaml.safe_load((own / "robot.yaml").read_text())["feet"]
-    next(iter(feet.values()))["radius_m"] = 0.03
-    edited(own / "robot.yaml", feet=feet)
-
-
-def higher_safe_set(own):
-    parameters = yaml.safe_load((own / "balancing.yaml").read_text())["parameters"]
-    parameters["safe_set"] = {"height_m": [0.8, 0.9]}
-    edited(own / "balancing.yaml", parameters=parameters)
+POLYGON = "outside their polygon, at ("
 
 
 @pytest.mark.parametrize(
-    ("spoil", "item", "message"),
+    ("spoil", "item", "message", "remedy"),
     [
-        (bare_base, "shape of the base", "base 'body' has no collision geometry"),
-        (unlimited_motor, "effort limits", r"\['knee_2'\] have none"),
-        (larger_foot, "contact spheres", "the model file has no such sphere"),
-        (higher_safe_set, "safe while it stands", r"violates \['height'"),
+        (with_foot_larger, "contact spheres", "the model file has no such sphere", ""),
+        (with_feet_on_a_line, "centre of mass over the feet", POLYGON, "'contact_points' under"),
+        (with_motor_unlimited, "effort limits", "['knee_2'] have none", ""),
     ],
 )
-def test_what_else_is_wrong_is_found_before_any_episode(own, spoil, item, message):
-    spoil(own)
-    assert re.search(message, problems(own / "balancing.yaml")[item].message)
+def test_what_else_is_wrong_is_found_before_any_episode(own, spoil, item, message, remedy):
+    spoil(own, yaml.safe_load((own / "robot.yaml").read_text())["feet"])
+    assert_told(problems(own / "balancing.yaml")[item], message, remedy)
+
+
+CALM = {
+    "base_offset_m": [0.0, 0.0],
+    "velocity_std_m_s": [0.01, 0.01, 0.01],
+    "target_offset_m": [0.0, 0.0],
+    "tilt_rad": 0.0,
+    "angular_velocity_std_rad_s": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "num_episodes", "item", "message", "remedy"),
+    [
+        ({"safe_set": {"height_m": [0.8, 0.9]}}, 0, "safe while it stands", "violates ['hei", ""),
+        (
+            {"start": CALM, "push": {"share": 0.0}},
+            2,
+            "share of unsafe episodes",
+            "0 % of 2 episodes",
+            "widen the ranges of starts and plans in the scenario",
+        ),
+    ],
+)
+def test_a_scenario_without_safety_or_without_danger_is_found(
+    own, change, num_episodes, item, message, remedy
+):
+    file = own / "balancing.yaml"
+    edited(file, parameters=yaml.safe_load(file.read_text())["parameters"] | change)
+    found = problems(file, num_episodes)[item]
+    assert_told(found, message, remedy)
+    if num_episodes:
+        assert "expected 10 to 90 %" in found.message
+        assert "'start' is {'foot_offset_m': " in found.remedy
 
 
 def urdf_of_spider(folder, change):
@@ -231,11 +215,8 @@ def test_a_urdf_without_effort_limits_gets_estimates_to_be_asked_for(tmp_path):
 def test_a_base_whose_shape_is_a_flat_mesh_collides_as_its_box(tmp_path):
     pytest.importorskip("trimesh")
     stl(tmp_path / "trunk.stl", [[-0.2, -0.2, -0.04], [0.2, 0.2, 0.04], [0.2, -0.2, 0.04]])
-    sphere = '<geometry><sphere radius="0.05"/></geometry>'
-    urdf = urdf_of_spider(
-        tmp_path,
-        lambda text: text.replace(sphere, '<geometry><mesh filename="trunk.stl"/></geometry>', 1),
-    )
+    sphere, trunk = '<sphere radius="0.05"/>', '<mesh filename="trunk.stl"/>'
+    urdf = urdf_of_spider(tmp_path, lambda text: text.replace(sphere, trunk, 1))
     written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
     box = ElementTree.parse(written.files[0]).find("link[@name='body']/collision/geometry/box")
     assert box.get("size") == "0.4 0.4 0.08"
@@ -246,16 +227,10 @@ def test_a_base_whose_shape_is_a_flat_mesh_collides_as_its_box(tmp_path):
 @pytest.fixture
 def bare(tmp_path):
     """A URDF two of whose links collide by meshes that do not exist."""
-    shape = '<collision><geometry><mesh filename="femur.stl"/></geometry></collision></link>'
-
-    def changed(text):
-        for name in ("femur_0", "femur_1"):
-            head, found, tail = text.partition(f'<link name="{name}">')
-            assert found
-            text = head + found + tail.replace("</link>", shape, 1)
-        return text
-
-    return urdf_of_spider(tmp_path, changed)
+    shape = mesh("collision", "femur.stl")
+    return urdf_of_spider(
+        tmp_path, lambda text: with_shape(with_shape(text, "femur_0", shape), "femur_1", shape)
+    )
 
 
 def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
@@ -266,10 +241,8 @@ def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
     assert result.exit_code == 0
     assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
     assert "everything passes through femur_0, femur_1. Add boxes" in result.output
-    assert yaml.safe_load((out / "robot.yaml").read_text())["without_collision"] == [
-        "femur_0",
-        "femur_1",
-    ]
+    stated = yaml.safe_load((out / "robot.yaml").read_text())
+    assert stated["without_collision"] == ["femur_0", "femur_1"]
 
 
 def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path):
@@ -280,9 +253,8 @@ def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path
     assert "warning  collision shapes: 2 links have none" in result.output
     assert "fix: add a <collision> with a box, sphere or capsule [m]" in result.output
     urdf = written.files[0]
-    box = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision></link>'
-    head, found, tail = urdf.read_text().partition('<link name="femur_0"')
-    urdf.write_text(head + found + tail.replace("</link>", box, 1))
+    box = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
+    urdf.write_text(with_shape(urdf.read_text(), "femur_0", box))
     (finding,) = (f for f in check_scenario(file, num_episodes=0) if f.item == "collision shapes")
     assert finding.is_warning and finding.message.endswith("passes through femur_1")
     edited(written.folder / "robot.yaml", without_collision=["femur_0"])
@@ -302,13 +274,8 @@ def test_a_check_says_how_far_it_is(spider):
     file, told = spider.folder / "balancing.yaml", []
     for _ in check_scenario(file, num_episodes=2, progress=lambda *count: told.append(count)):
         pass
-    assert told == [
-        ("stands for 1 s", 0, 1),
-        ("stands for 1 s", 1, 1),
-        ("episodes", 0, 2),
-        ("episodes", 1, 2),
-        ("episodes", 2, 2),
-    ]
+    stands, episodes = [("stands for 1 s", i, 1) for i in (0, 1)], range(3)
+    assert told == [*stands, *(("episodes", i, 2) for i in episodes)]
 
 
 def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
@@ -317,12 +284,14 @@ def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
     )
     written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
     assert any("shape of the base 'body', in spider.urdf" in what for what in written.asked)
-    assert list(problems(written.folder / "balancing.yaml")) == ["shape of the base"]
+    ((item, found),) = problems(written.folder / "balancing.yaml").items()
+    assert item == "shape of the base"
+    assert "base 'body' has no collision geometry" in found.message
 
 
 def test_new_says_which_visuals_it_left_out(tmp_path):
-    visual = '<visual><geometry><mesh filename="gone.stl"/></geometry></visual></link>'
-    urdf = urdf_of_spider(tmp_path, lambda text: text.replace("</link>", visual, 1))
+    gone = mesh("visual", "gone.stl")
+    urdf = urdf_of_spider(tmp_path, lambda text: with_shape(text, "body", gone))
     out = tmp_path / "spider"
     result = CliRunner().invoke(
         make_app(), ["new", "spider", "--urdf", str(urdf), "--out", str(out)]
@@ -330,24 +299,6 @@ def test_new_says_which_visuals_it_left_out(tmp_path):
     assert result.exit_code == 0
     assert "not where the URDF says are left out: gone.stl" in result.output
     assert "left out: gone.stl" in (out / "README.md").read_text()
-
-
-def test_starts_without_danger_are_told_to_be_widened(own):
-    scenario = yaml.safe_load((own / "balancing.yaml").read_text())
-    calm = {
-        "base_offset_m": [0.0, 0.0],
-        "velocity_std_m_s": [0.01, 0.01, 0.01],
-        "target_offset_m": [0.0, 0.0],
-        "tilt_rad": 0.0,
-        "angular_velocity_std_rad_s": 0.0,
-    }
-    scenario["parameters"] |= {"start": calm, "push": {"share": 0.0}}
-    edited(own / "balancing.yaml", **scenario)
-    found = problems(own / "balancing.yaml", num_episodes=2)["share of unsafe episodes"]
-    assert found.message.startswith("0 % of 2 episodes")
-    assert "expected 10 to 90 %" in found.message
-    assert "widen the ranges of starts and plans in the scenario" in found.remedy
-    assert "'start' is {'foot_offset_m': " in found.remedy
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,7 @@ class Bench:
     def __init__(self, name="laikago", **options):
         kinematics = robot_kinematics(name)
         n_v = kinematics.num_velocities
-        q = np.concatenate(
-            [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, kinematics.standing_height], kinematics.posture]
-        )
+        q = kinematics.standing_positions()
         builder = DiagramBuilder()
         source = builder.AddSystem(ConstantVectorSource(np.concatenate([q, np.zeros(n_v)])))
         self.observers = Observers(builder, kinematics, source.get_output_port(), 0.01, **options)
@@ -30,10 +28,16 @@ class Bench:
 
     def states(self, seed):
         """What the exact and the noisy observer see once the noise has a seed."""
+        return self.seen(self.seeded(seed))
+
+    def seeded(self, seed):
         context = self.diagram.CreateDefaultContext()
         self.observers.reseed(context, np.random.default_rng(seed))
+        return context
+
+    def seen(self, context):
         return [
-            observer.GetOutputPort("state").Eval(observer.GetMyContextFromRoot(context))
+            observer.GetOutputPort("state").Eval(observer.GetMyContextFromRoot(context)).copy()
             for observer in (self.exact, self.noisy)
         ]
 
@@ -59,18 +63,13 @@ def test_noise_follows_from_the_generator_alone(bench):
 
 
 def test_silence_lasts_until_the_next_draw(bench):
-    context = bench.diagram.CreateDefaultContext()
-    bench.observers.reseed(context, np.random.default_rng(0))
+    context = bench.seeded(0)
     bench.observers.silence(context)
-    exact, noisy = (
-        observer.GetOutputPort("state").Eval(observer.GetMyContextFromRoot(context))
-        for observer in (bench.exact, bench.noisy)
-    )
+    exact, noisy = bench.seen(context)
     np.testing.assert_array_equal(noisy, exact)
     simulator = Simulator(bench.diagram, context)
     simulator.AdvanceTo(0.02)
-    later = bench.noisy.GetOutputPort("state").Eval(bench.noisy.GetMyContextFromRoot(context))
-    assert not np.array_equal(later, exact)
+    assert not np.array_equal(bench.seen(context)[1], exact)
 
 
 def test_independent_noise_adds_in_squares():
@@ -86,14 +85,11 @@ def test_options_are_those_of_every_observer():
 
 
 def test_noise_is_new_every_period_and_held_in_between(bench):
-    simulator = Simulator(bench.diagram)
-    context = simulator.get_mutable_context()
-    bench.observers.reseed(context, np.random.default_rng(0))
-    simulator.Initialize()
-    port, of = bench.noisy.GetOutputPort("state"), bench.noisy.GetMyContextFromRoot(context)
+    context = bench.seeded(0)
+    simulator = Simulator(bench.diagram, context)
     seen = []
     for time in (0.001, 0.009, 0.011):
         simulator.AdvanceTo(time)
-        seen.append(port.Eval(of).copy())
+        seen.append(bench.seen(context)[1])
     np.testing.assert_array_equal(seen[0], seen[1])
     assert not np.array_equal(seen[1], seen[2])

@@ -20,19 +20,16 @@ from drake_safety.plants.physics import add_ground
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import HAND_RADIUS_M, robot_kinematics, robot_model, write_porter
+from urdf_files import GOOD, LINK, written
 
 SIZE = np.array([0.3, 0.8, 0.1])
 FAR_M = 9.0  # A range that nothing here is beyond.
-INERTIA = (
-    '<inertial><mass value="1"/>'
-    '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
 
 
 def link(name, *, is_solid=True):
     box = f'<geometry><box size="{SIZE[0]} {SIZE[1]} {SIZE[2]}"/></geometry>'
     shape = f"<collision>{box}</collision>" if is_solid else f"<visual>{box}</visual>"
-    return f'<link name="{name}">{INERTIA}{shape}</link>'
+    return LINK.format(name, GOOD, shape)
 
 
 def joint(kind, parent, child):
@@ -43,10 +40,8 @@ def joint(kind, parent, child):
     )
 
 
-def model(folder, *parts, name="block"):
-    path = folder / f"{name}.urdf"
-    path.write_text(f'<robot name="{name}">{"".join(parts)}</robot>')
-    return str(path)
+def model(folder, *parts):
+    return str(written(folder, *parts, name="block.urdf"))
 
 
 def block(folder, position, yaw_rad=0.0):
@@ -147,19 +142,15 @@ def test_no_answer_depends_on_the_one_before(tmp_path):
     assert clearance.of_arms(one) == before[0]
 
 
-@pytest.mark.parametrize("range_m", [0.0, -0.1, np.nan, np.inf])
-def test_a_range_that_is_none_is_refused(range_m):
+@pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
+def test_a_range_that_is_none_is_refused_and_positions_that_are_not_finite(value):
     with pytest.raises(ValueError, match="clearance: range_m must be finite and positive; got"):
-        Clearance(robot_model("porter"), [], range_m=range_m)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_positions_that_are_not_finite_are_refused(value):
-    clearance = Clearance(robot_model("porter"), [], range_m=0.1)
-    q = postures(1)[0]
-    q[9] = value
-    with pytest.raises(ValueError, match="clearance: positions must be finite; got"):
-        clearance.of_arms(q)
+        Clearance(robot_model("porter"), [], range_m=value)
+    if not np.isfinite(value):
+        q = postures(1)[0]
+        q[9] = value
+        with pytest.raises(ValueError, match="clearance: positions must be finite; got"):
+            Clearance(robot_model("porter"), [], range_m=0.1).of_arms(q)
 
 
 def test_arms_that_nothing_can_touch_are_refused_where_there_is_something_to_touch(tmp_path):
@@ -200,29 +191,24 @@ def test_of_all_contacts_those_of_arms_with_obstacles_and_the_rest_with_ground_a
     boxes = collision_geometries(plant, instances)
     ground = plant.GetCollisionGeometriesForBody(plant.world_body())
     assert len(boxes) == 2 and arms < robots
-    expected = {
-        frozenset(pair)
-        for pair in [*itertools.product(arms, boxes), *itertools.product(robots - arms, ground)]
-    }
+    if name == "porter":
+        inspector = scene_graph.model_inspector()
+        frames = sorted(inspector.GetName(inspector.GetFrameId(one)) for one in arms)
+        assert frames == ["porter::left_palm", "porter::right_palm"]
+    pairs = [*itertools.product(arms, boxes), *itertools.product(robots - arms, ground)]
+    expected = {frozenset(pair) for pair in pairs}
     found = {frozenset(pair) for pair in scene_graph.model_inspector().GetCollisionCandidates()}
     assert found == expected
 
 
-def test_arms_are_what_the_joints_of_a_hand_move():
-    robot = robot_model("porter")
-    plant, scene_graph, _ = scene(robot, [])
-    inspector = scene_graph.model_inspector()
-    names = [inspector.GetName(inspector.GetFrameId(g)) for g in arm_geometries(plant, robot)]
-    assert sorted(names) == ["porter::left_palm", "porter::right_palm"]
-
-
-def test_obstacles_stand_still_where_they_are_told_to(tmp_path):
+# Whatever link the file names first, the one that nothing holds is put in place.
+@pytest.mark.parametrize("names", [("post", "board"), ("board", "post")])
+def test_obstacles_stand_still_where_they_are_told_to(tmp_path, names):
     plant = MultibodyPlant(0.001)
-    path = model(tmp_path, link("post"), joint("fixed", "post", "board"), link("board"))
-    obstacles = [
-        Obstacle(model=path, position=[1.0, 2.0, 3.0], yaw_rad=0.5),
-        Obstacle(model=path, position=[-1.0, 0.0, 0.0]),
-    ]
+    first, second = map(link, names)
+    path = model(tmp_path, first, joint("fixed", "post", "board"), second)
+    obstacles = [Obstacle(model=path, position=[1.0, 2.0, 3.0], yaw_rad=0.5)]
+    obstacles.append(Obstacle(model=path, position=[-1.0, 0.0, 0.0]))
     instances = add_obstacles(plant, obstacles)
     plant.Finalize()
     assert plant.num_velocities() == 0
@@ -233,29 +219,16 @@ def test_obstacles_stand_still_where_they_are_told_to(tmp_path):
         assert X_WO.IsNearlyEqualTo(RigidTransform(turn, obstacle.position), 1e-12)
 
 
-def test_it_is_the_link_that_nothing_holds_which_is_put_in_place(tmp_path):
-    """Whatever link the file names first."""
-    plant = MultibodyPlant(0.001)
-    path = model(tmp_path, link("board"), joint("fixed", "post", "board"), link("post"))
-    (instance,) = add_obstacles(plant, [Obstacle(model=path, position=[1.0, 0.0, 0.0])])
-    plant.Finalize()
-    assert plant.num_velocities() == 0
-    X_WO = plant.GetBodyByName("post", instance).EvalPoseInWorld(plant.CreateDefaultContext())
-    np.testing.assert_array_equal(X_WO.translation(), [1.0, 0.0, 0.0])
+HELD = ['<link name="world"/>', joint("fixed", "world", "a"), link("a")]
+MOVING = [link("frame"), joint("revolute", "frame", "door"), link("door")]
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
         ([link("a"), link("b")], r"of the links \['a', 'b'\] these are \['a', 'b'\]"),
-        (
-            ['<link name="world"/>', joint("fixed", "world", "a"), link("a")],
-            r"of the links \['a'\] these are \[\]",
-        ),
-        (
-            [link("frame"), joint("revolute", "frame", "door"), link("door")],
-            r"obstacles do not move; the model has the joints \['door_joint'\]",
-        ),
+        (HELD, r"of the links \['a'\] these are \[\]"),
+        (MOVING, r"obstacles do not move; the model has the joints \['door_joint'\]"),
         (["<link>"], "obstacle '.*block.urdf'"),
     ],
     ids=["two", "held", "moving", "broken"],

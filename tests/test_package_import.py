@@ -36,10 +36,8 @@ def test_a_checkout_needs_no_installation():
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == [
-        str(ROOT / "models/__init__.py"),
-        str(ROOT / "diagrams/pendulum.py"),
-    ]
+    modules = ("models/__init__.py", "diagrams/pendulum.py")
+    assert done.stdout.split() == [str(ROOT / name) for name in modules]
 
 
 def test_drakes_log_is_not_filtered_and_a_loop_gives_no_cause_to():

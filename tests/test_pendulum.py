@@ -1,5 +1,3 @@
-"""Pendulum: physics worked by hand, the motor's limit, and a true safe set that Γ learns."""
-
 import math
 from dataclasses import replace
 
@@ -76,22 +74,6 @@ def test_an_episode_goes_on_as_its_start_says(loop):
         np.testing.assert_allclose(port.Eval(other), port.Eval(context), atol=1e-12)
 
 
-def test_features_are_worked_by_hand(loop):
-    context = loop.CreateDefaultContext()
-    loop.reset_to(context, None, start(loop, 0.1, 0.5, goal=0.2))
-    values = dict(
-        zip(loop.feature_names, loop.GetOutputPort("features").Eval(context), strict=True)
-    )
-    hold = math.asin(0.35)
-    capture = 0.1 + 0.5 * math.sqrt(0.5 / 9.81)
-    assert values["now_margin_front"] == pytest.approx(0.5)
-    assert values["now_margin_back"] == pytest.approx(0.7)
-    assert values["capture_reserve_front"] == pytest.approx(hold - capture)
-    assert values["goal_reserve_back"] == pytest.approx(hold + 0.2)
-    assert values["plan_reserve_front"] == pytest.approx(hold - 0.2)
-    assert values["tracking_error"] == pytest.approx(-0.1)
-
-
 def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     context = loop.CreateDefaultContext()
     plan = loop.plan(-0.24, 0.24, 1.0)
@@ -115,29 +97,23 @@ def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     assert values["plan_effort_reserve_back"] == pytest.approx(0.35 - effort.max(), abs=0.01)
 
 
-def test_a_variation_that_asks_for_what_a_pendulum_has_not_is_refused():
-    text = (
-        "task: drake_safety.diagrams.pendulum:Pendulum\n"
-        "variations: {nominal: {foot_friction: 0.3}}\n"
-    )
-    scenario = parse_scenario(text, name="slippery", folder=None)
-    with pytest.raises(ValueError, match="'nominal' sets foot_friction; entries of this plant are"):
-        scenario.make_loop()
-
-
 @pytest.mark.parametrize(
-    ("parameters", "message"),
+    ("line", "message"),
     [
-        ("{effort_share: 1.2}", "effort_share must be below 1"),
-        ("{mass_kg: 0}", "mass_kg must be finite and positive"),
-        ("{plan_duration_s: [2, 1]}", r"plan_duration_s must be \[shortest, longest\]"),
-        ("{start_angle_rad: 0.9}", "must not exceed largest_angle_rad 0.6"),
+        ("parameters: {effort_share: 1.2}", "effort_share must be below 1"),
+        ("parameters: {mass_kg: 0}", "mass_kg must be finite and positive"),
+        ("parameters: {plan_duration_s: [2, 1]}", r"plan_duration_s must be \[shortest, longest\]"),
+        ("parameters: {start_angle_rad: 0.9}", "must not exceed largest_angle_rad 0.6"),
+        (
+            "variations: {nominal: {foot_friction: 0.3}}",
+            "'nominal' sets foot_friction; entries of this plant are",
+        ),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(parameters, message):
-    text = f"task: drake_safety.diagrams.pendulum:Pendulum\nparameters: {parameters}\n"
+def test_what_a_pendulum_cannot_have_is_refused(line, message):
+    text = f"task: drake_safety.diagrams.pendulum:Pendulum\n{line}\n"
     with pytest.raises(ValueError, match=message):
-        parse_scenario(text, name="odd", folder=None)
+        parse_scenario(text, name="odd", folder=None).make_loop()
 
 
 @pytest.mark.train

@@ -1,5 +1,3 @@
-"""The pendulum's systems on their own: ports, values worked by hand, the motor's limit."""
-
 import math
 
 import numpy as np
@@ -18,24 +16,11 @@ LENGTH_M = 0.5
 PERIOD_S = 0.01
 
 
-def port_sizes(system):
-    inputs = [system.get_input_port(i) for i in range(system.num_input_ports())]
-    outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
-    return {port.get_name(): port.size() for port in (*inputs, *outputs)}
-
-
 def observed(angle_from_hanging, rate):
     observer = PendulumObserver(LENGTH_M)
     context = observer.CreateDefaultContext()
     observer.get_input_port().FixValue(context, [angle_from_hanging, rate])
     return [observer.GetOutputPort(name).Eval(context) for name in ("plant_state", "output")]
-
-
-def test_the_observer_passes_its_input_on_at_once():
-    observer = PendulumObserver(LENGTH_M)
-    assert port_sizes(observer) == {"pendulum_state": 2, "plant_state": 2, "output": 3}
-    assert observer.HasDirectFeedthrough(0, 0)
-    assert observer.HasDirectFeedthrough(0, 1)
 
 
 def test_the_observer_counts_from_upright_and_places_the_bob():
@@ -59,46 +44,22 @@ def torque_of(parameters, state, angle=0.0, rate=0.0):
     for name, value in ports.items():
         controller.GetInputPort(name).FixValue(context, value)
     simulator.AdvanceTo(0.1 * PERIOD_S)
-    return simulator, controller
-
-
-def held_torque(*arguments, **options):
-    simulator, controller = torque_of(*arguments, **options)
-    return controller.get_output_port().Eval(simulator.get_context())[0]
-
-
-def test_the_controllers_torque_is_held_and_so_nothing_feeds_through():
-    controller = PendulumController(PendulumParameters(), PERIOD_S)
-    sizes = {"plant_state": 2, "desired_output": 3, "desired_output_rate": 3, "torque": 1}
-    assert port_sizes(controller) == sizes
-    assert not controller.HasAnyDirectFeedthrough()
+    return controller.get_output_port().Eval(context)[0]
 
 
 def test_the_torque_is_that_of_both_errors_less_the_weights():
     parameters = PendulumParameters(effort_share=0.999)
     # 20 (0.1 - 0.05) + 3 (0.4 - 0.2) - 1 * 9.81 * 0.5 sin(0.05) [N·m].
     expected = 20.0 * 0.05 + 3.0 * 0.2 - 4.905 * math.sin(0.05)
-    assert held_torque(parameters, [0.05, 0.2], 0.1, 0.4) == pytest.approx(expected, abs=1e-12)
-    assert held_torque(parameters, [0.0, 0.0]) == 0.0
+    assert torque_of(parameters, [0.05, 0.2], 0.1, 0.4) == pytest.approx(expected, abs=1e-12)
+    assert torque_of(parameters, [0.0, 0.0]) == 0.0
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_torque_stays_within_the_motors_limit(side):
     parameters = PendulumParameters(effort_share=0.35)
     limit = 0.35 * 9.81 * 0.5
-    assert held_torque(parameters, [0.0, 0.0], side * 0.3) == pytest.approx(side * limit)
-
-
-def test_the_torque_changes_at_its_period_and_not_between():
-    parameters = PendulumParameters()
-    simulator, controller = torque_of(parameters, [0.0, 0.0], 0.05)
-    context, port = simulator.get_mutable_context(), controller.get_output_port()
-    first = port.Eval(context)[0]
-    controller.GetInputPort("plant_state").FixValue(context, [0.02, 0.0])
-    simulator.AdvanceTo(0.9 * PERIOD_S)
-    assert port.Eval(context)[0] == first == pytest.approx(1.0)
-    simulator.AdvanceTo(1.1 * PERIOD_S)
-    assert port.Eval(context)[0] == pytest.approx(20 * 0.03 - 4.905 * math.sin(0.02))
+    assert torque_of(parameters, [0.0, 0.0], side * 0.3) == pytest.approx(side * limit)
 
 
 def test_margins_are_the_angles_left_to_either_side():

@@ -1,33 +1,10 @@
-"""PolicyController: holds its set points, remembers its phase, and survives what is not finite."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.control.policy import GaitClock, ObservationTerm, Policy, PolicyParameters
-from drake_safety.control.policy_network import PolicyNetwork
-from drake_safety.robots.robot_model import JointGains
-from drake_safety.systems.policy_controller import ACTING, HELD, PolicyController
-
-
-class Kinematics:
-    num_positions, num_velocities, num_joints = 9, 8, 2
-
-
-def controller(monkeypatch, evaluate=lambda batch: batch[:, :2] + 1.0):
-    network = PolicyNetwork(None, evaluate, (9, 2))
-    monkeypatch.setattr("drake_safety.control.policy.load_network", lambda path: network)
-    terms = ["velocity_commands", "last_action", "sin_phase", "cos_phase"]
-    parameters = PolicyParameters(
-        network="net.onnx",
-        joints=["b", "a"],
-        default_positions={".*": 0.0},
-        action_scale={".*": 0.5},
-        gains={".*": JointGains(stiffness=1.0)},
-        observation=[ObservationTerm(name=name) for name in terms],
-        gait=GaitClock(period_s=0.2),
-    )
-    return PolicyController(Kinematics(), Policy(parameters, ["a", "b"]))
+from drake_safety.systems.policy_controller import ACTING, HELD
+from gliding_task import evaluated
+from system_doubles import controller
 
 
 def started(system, command=(0.2, 0.4, 0.0), state=None):
@@ -39,29 +16,21 @@ def started(system, command=(0.2, 0.4, 0.0), state=None):
     return simulator, context
 
 
-def output(system, context, name):
-    return system.GetOutputPort(name).Eval(context)
-
-
-def test_a_set_point_is_that_of_the_action_until_the_next_period(monkeypatch):
-    system = controller(monkeypatch)
+def test_a_set_point_is_that_of_the_action_until_the_next_period():
+    system = controller()
     simulator, context = started(system)
     simulator.AdvanceTo(0.01)
     # Actions 1.2 and 1.4, half a radian each, of the joints b and a.
     expected = np.float32([0.7, 0.6, 0, 0])
-    np.testing.assert_allclose(output(system, context, "desired_joint_state"), expected)
+    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
     simulator.AdvanceTo(0.0199)
-    np.testing.assert_allclose(output(system, context, "desired_joint_state"), expected)
-    assert output(system, context, "status")[0] == ACTING
-    assert len(output(system, context, "action_state")) == len(system.action_names) == 10
+    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
+    assert evaluated(system, context, "status")[0] == ACTING
+    assert len(evaluated(system, context, "action_state")) == len(system.action_names) == 10
 
 
-def test_the_outputs_are_states_without_feedthrough(monkeypatch):
-    assert not controller(monkeypatch).HasAnyDirectFeedthrough()
-
-
-def test_a_cloned_context_goes_on_from_its_phase(monkeypatch):
-    system = controller(monkeypatch)
+def test_a_cloned_context_goes_on_from_its_phase():
+    system = controller()
     simulator, context = started(system)
     simulator.AdvanceTo(0.05)
     other = Simulator(system, context.Clone())
@@ -69,26 +38,26 @@ def test_a_cloned_context_goes_on_from_its_phase(monkeypatch):
         one.AdvanceTo(0.13)
     for name in ("desired_joint_state", "action_state"):
         np.testing.assert_array_equal(
-            output(system, context, name), output(system, other.get_context(), name)
+            evaluated(system, context, name), evaluated(system, other.get_context(), name)
         )
     _, fresh_context = started(system)
     system.set_state(fresh_context, system.state_of(context))
     np.testing.assert_array_equal(
-        output(system, fresh_context, "action_state"), output(system, context, "action_state")
+        evaluated(system, fresh_context, "action_state"), evaluated(system, context, "action_state")
     )
 
 
 @pytest.mark.parametrize("what", ["command", "state", "action"])
-def test_what_is_not_finite_leaves_the_last_action_and_a_status(monkeypatch, what):
+def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     broken = []
 
     def evaluate(batch):
         return batch[:, :2] * np.nan if broken else batch[:, :2] + 1.0
 
-    system = controller(monkeypatch, evaluate)
+    system = controller(evaluate)
     simulator, context = started(system)
     simulator.AdvanceTo(0.01)
-    good = output(system, context, "desired_joint_state").copy()
+    good = evaluated(system, context, "desired_joint_state").copy()
     if what == "command":
         system.GetInputPort("command").FixValue(context, [np.inf, 0, 0])
     elif what == "state":
@@ -96,5 +65,5 @@ def test_what_is_not_finite_leaves_the_last_action_and_a_status(monkeypatch, wha
     else:
         broken.append(True)
     simulator.AdvanceTo(0.05)
-    np.testing.assert_array_equal(output(system, context, "desired_joint_state"), good)
-    assert output(system, context, "status")[0] == HELD
+    np.testing.assert_array_equal(evaluated(system, context, "desired_joint_state"), good)
+    assert evaluated(system, context, "status")[0] == HELD

@@ -1,5 +1,3 @@
-"""Progress: lines where there is no terminal, and True in place of a callback."""
-
 import io
 import time
 
@@ -29,28 +27,21 @@ def test_without_a_terminal_lines_come_while_a_stage_is_silent():
     assert lines_of(file)[-1].startswith("throws: 10/40 0:00:00 left 0:00:0")
 
 
-def test_the_end_of_a_stage_is_a_line_and_so_is_silence_after_it():
-    file = io.StringIO()
-    with open_stages(Console(file=file, width=200), period_s=0.05) as stages:
-        stages("throws", 40, 40)
-        assert lines_of(file) == ["throws: 40/40 0:00:00 left 0:00:00"]
+@pytest.mark.parametrize(
+    ("done", "is_coloured", "lines"),
+    [
+        (40, False, ["throws: 40/40 0:00:00 left 0:00:00", "still working, after 'throws'"]),
+        (40, True, ["throws: 40/40 0:00:00 left 0:00:00", "still working, after 'throws'"]),
+        (30, False, ["throws: 30/40 0:00:00 left -:--:--"]),  # Done by an earlier run.
+    ],
+)
+def test_the_end_of_a_stage_is_a_line_and_so_is_silence_after_it(done, is_coloured, lines):
+    console = Console(file=io.StringIO(), width=200, force_terminal=is_coloured or None)
+    with open_stages(console, period_s=0.05) as stages:
+        stages("throws", done, 40)
+        assert lines_of(console.file) == lines[: done // 40]
         time.sleep(0.2)
-    assert lines_of(file)[1] == "still working, after 'throws'"
-
-
-def test_what_an_earlier_run_has_done_is_not_counted_for_the_time_left():
-    file = io.StringIO()
-    with open_stages(Console(file=file, width=200), period_s=0.05) as stages:
-        stages("throws", 30, 40)
-        time.sleep(0.2)
-    assert lines_of(file)[0] == "throws: 30/40 0:00:00 left -:--:--"
-
-
-def test_a_log_file_that_is_told_to_have_colours_gets_lines():
-    file = io.StringIO()
-    with open_stages(Console(file=file, width=200, force_terminal=True)) as stages:
-        stages("throws", 1, 1)
-    assert lines_of(file) == ["throws: 1/1 0:00:00 left 0:00:00"]
+    assert lines_of(console.file)[: len(lines)] == lines
 
 
 def test_on_a_terminal_there_are_bars():

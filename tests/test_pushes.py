@@ -1,31 +1,30 @@
-"""Pushes say where, how hard and when; random ones are as often and as hard as they shall."""
-
 import numpy as np
 import pytest
 
 from drake_safety.plants.pushes import Push, RandomPushes
 
 
-def test_a_push_is_as_strong_as_its_force_is_long():
-    assert Push(force_n=[3.0, 0.0, -4.0]).strength_n == 5.0
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("schema", "change", "message"),
     [
-        ({"force_n": [1.0, 2.0]}, r"force_n must be three numbers \[N\]; got \[1.0, 2.0\]"),
-        ({"force_n": [1.0, 2.0, float("nan")]}, "force_n must be three numbers"),
-        ({"time_s": -0.1}, "time_s must not be negative; got -0.1"),
-        ({"duration_s": 0.0}, "duration_s must be positive; got 0.0"),
+        (Push, {"force_n": [1.0, 2.0]}, r"force_n must be three numbers \[N\]; got \[1.0, 2.0\]"),
+        (Push, {"force_n": [1.0, 2.0, float("nan")]}, "force_n must be three numbers"),
+        (Push, {"time_s": -0.1}, "time_s must not be negative; got -0.1"),
+        (Push, {"duration_s": 0.0}, "duration_s must be positive; got 0.0"),
+        (RandomPushes, {"share": 1.0}, r"share must be in \[0, 1\); got 1.0"),
+        (RandomPushes, {"force_n": [2.0, 1.0]}, r"force_n must be \[lowest, highest\]"),
+        (RandomPushes, {"time_s": [1.0]}, "time_s must be"),
+        (RandomPushes, {"duration_s": 0.0}, "duration_s must be positive; got 0.0"),
     ],
 )
-def test_a_push_that_cannot_be_is_refused(change, message):
+def test_pushes_that_cannot_be_are_refused(schema, change, message):
     with pytest.raises(ValueError, match=message):
-        Push(**change)
+        schema(**change)
 
 
 def test_random_pushes_are_horizontal_and_within_their_bounds_as_often_as_they_shall():
     pushes = RandomPushes(share=0.3, force_n=[50.0, 60.0], time_s=[0.2, 0.4], duration_s=0.1)
+    assert Push(force_n=[3.0, 0.0, -4.0]).strength_n == 5.0
     rng = np.random.default_rng(0)
     drawn = [pushes.sample(rng, "trunk") for _ in range(2000)]
     those = [push for push in drawn if push is not None]
@@ -38,27 +37,6 @@ def test_random_pushes_are_horizontal_and_within_their_bounds_as_often_as_they_s
     assert np.linalg.norm(np.mean(directions, axis=0)) < 0.1
 
 
-def test_random_pushes_push_the_body_they_name():
-    pushes = RandomPushes(share=0.999, body="head")
-    push = pushes.sample(np.random.default_rng(0), "trunk")
-    assert push is not None
-    assert push.body == "head"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"share": 1.0}, r"share must be in \[0, 1\); got 1.0"),
-        ({"force_n": [2.0, 1.0]}, r"force_n must be \[lowest, highest\]"),
-        ({"time_s": [1.0]}, "time_s must be"),
-        ({"duration_s": 0.0}, "duration_s must be positive; got 0.0"),
-    ],
-)
-def test_random_pushes_that_cannot_be_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        RandomPushes(**change)
-
-
 def test_a_push_that_is_drawn_is_the_one_that_an_episode_would_begin_with():
     pushes = RandomPushes(share=0.999)
     episode, drawn = np.random.default_rng(3), np.random.default_rng(3)
@@ -66,3 +44,5 @@ def test_a_push_that_is_drawn_is_the_one_that_an_episode_would_begin_with():
     assert pushes.sample(episode, "trunk") == pushes.draw(drawn, "trunk")
     # Whoever wants a push gets one, however few episodes begin with it.
     assert RandomPushes(share=0.0).draw(np.random.default_rng(3), "trunk").body == "trunk"
+    named = RandomPushes(share=0.999, body="head").sample(np.random.default_rng(0), "trunk")
+    assert named.body == "head"

@@ -1,17 +1,12 @@
-"""Reaching in motion: any robot reaches, sees what its variation says, and is judged by Γ."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.kinematic_preview import chain_joints
-from drake_safety.control.whole_body_qp import solve_qp
-from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.reaching_sampling import PostureSampling
-from drake_safety.systems import whole_body_controller
 from reaching_loops import (
     EASY,
     NOISE,
@@ -29,6 +24,7 @@ from reaching_loops import (
 def test_a_robot_of_ones_own_reaches_from_yaml_alone(hand, side):
     episode = easy_episode(hand=hand)
     assert episode.is_safe
+    assert episode.num_controller_failures == 0
     assert np.linalg.norm(episode.output[-1] - EASY * [1, side, 1]) < 0.02
     error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
     assert error.max() < 0.05
@@ -127,30 +123,18 @@ def test_an_unsolved_program_shows_in_the_solver_status():
     assert evaluated(loop, context, "solver_status")[0] != 0
 
 
-def test_a_push_may_be_given_to_any_body():
-    loop = porter()
-    moved = []
-    for force_n in (0.0, 40.0):
-        context = loop.CreateDefaultContext()
-        loop.reset_standing(context, EASY)
-        body = loop.robot.base
-        loop.set_push(context, Push(body=body, force_n=[0.0, force_n, 0.0], time_s=0.0))
-        Simulator(loop, context).AdvanceTo(0.1)
-        moved.append(positions(loop, context)[5])
-    assert moved[1] - moved[0] > 1e-3
-
-
-def test_a_reset_forgets_the_push_of_an_earlier_run():
+def test_any_body_may_be_pushed_and_a_reset_forgets_it():
     loop = porter()
     context = loop.CreateDefaultContext()
-    alone = []
-    for is_pushed in (True, False):
+    ends = []
+    for is_pushed in (False, True, False):
         loop.reset_standing(context, EASY)
         if is_pushed:
             loop.set_push(context, Push(body=loop.robot.base, force_n=[0.0, 40.0, 0.0], time_s=0.0))
         Simulator(loop, context).AdvanceTo(0.1)
-        alone.append(positions(loop, context)[5])
-    assert alone[0] - alone[1] > 1e-3
+        ends.append(positions(loop, context)[5])
+    assert ends[1] - ends[0] > 1e-3
+    assert ends[2] == ends[0]
 
 
 def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
@@ -162,33 +146,6 @@ def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
     assert not episode.is_safe
     assert episode.cause == "support_polygon"
     assert len(episode.time_s) == 1
-
-
-def fail_later(monkeypatch, error):
-    ticks = []
-
-    def fails_later(qp):
-        ticks.append(qp)
-        if len(ticks) > 30:
-            raise error
-        return solve_qp(qp)
-
-    monkeypatch.setattr(whole_body_controller, "solve_qp", fails_later)
-
-
-def test_a_controller_that_raises_is_an_error_and_no_diverged_simulation(monkeypatch):
-    fail_later(monkeypatch, RuntimeError("no memory"))
-    with pytest.raises(EpisodeError, match=r"episode 0 of .* RuntimeError: no memory"):
-        run_episode(porter(), 0, goal=EASY)
-
-
-def test_an_episode_whose_simulation_fails_keeps_its_rows_and_says_so(monkeypatch):
-    whole = easy_episode()
-    fail_later(monkeypatch, DivergenceError("the numbers ran away"))
-    episode = run_episode(porter(), 0, goal=EASY)
-    assert episode.cause == DIVERGED
-    np.testing.assert_array_equal(episode.state, whole.state[: len(episode.time_s)])
-    assert 0 < episode.time_s[-1] <= 31 * porter().scenario.control_period_s
 
 
 @pytest.fixture(scope="module")
@@ -212,24 +169,10 @@ def test_one_assessment_serves_both_hands(assessment):
     assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-4)
 
 
-@pytest.mark.train
-def test_an_assessment_of_another_scenario_is_refused(assessment):
-    scenario = load_scenario(porter_path())
-    scenario.parameters.safe_set.joint_margin_rad = 0.04
-    with pytest.raises(ValueError, match="assessment and diagram differ in scenario hash"):
-        scenario.make_loop(assessment=assessment)
-    with pytest.raises(
-        ValueError, match=r"differ in scenario: .* with porting, the diagram has at"
-    ):
-        load_scenario("atlas_reaching").make_loop(assessment=assessment)
-
-
-def test_the_hash_follows_what_can_be_touched_and_not_what_is_only_to_be_seen(tmp_path):
+def test_the_hash_follows_what_can_be_touched(tmp_path):
     path = porter_path()
     before = load_scenario(path).simulation_hash()
     scenario = load_scenario(path)
-    scenario.parameters.decorations = []
-    assert scenario.simulation_hash() == before
     scenario.parameters.obstacles[0].position[2] += 0.01
     assert scenario.simulation_hash() != before
     shelf = tmp_path / "shelf.urdf"

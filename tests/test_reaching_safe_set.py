@@ -16,9 +16,8 @@ from drake_safety.plants.obstacles import Clearance, Obstacle
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import edited, robot_kinematics, robot_model, write_porter
 
-SHELF = Obstacle(
-    model="package://drake_safety_models/scenes/bookshelf.urdf", position=[0.9, 0.0, 0.0]
-)
+SHELF_MODEL = "package://drake_safety_models/scenes/bookshelf.urdf"
+SHELF = Obstacle(model=SHELF_MODEL, position=[0.9, 0.0, 0.0])
 RANGE_M = 0.1
 NAMES = ("support_polygon", "collision", "joint_limits", "fall")
 ROBOTS = ("porter", "atlas")
@@ -35,8 +34,9 @@ def margins(of, q):
     return dict(zip(of.names, values, strict=True))
 
 
-def features(of, q, preview):
-    values = of.features(q, np.zeros(of.kinematics.num_velocities), preview)
+def features(of, q, preview, v=None):
+    v = np.zeros(of.kinematics.num_velocities) if v is None else v
+    values = of.features(q, v, preview)
     return dict(zip(of.feature_names, values, strict=True))
 
 
@@ -209,7 +209,7 @@ def test_features_of_motion_are_velocities_and_where_they_lead(name):
     hand = of.model.reaching_position(q)
     preview = in_stance(kinematics, q, straight(hand, hand))
     v = 0.2 * np.random.default_rng(1).normal(size=kinematics.num_velocities)
-    found = dict(zip(of.feature_names, of.features(q, v, preview), strict=True))
+    found = features(of, q, preview, v)
 
     def moved(duration_s):
         kinematics.set_positions(q)
@@ -218,20 +218,18 @@ def test_features_of_motion_are_velocities_and_where_they_lead(name):
     tiny_s = 1e-6
     before, after = moved(-tiny_s), moved(tiny_s)
     R_SW = in_stance(kinematics, q, np.eye(3)) - in_stance(kinematics, q, np.zeros(3))
-    for point, of_body in (
-        ("center_of_mass", kinematics.center_of_mass),
-        ("hand", of.model.reaching_position),
-    ):
+    bodies = {"center_of_mass": kinematics.center_of_mass, "hand": of.model.reaching_position}
+    for point, of_body in bodies.items():
         rate = (of_body(after) - of_body(before)) / (2 * tiny_s) @ R_SW
         seen = [found[f"{point}_velocity_{axis}"] for axis in "xyz"]
         np.testing.assert_allclose(seen, rate, atol=1e-6)
     pendulum_s = np.sqrt(found["center_of_mass_height"] / 9.81)
     for angle, axis, sign in ((0, "x", 1), (90, "y", 1), (180, "x", -1), (270, "y", -1)):
-        lead = (
-            found[f"center_of_mass_margin_{angle}deg"] - found[f"capture_point_margin_{angle}deg"]
+        here, there = (
+            found[f"{of}_margin_{angle}deg"] for of in ("center_of_mass", "capture_point")
         )
         speed = sign * found[f"center_of_mass_velocity_{axis}"]
-        assert lead == pytest.approx(pendulum_s * speed, abs=1e-9)
+        assert here - there == pytest.approx(pendulum_s * speed, abs=1e-9)
     soon = q.copy()
     soon[7:] += 0.1 * v[6:]
     assert found["soon_joint_limits"] == pytest.approx(margins(of, soon)["joint_limits"])
@@ -246,10 +244,8 @@ def test_the_goal_is_seen_from_the_shoulder(name):
     kinematics = of.kinematics
     q = leaning(kinematics, [0.01, -0.02, -0.05])
     kinematics.set_positions(q)
-    shoulder = kinematics.plant.GetJointByName(
-        kinematics.robot.reaching_frame("left").joints[0]
-    ).frame_on_parent()
-    p_WS = shoulder.CalcPoseInWorld(kinematics.context).translation()
+    shoulder = kinematics.plant.GetJointByName(kinematics.robot.reaching_frame("left").joints[0])
+    p_WS = shoulder.frame_on_parent().CalcPoseInWorld(kinematics.context).translation()
     found = features(of, q, in_stance(kinematics, q, straight(of.model.reaching_position(q), p_WS)))
     assert found["goal_distance"] == pytest.approx(0.0, abs=1e-9)
 
@@ -269,7 +265,7 @@ def test_the_stance_reaches_past_the_centre_of_mass_as_far_as_its_edges_are():
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_previewed_margins_are_those_of_the_previewed_bodies(name):
-    """Of a plan that holds still the preview's last body is the one that all its samples near."""
+    # Of a plan that holds still the preview's last body is the one that all its samples near.
     of = safe_set(name, obstacles=[SHELF])
     kinematics = of.kinematics
     q = leaning(kinematics, [0.0, 0.0, -0.05])
@@ -312,13 +308,11 @@ def test_features_do_not_depend_on_where_in_the_world_the_robot_stands(name):
     X_WM = RigidTransform(RotationMatrix.MakeZRotation(1.2), [3.0, -2.0, 0.0])
     X_WB = RigidTransform(RotationMatrix(RollPitchYaw(0.02, 0.0, 0.03)), q[4:7])
     moved = kinematics.positions_at(X_WM @ X_WB, q[7:])
-    np.testing.assert_allclose(
-        of.features(moved, v, preview), of.features(q, v, preview), atol=1e-7
-    )
+    here, there = of.features(q, v, preview), of.features(moved, v, preview)
+    np.testing.assert_allclose(there, here, atol=1e-7)
 
 
-# The torso that Atlas was published with is not quite symmetric: millimetres in its centre of
-# mass.
+# The torso that Atlas was published with is not quite symmetric.
 @pytest.mark.parametrize(("name", "atol"), [("porter", 1e-6), ("atlas", 5e-3)])
 def test_mirrored_features_of_the_mirrored_robot_are_those_of_the_other_hand(name, atol):
     left = safe_set(name, "left", [SHELF])
@@ -376,14 +370,13 @@ def test_a_hand_has_the_size_of_its_own_frame_whatever_else_its_body_carries(tmp
     assert found["fingertip"] - found["left"] == pytest.approx(hands["left"]["radius_m"] - 0.01)
 
 
-def test_a_model_without_a_hand_is_answered_with_the_hands_there_are():
-    clearance = Clearance(robot_model("porter"), [], range_m=RANGE_M)
-    with pytest.raises(ValueError, match=r"'porter': the model must have a hand, one of \['left'"):
-        ReachingSafeSet(WholeBodyModel(robot_kinematics("porter")), clearance, ReachingLimits())
-
-
-def test_a_hand_that_no_joint_carries_is_refused():
-    clearance = Clearance(robot_model("biped"), [], range_m=RANGE_M)
-    model = WholeBodyModel(robot_kinematics("biped"), "head")
-    with pytest.raises(ValueError, match="'biped', reaching frame 'head': joints must be those of"):
-        ReachingSafeSet(model, clearance, ReachingLimits())
+@pytest.mark.parametrize(
+    ("name", "hand", "message"),
+    [
+        ("porter", None, r"'porter': the model must have a hand, one of \['left'"),
+        ("biped", "head", "'biped', reaching frame 'head': joints must be those of"),
+    ],
+)
+def test_a_model_without_a_hand_and_a_hand_that_no_joint_carries_are_refused(name, hand, message):
+    with pytest.raises(ValueError, match=message):
+        safe_set(name, hand)

@@ -1,5 +1,3 @@
-"""Episodes of diagrams of one's own: the same guarantees as for the package's tasks."""
-
 import logging
 import os
 import subprocess
@@ -9,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import quadrotor_file
+from cart_episodes import assert_identical
 from drake_safety import record_episodes
 from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
+from gliding_task import declare_outputs
 
 STEP_S = 0.1
 
@@ -22,25 +22,18 @@ STEP_S = 0.1
 class Glider(LeafSystem):
     """A mass that glides between two walls; beyond x = 0.5 it fails as one likes."""
 
-    def __init__(self, failure, wall_m=1.0):
+    def __init__(self, failure, wall_m):
         super().__init__()
         self.failure = failure
         self.DeclareDiscreteState(2)
         self.DeclarePeriodicDiscreteUpdateEvent(0.01, 0.0, self._update)
-        for name, calc in {
-            "position_and_speed": lambda state: state,
-            "output": lambda state: state[:1],
-            "desired_preview": lambda state: np.zeros(5),
-            "margins": lambda state: wall_m - state[0] * np.array([1.0, -1.0]),
-        }.items():
-            size = {"position_and_speed": 2, "output": 1, "desired_preview": 5, "margins": 2}[name]
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(size),
-                lambda context, output, calc=calc: output.SetFromVector(
-                    calc(context.get_discrete_state_vector().value())
-                ),
-            )
+        ports = {
+            "position_and_speed": (2, lambda x, v: [x, v]),
+            "output": (1, lambda x, v: [x]),
+            "desired_preview": (5, lambda x, v: np.zeros(5)),
+            "margins": (2, lambda x, v: [wall_m - x, wall_m + x]),
+        }
+        declare_outputs(self, ports, lambda context: context.get_discrete_state_vector().value())
 
     def _update(self, context, discrete_state):
         x, v = context.get_discrete_state_vector().value()
@@ -49,9 +42,9 @@ class Glider(LeafSystem):
         discrete_state.set_value([x + 0.01 * v, v])
 
 
-def make_glider(failure=None):
+def make_glider(failure=None, wall_m=1.0):
     builder = DiagramBuilder()
-    glider = builder.AddNamedSystem("glider", Glider(failure))
+    glider = builder.AddNamedSystem("glider", Glider(failure, wall_m))
     for i in range(glider.num_output_ports()):
         builder.ExportOutput(glider.get_output_port(i), glider.get_output_port(i).get_name())
     return builder.Build()
@@ -68,13 +61,6 @@ def record(num_episodes=10, *, make=make_glider, reset=reset_glider, **options):
     return record_episodes(make, num_episodes, reset=reset, ports=ports, **(defaults | options))
 
 
-def assert_identical(episodes, others):
-    for one, other in zip(episodes, others, strict=True):
-        assert (one.index, one.cause) == (other.index, other.cause)
-        for name in ("time_s", "state", "desired_preview", "margins"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
 def test_what_is_left_out_has_its_default():
     episodes = record()
     assert episodes.info.horizon == 5
@@ -88,16 +74,8 @@ def test_what_is_left_out_has_its_default():
         np.testing.assert_array_equal(episode.true_state, episode.state)
         np.testing.assert_array_equal(episode.desired_output, episode.desired_preview[:, :1])
         assert episode.is_safe == (episode.margins.min() >= 0)
-
-
-def test_an_unsafe_episode_ends_within_a_look_of_leaving():
-    for episode in record():
         if not episode.is_safe:
             assert -0.0201 < episode.margins[-1].min() < 0  # A look a hundredth of a second.
-
-
-def test_a_row_belongs_to_its_time():
-    for episode in record():
         x, v = episode.state[0]
         np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=1e-9)
 
@@ -131,11 +109,7 @@ def test_episodes_of_what_has_changed_since_are_refused_and_those_kept_are_count
     wall_m = 1.0
 
     def make():
-        builder = DiagramBuilder()
-        glider = builder.AddNamedSystem("glider", Glider(None, wall_m))
-        for i in range(glider.num_output_ports()):
-            builder.ExportOutput(glider.get_output_port(i), glider.get_output_port(i).get_name())
-        return builder.Build()
+        return make_glider(wall_m=wall_m)
 
     record(4, make=make, path=tmp_path)
     assert not caplog.records
@@ -227,7 +201,7 @@ def test_a_drake_plant_that_diverges_is_no_mistake():
         plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
         plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
         plant.Finalize()
-        glider = builder.AddSystem(Glider(None))
+        glider = builder.AddSystem(Glider(None, 1.0))
         forces = builder.AddSystem(ConstantVectorSource(np.full(6, force)))
         builder.Connect(forces.get_output_port(), plant.get_applied_generalized_force_input_port())
         for name in ("position_and_speed", "output", "desired_preview", "margins"):
@@ -262,7 +236,6 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
 
 @pytest.mark.train
 def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
-    """Its functions, the systems that they make, and what pydrake binds without a module."""
     script = tmp_path / "mine.py"
     script.write_text(
         Path(quadrotor_file.__file__).read_text()

@@ -104,10 +104,8 @@ def test_stated_shapes_and_contact_points_are_all_that_collides(tmp_path):
 def test_what_is_welded_to_a_neighbour_does_not_collide_with_it(tmp_path):
     # The tip is welded to the leg, so Drake alone would let it push the seat.
     plant, scene_graph, _ = built(write(tmp_path))
-    seat, tip = (
-        plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name))[0]
-        for name in ("seat", "tip")
-    )
+    bodies = map(plant.GetBodyByName, ("seat", "tip"))
+    seat, tip = (plant.GetCollisionGeometriesForBody(body)[0] for body in bodies)
     assert scene_graph.model_inspector().CollisionFiltered(seat, tip)
 
 
@@ -117,17 +115,19 @@ def test_a_stated_speed_limit_stands_in_for_the_files(tmp_path):
     assert plant.GetJointByName("hip").velocity_lower_limit() == -7.0
 
 
-def test_shapes_of_no_body_and_shapes_that_are_none_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no body for shapes \\['lid'\\]"):
-        built(write(tmp_path, shapes={"lid": [{"radius_m": 0.1}]}))
-    with pytest.raises(ValueError, match="either box_m or a positive radius_m"):
-        write(tmp_path, shapes={"seat": [{}]})
-    with pytest.raises(ValueError, match="to_m must be a capsule's other end"):
-        write(tmp_path, shapes={"seat": [{"box_m": [1, 1, 1], "to_m": [0, 0, 1]}]})
-    with pytest.raises(ValueError, match="collision must be one of"):
-        write(tmp_path, collision="meshes")
-    with pytest.raises(ValueError, match="need collision: stated"):
-        write(tmp_path, collision="model_file")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shapes": {"lid": [{"radius_m": 0.1}]}}, r"no body for shapes \['lid'\]"),
+        ({"shapes": {"seat": [{}]}}, "either box_m or a positive radius_m"),
+        ({"shapes": {"seat": [{"box_m": [1] * 3, "to_m": [0] * 3}]}}, "a capsule's other end"),
+        ({"collision": "meshes"}, "collision must be one of"),
+        ({"collision": "model_file"}, "need collision: stated"),
+    ],
+)
+def test_shapes_of_no_body_and_shapes_that_are_none_are_refused(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        built(write(tmp_path, **change))
 
 
 def test_a_package_that_an_extra_would_bring_is_asked_for_by_the_extras_name(monkeypatch):

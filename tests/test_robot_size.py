@@ -46,20 +46,14 @@ def test_a_robot_of_the_same_size_changes_nothing():
 def test_fields_are_scaled_by_their_quantities_and_others_left_out():
     quantities = {"reach_m": ["length", "width"], "heights_m": "height", "step": {"lift_m": "one"}}
     factors = {"length": 2.0, "width": 3.0, "height": 0.5, "one": 1.0}
-    assert scaled_defaults(Numbers(), quantities, factors) == {
-        "reach_m": [0.4, 0.3],
-        "heights_m": [0.15, 0.25],
-        "step": {"lift_m": 0.06},
-    }
+    scaled = {"reach_m": [0.4, 0.3], "heights_m": [0.15, 0.25], "step": {"lift_m": 0.06}}
+    assert scaled_defaults(Numbers(), quantities, factors) == scaled
     with pytest.raises(ValueError, match="has no field 'gone'"):
         scaled_defaults(Numbers(), {"gone": "one"}, factors)
 
 
 def test_what_a_file_states_stands():
     below = {"step": {"lift_m": 0.1, "reach_m": 1.0}, "share": 0.5}
-    assert overlaid(below, {"step": {"lift_m": 0.2}, "name": "x"}) == {
-        "step": {"lift_m": 0.2, "reach_m": 1.0},
-        "share": 0.5,
-        "name": "x",
-    }
+    both = {"step": {"lift_m": 0.2, "reach_m": 1.0}, "share": 0.5, "name": "x"}
+    assert overlaid(below, {"step": {"lift_m": 0.2}, "name": "x"}) == both
     assert below["step"]["lift_m"] == 0.1

@@ -19,8 +19,9 @@ OF_THE_EXTRA = [
 BALANCING = [name for name in OF_THE_EXTRA if f"{name}_balancing" in scenario_names()]
 
 
-def heights_standing(name, duration_s):
-    """Heights of the base, twenty a second, and what must not happen while standing."""
+@pytest.mark.parametrize("duration_s", [2.0, pytest.param(10.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", BALANCING)
+def test_it_stands(name, duration_s):
     loop = load_scenario(f"{name}_balancing").make_loop("actual", recovery=False, ball=False)
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
@@ -30,34 +31,17 @@ def heights_standing(name, duration_s):
     loop.reset_to(context, rng, start)
     simulator.Initialize()
     violations = ViolationCounter(loop)
-    heights = []
     for row in range(1, round(20 * duration_s) + 1):
         simulator.AdvanceTo(0.05 * row)
         violations.count(context)
-        heights.append(loop.GetOutputPort("plant_state").Eval(context)[6])
-    return np.array(heights), loop.kinematics.standing_height, violations.counts
-
-
-def check_standing(name, duration_s):
-    heights, standing, violations = heights_standing(name, duration_s)
-    assert np.abs(heights - standing).max() < 0.02
-    assert not any(violations.values()), violations
+        height = loop.GetOutputPort("plant_state").Eval(context)[6]
+        assert abs(height - loop.kinematics.standing_height) < 0.02
+    assert not any(violations.counts.values()), violations.counts
 
 
 def test_six_quadrupeds_besides_the_packages_own_balance_by_data_alone():
     assert len(BALANCING) >= 6
     assert all(len(load_robot(name).feet) == 4 for name in BALANCING)
-
-
-@pytest.mark.parametrize("name", BALANCING)
-def test_it_stands_for_two_seconds(name):
-    check_standing(name, 2.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", BALANCING)
-def test_it_stands_for_ten_seconds(name):
-    check_standing(name, 10.0)
 
 
 @pytest.mark.parametrize("name", BALANCING)
@@ -75,19 +59,13 @@ def test_every_joint_is_driven_and_the_ranges_are_of_its_size(name):
     assert parameters.recovery.step.max_reach_m < height
 
 
-def test_without_the_extra_a_scenario_says_what_to_install(monkeypatch):
+def test_without_the_extra_a_scenario_and_their_list_say_what_to_install(monkeypatch, capsys):
+    from drake_safety.cli.prepare import scenarios
     from drake_safety.robots import model_files
 
     monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):
         load_scenario(f"{BALANCING[0]}_balancing")
-
-
-def test_without_the_extra_the_list_of_scenarios_says_which_need_it(monkeypatch, capsys):
-    from drake_safety.cli.prepare import scenarios
-    from drake_safety.robots import model_files
-
-    monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
     monkeypatch.setenv("COLUMNS", "200")
     scenarios()
     lines = capsys.readouterr().out.splitlines()

@@ -1,5 +1,3 @@
-"""SafetyAssessor: Γ with its monitor and the check of the margins, connected."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -9,10 +7,10 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_safety import (
     AddSafetyAssessor,
     AssessmentParameters,
-    NoveltyMonitor,
     SafetyAssessment,
     SafetyAssessor,
 )
+from gliding_task import evaluated
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
 
@@ -53,45 +51,32 @@ def added(assessment, inputs, **options):
     return assessor, simulator, assessor.GetMyContextFromRoot(simulator.get_context())
 
 
-def value(assessor, context, name):
-    return assessor.GetOutputPort(name).Eval(context)
-
-
 def test_one_call_adds_gamma_the_monitor_and_the_check_of_the_margins(assessment, inputs):
     assessor, simulator, context = added(assessment, inputs)
     simulator.Initialize()
     expected = assessment.predict_one(*(inputs[name] for name in INPUTS[:3]))
-    np.testing.assert_array_equal(value(assessor, context, "belief"), expected.belief)
-    assert value(assessor, context, "alarm") == 0.0
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), expected.belief)
+    assert evaluated(assessor, context, "alarm") == 0.0
     simulator.AdvanceTo(NUM_FROZEN * STEP_S)
     # The inputs do not change at all, as those of a frozen sensor.
-    assert value(assessor, context, "alarm_cause") == "input frozen"
-    np.testing.assert_array_equal(value(assessor, context, "belief"), [0.0, 0.0, 1.0])
+    assert evaluated(assessor, context, "alarm_cause") == "input frozen"
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), [0.0, 0.0, 1.0])
     outside, simulator, context = added(assessment, {**inputs, "margins": -inputs["margins"]})
     simulator.Initialize()
-    assert value(outside, context, "belief")[0] == 0.0
-
-
-def test_its_outputs_are_those_of_its_two_systems(assessment):
-    def names(system):
-        return [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
-
-    assessor = SafetyAssessor(assessment)
-    assert names(assessor) == [*names(assessor.evaluator), *names(NoveltyMonitor(assessment))]
-    assert not assessor.HasAnyDirectFeedthrough()
+    assert evaluated(outside, context, "belief")[0] == 0.0
 
 
 def test_less_is_said_by_an_argument(assessment, inputs):
     assessor, simulator, context = added(assessment, inputs, on_alarm="report")
     simulator.AdvanceTo(NUM_FROZEN * STEP_S)
-    assert value(assessor, context, "alarm") == 1.0
-    assert value(assessor, context, "belief")[2] < 1.0
+    assert evaluated(assessor, context, "alarm") == 1.0
+    assert evaluated(assessor, context, "belief")[2] < 1.0
     without, simulator, context = added(assessment, {**inputs, "margins": None}, on_alarm=None)
     assert without.monitor is None
     assert not without.HasOutputPort("alarm")
     assert not without.HasInputPort("margins")
     simulator.AdvanceTo(STEP_S)
-    assert value(without, context, "belief")[2] < 1.0
+    assert evaluated(without, context, "belief")[2] < 1.0
     with pytest.raises(ValueError, match=r"on_alarm is 'stop', expected one of .* or None"):
         SafetyAssessor(assessment, on_alarm="stop")
 
@@ -99,15 +84,6 @@ def test_less_is_said_by_an_argument(assessment, inputs):
 def test_the_margins_are_not_left_out_by_mistake(assessment, inputs):
     with pytest.raises(TypeError, match="margins"):
         added(assessment, {name: inputs[name] for name in INPUTS[:3]})
-    assessor = SafetyAssessor(assessment)
-    simulator = Simulator(assessor)
-    for name in INPUTS[:3]:
-        assessor.GetInputPort(name).FixValue(simulator.get_mutable_context(), inputs[name])
-    with pytest.raises(RuntimeError, match=r"required InputPort.*\(margins\).*is not connected"):
-        simulator.Initialize()
-
-
-def test_missing_features_and_ports_of_another_size_are_refused(assessment, inputs):
     with pytest.raises(ValueError, match="was fitted with features"):
         added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
     with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
@@ -118,9 +94,9 @@ def test_it_adopts_what_an_adapted_assessment_has_learned_and_the_alarm_ends(ass
     adapted = assessment.adapt(worse())
     assessor, simulator, context = added(assessment, inputs)
     simulator.AdvanceTo(NUM_FROZEN * STEP_S)
-    assert value(assessor, context, "alarm") == 1.0
+    assert evaluated(assessor, context, "alarm") == 1.0
     assessor.adopt(assessor.GetMyMutableContextFromRoot(simulator.get_mutable_context()), adapted)
-    assert value(assessor, context, "alarm") == 0.0
+    assert evaluated(assessor, context, "alarm") == 0.0
     simulator.AdvanceTo((NUM_FROZEN + 1) * STEP_S)
     expected = adapted.predict_one(*(inputs[name] for name in INPUTS[:3]))
-    np.testing.assert_array_equal(value(assessor, context, "belief"), expected.belief)
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), expected.belief)

@@ -1,5 +1,3 @@
-"""Starts, plans and throws lie in their ranges, and feet stand still while the base moves."""
-
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
@@ -76,17 +74,6 @@ def test_feet_at_rest_need_no_joint_rates_when_the_base_is_at_rest():
     X_WB = RigidTransform(Quaternion(start.q[:4]), start.q[4:7])
     v = resting_feet(kinematics, X_WB, start.q[7:], np.zeros(NUM_BASE_VELOCITIES))
     np.testing.assert_array_equal(v, 0.0)
-
-
-def test_the_same_generator_gives_the_same_start_and_another_one_another():
-    kinematics = robot_kinematics(ROBOT_NAMES[0])
-    sampling = sampling_for(kinematics)
-    one, same, other = (
-        sampling.sample(kinematics, np.random.default_rng(seed)) for seed in (0, 0, 1)
-    )
-    np.testing.assert_array_equal(one.v, same.v)
-    np.testing.assert_array_equal(one.q, same.q)
-    assert not np.allclose(one.v, other.v)
 
 
 def test_random_throws_lie_in_their_ranges():

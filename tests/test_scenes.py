@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pydrake.geometry import Box, Role, Sphere
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import UnitInertia
 from pydrake.systems.framework import DiagramBuilder
 
@@ -16,86 +16,57 @@ BOARD_SIZE = (0.3, 2.0, 0.05)
 BOARD_HEIGHTS = (0.025, 0.325, 0.625, 0.925, 1.225, 1.475)
 
 
-def test_the_ball_is_a_solid_sphere_of_two_kilograms():
-    plant = MultibodyPlant(0.001)
-    package_parser(plant).AddModelsFromUrl(f"{SCENES}/ball.sdf")
-    plant.Finalize()
-    ball = plant.GetBodyByName("ball").default_spatial_inertia()
-    assert ball.get_mass() == 2.0
-    np.testing.assert_array_equal(ball.get_com(), np.zeros(3))
-    moment = 2.0 / 5.0 * 2.0 * 0.08**2
-    np.testing.assert_allclose(
-        ball.CalcRotationalInertia().CopyToFullMatrix3(), moment * np.eye(3), rtol=0.0, atol=1e-15
-    )
-
-
-@pytest.mark.parametrize("scene", ["ground.urdf", "blue_box.sdf", "red_can.sdf"])
-def test_ground_and_targets_are_only_to_be_seen(scene):
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
-    package_parser(plant).AddModelsFromUrl(f"{SCENES}/{scene}")
-    plant.Finalize()
-    inspector = scene_graph.model_inspector()
-    assert inspector.NumGeometriesWithRole(Role.kProximity) == 0
-    assert inspector.NumGeometriesWithRole(Role.kIllustration) > 0
-
-
-def test_the_ground_does_not_move():
-    plant = MultibodyPlant(0.001)
-    package_parser(plant).AddModelsFromUrl(f"{SCENES}/ground.urdf")
-    plant.Finalize()
-    assert plant.num_velocities() == 0
-
-
-def welded(*names: str):
-    """A plant and scene graph with models welded to the world's origin, and their bodies."""
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
-    bodies = []
-    for name in names:
-        (instance,) = package_parser(plant).AddModelsFromUrl(f"{SCENES}/{name}")
-        (index,) = plant.GetBodyIndices(instance)
-        bodies.append(plant.get_body(index))
-        plant.WeldFrames(plant.world_frame(), bodies[-1].body_frame())
+def scene_of(name, is_welded=False):
+    """A plant and scene graph with one model, at will welded to the origin, and its bodies."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.001)
+    (instance,) = package_parser(plant).AddModelsFromUrl(f"{SCENES}/{name}")
+    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
+    if is_welded:
+        plant.WeldFrames(plant.world_frame(), bodies[0].body_frame())
     plant.Finalize()
     return plant, scene_graph, bodies
 
 
-def test_the_bookshelf_can_be_touched_at_its_boards_and_nowhere_else():
-    plant, scene_graph, (shelf,) = welded("bookshelf.urdf")
+def test_the_ball_is_a_solid_sphere_of_two_kilograms():
+    _, _, (ball,) = scene_of("ball.sdf")
+    inertia = ball.default_spatial_inertia()
+    assert inertia.get_mass() == 2.0
+    np.testing.assert_array_equal(inertia.get_com(), np.zeros(3))
+    expected = 2.0 / 5.0 * 2.0 * 0.08**2 * np.eye(3)
+    found = inertia.CalcRotationalInertia().CopyToFullMatrix3()
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("scene", ["ground.urdf", "blue_box.sdf", "red_can.sdf"])
+def test_ground_and_targets_are_only_to_be_seen_and_the_ground_does_not_move(scene):
+    plant, scene_graph, _ = scene_of(scene)
     inspector = scene_graph.model_inspector()
-    boards = plant.GetCollisionGeometriesForBody(shelf)
+    assert inspector.NumGeometriesWithRole(Role.kProximity) == 0
+    assert inspector.NumGeometriesWithRole(Role.kIllustration) > 0
+    assert (plant.num_velocities() == 0) == (scene == "ground.urdf")
+
+
+def test_the_bookshelf_can_be_touched_at_its_boards_where_they_are_seen_and_nowhere_else():
+    plant, scene_graph, (shelf,) = scene_of("bookshelf.urdf", is_welded=True)
+    inspector = scene_graph.model_inspector()
+    visuals = plant.GetVisualGeometriesForBody(shelf)
+    seen = [(inspector.GetPoseInFrame(g), inspector.GetShape(g).size()) for g in visuals]
     heights = []
-    for board in boards:
-        shape = inspector.GetShape(board)
+    for board in plant.GetCollisionGeometriesForBody(shelf):
+        shape, X_BG = inspector.GetShape(board), inspector.GetPoseInFrame(board)
         assert isinstance(shape, Box)
         np.testing.assert_array_equal(shape.size(), BOARD_SIZE)
-        X_BG = inspector.GetPoseInFrame(board)
         assert X_BG.rotation().IsNearlyIdentity(0.0)
         np.testing.assert_array_equal(X_BG.translation()[:2], np.zeros(2))
         heights.append(X_BG.translation()[2])
+        assert any(X.IsExactlyEqualTo(X_BG) and tuple(size) == BOARD_SIZE for X, size in seen)
     assert sorted(heights) == list(BOARD_HEIGHTS)
     assert plant.num_velocities() == 0
 
 
-def test_each_board_of_the_bookshelf_is_seen_where_it_is_touched():
-    plant, scene_graph, (shelf,) = welded("bookshelf.urdf")
-    inspector = scene_graph.model_inspector()
-    seen = [
-        (inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry).size())
-        for geometry in plant.GetVisualGeometriesForBody(shelf)
-    ]
-    for board in plant.GetCollisionGeometriesForBody(shelf):
-        X_BG, size = inspector.GetPoseInFrame(board), inspector.GetShape(board).size()
-        assert any(
-            X_BS.IsExactlyEqualTo(X_BG) and np.array_equal(seen_size, size)
-            for X_BS, seen_size in seen
-        )
-
-
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_target_whose_centre_is_six_centimetres_above_a_board_stands_on_it(target):
-    plant, scene_graph, (body,) = welded(f"{target}.sdf")
+    plant, scene_graph, (body,) = scene_of(f"{target}.sdf")
     inspector = scene_graph.model_inspector()
     halves = []
     for geometry in plant.GetVisualGeometriesForBody(body):
@@ -111,17 +82,15 @@ def test_a_target_whose_centre_is_six_centimetres_above_a_board_stands_on_it(tar
 
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_target_has_the_inertia_of_a_solid_of_its_size(target):
-    plant, scene_graph, (body,) = welded(f"{target}.sdf")
+    plant, scene_graph, (body,) = scene_of(f"{target}.sdf")
     inspector = scene_graph.model_inspector()
     shape = inspector.GetShape(plant.GetVisualGeometriesForBody(body)[0])
-    M_BBo_B = body.default_spatial_inertia()
     if isinstance(shape, Box):
         unit = UnitInertia.SolidBox(0.1, 0.1, 0.12)
     else:
         unit = UnitInertia.SolidCylinder(shape.radius(), 0.12, [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(
-        M_BBo_B.get_unit_inertia().CopyToFullMatrix3(), unit.CopyToFullMatrix3(), rtol=0.01
-    )
+    found = body.default_spatial_inertia().get_unit_inertia().CopyToFullMatrix3()
+    np.testing.assert_allclose(found, unit.CopyToFullMatrix3(), rtol=0.01)
 
 
 def test_distances_from_hands_and_forearms_to_the_boards_can_be_computed():

@@ -1,5 +1,3 @@
-"""Sets of episodes that do not overlap, and assessments that know which ones they have used."""
-
 import dataclasses
 import inspect
 from itertools import combinations
@@ -15,7 +13,6 @@ from drake_safety.learning.feedback import feedback_sets
 from drake_safety.learning.seeds import (
     ADAPTATION,
     BLOCKS,
-    CALIBRATION,
     DEMONSTRATION,
     NOT_DRAWN,
     UsedEpisodes,
@@ -77,11 +74,6 @@ def test_every_command_takes_its_default_seed_from_the_table():
     shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]
     assert shown == [DEMONSTRATION.first] * 3
     assert default_seed(run_pairs) == ADAPTATION.first
-
-
-def test_calibration_and_adaptation_share_no_episode_by_default():
-    calibration, adaptation = CALIBRATION.seeds(), ADAPTATION.seeds()
-    assert not set(calibration.values()) & set(adaptation.values())
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():

@@ -1,5 +1,3 @@
-"""One diagram in several threads, each with a Context of its own, as Drake's users expect."""
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

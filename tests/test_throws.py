@@ -1,5 +1,3 @@
-"""Throws: balls at the actual plant, logged, judged and recovered from."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""WholeBodyController: torques at its ticks, robots that stand and reach, failures without harm."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -55,20 +53,6 @@ class Bench:
         return solve_qp(build_qp(self.controller.model, q, v, reference)).torques
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_its_ports_have_the_sizes_of_the_robot(name):
-    bench = Bench(name, hand=None)
-    kinematics, port = bench.kinematics, bench.controller.GetInputPort
-    assert port("plant_state").size() == kinematics.num_positions + kinematics.num_velocities
-    assert port("desired_output").size() == port("desired_output_rate").size() == 3
-    assert bench.controller.GetOutputPort("actuation").size() == kinematics.num_joints
-    assert bench.controller.GetOutputPort("solver_status").size() == 1
-
-
-def test_no_input_feeds_through():
-    assert not Bench().controller.HasAnyDirectFeedthrough()
-
-
 def test_the_actuation_is_the_solution_of_the_program():
     bench = Bench()
     reference = bench.controller.model.reference(bench.q)
@@ -79,15 +63,6 @@ def test_the_actuation_is_the_solution_of_the_program():
     reference.reaching = PointReference(position=goal, rate=np.array([0.1, 0.0, 0.0]))
     bench.fix("desired_output", goal)
     bench.fix("desired_output_rate", [0.1, 0.0, 0.0])
-    bench.simulator.Initialize()
-    np.testing.assert_array_equal(bench.actuation(), bench.torques(reference))
-
-
-def test_without_a_hand_the_centre_of_mass_follows_the_desired_output():
-    bench = Bench(hand=None)
-    reference = bench.controller.model.reference(bench.q)
-    reference.center_of_mass.position += [0.01, 0.0, -0.01]
-    bench.fix("desired_output", reference.center_of_mass.position)
     bench.simulator.Initialize()
     np.testing.assert_array_equal(bench.actuation(), bench.torques(reference))
 
@@ -120,23 +95,6 @@ def test_a_reference_of_another_robot_is_refused():
         bench.controller.set_reference(bench.context, reference)
 
 
-def test_commands_change_only_at_the_ticks():
-    bench = Bench(offset_s=0.25 * PERIOD_S)
-    bench.simulator.Initialize()
-    first = bench.actuation()
-    bench.fix("desired_output", [0.02, 0.0, 0.85])
-    bench.simulator.AdvanceTo(0.2 * PERIOD_S)
-    np.testing.assert_array_equal(bench.actuation(), first)
-    bench.simulator.AdvanceTo(0.3 * PERIOD_S)
-    second = bench.actuation()
-    assert not np.array_equal(second, first)
-    bench.fix("desired_output", [0.0, 0.0, 0.85])
-    bench.simulator.AdvanceTo(1.2 * PERIOD_S)
-    np.testing.assert_array_equal(bench.actuation(), second)
-    bench.simulator.AdvanceTo(1.3 * PERIOD_S)
-    assert not np.array_equal(bench.actuation(), second)
-
-
 def test_torques_go_to_the_actuators_that_the_matrix_names():
     n_j = robot_kinematics("biped").num_joints
     rng = np.random.default_rng(0)
@@ -150,11 +108,6 @@ def test_torques_go_to_the_actuators_that_the_matrix_names():
 def test_a_matrix_for_other_joints_is_refused():
     with pytest.raises(ValueError, match=r"must have 12 columns.*left_knee.*shape \(3, 5\)"):
         Bench(actuation_matrix=np.zeros((3, 5)))
-
-
-def test_an_unknown_hand_is_answered_with_the_hands_there_are():
-    with pytest.raises(ValueError, match=r"robot 'biped' has no reaching frame 'tail'.*head"):
-        Bench(hand="tail")
 
 
 def spoilt(bench, how):
@@ -224,7 +177,6 @@ def test_nothing_of_an_earlier_episode_is_left_after_the_initialisation():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_robots_stand(name):
-    """Under torques alone, at 2 ms with a tick every 4 ms."""
     loop = WholeBodyLoop(robot_model(name))
     start = loop.q
     reference = loop.controller.model.reference(start)
@@ -252,7 +204,6 @@ def test_robots_come_to_rest_after_a_start_in_motion(name):
 
 
 def test_dry_friction_holds_joints_under_torques():
-    """The friction actuators are armed, get no torque, and the robot stands all the same."""
     smooth = WholeBodyLoop(robot_model("laikago"))
     rough = WholeBodyLoop(robot_model("laikago"), variation=PlantVariation(joint_friction_nm=1.0))
     goal = smooth.kinematics.center_of_mass(smooth.q) + [0.03, 0.0, -0.03]

@@ -61,33 +61,26 @@ def test_the_reference_goes_where_the_feet_are(kinematics):
     q = kinematics.standing_positions()
     X_WB = X @ RigidTransform(q[4:7])
     here, there = model.reference(q), model.reference(kinematics.positions_at(X_WB, q[7:]))
-    np.testing.assert_allclose(
-        there.center_of_mass.position, X @ here.center_of_mass.position, atol=1e-9
-    )
+    expected = X @ here.center_of_mass.position
+    np.testing.assert_allclose(there.center_of_mass.position, expected, atol=1e-9)
     for before, after in zip(here.orientations, there.orientations, strict=True):
-        np.testing.assert_allclose(
-            after.matrix(), (X.rotation() @ before).matrix(), rtol=0, atol=1e-9
-        )
+        turned = (X.rotation() @ before).matrix()
+        np.testing.assert_allclose(after.matrix(), turned, rtol=0, atol=1e-9)
 
 
 def test_the_bodies_of_the_reference_are_upright_however_the_robot_leans():
     kinematics = robot_kinematics("biped")
     X_WB = RigidTransform(RollPitchYaw(0.05, -0.04, 0.0), [0.0, 0.0, 0.6])
-    (R,) = (
-        WholeBodyModel(kinematics)
-        .reference(kinematics.positions_at(X_WB, kinematics.posture))
-        .orientations
-    )
+    q = kinematics.positions_at(X_WB, kinematics.posture)
+    (R,) = WholeBodyModel(kinematics).reference(q).orientations
     np.testing.assert_allclose(R.matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-12)
 
 
 def test_the_hand_of_the_reference_is_where_the_hand_is():
     kinematics = robot_kinematics("biped")
     q = kinematics.standing_positions()
-    model = WholeBodyModel(kinematics, "head")
-    np.testing.assert_allclose(
-        model.reference(q).reaching.position, q[4:7] + [0.0, 0.0, 0.25], atol=1e-12
-    )
+    hand = WholeBodyModel(kinematics, "head").reference(q).reaching.position
+    np.testing.assert_allclose(hand, q[4:7] + [0.0, 0.0, 0.25], atol=1e-12)
 
 
 def test_base_and_unactuated_joints_are_the_equalities_of_the_equations_of_motion(tmp_path):
@@ -110,6 +103,9 @@ def test_an_unknown_hand_is_answered_with_the_hands_there_are():
         WholeBodyModel(robot_kinematics("biped")).reaching_position(np.zeros(19))
 
 
+POINTS = "points must be three finite numbers each"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -118,14 +114,8 @@ def test_an_unknown_hand_is_answered_with_the_hands_there_are():
         ({"orientations": []}, r"must have orientations for \['pelvis'\]; got 0 entries"),
         ({"reaching": None}, "must have reaching for the hand; got none"),
         ({"posture": np.full(12, np.nan)}, "posture must be finite"),
-        (
-            {"center_of_mass": PointReference(position=np.array([0.0, np.inf, 0.0]))},
-            "points must be three finite numbers each",
-        ),
-        (
-            {"reaching": PointReference(position=np.zeros(3), rate=np.zeros(2))},
-            "points must be three finite numbers each",
-        ),
+        ({"center_of_mass": PointReference(position=np.array([0.0, np.inf, 0.0]))}, POINTS),
+        ({"reaching": PointReference(position=np.zeros(3), rate=np.zeros(2))}, POINTS),
     ],
 )
 def test_a_reference_that_does_not_fit_the_robot_is_refused(change, message):

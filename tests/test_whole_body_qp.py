@@ -29,9 +29,8 @@ G = 9.81
 @functools.cache
 def whole_body_model(name):
     """A robot's model; with its first hand, if it has any."""
-    return WholeBodyModel(
-        robot_kinematics(name), next(iter(robot_kinematics(name).robot.reaching_frames), None)
-    )
+    hand = next(iter(robot_model(name).reaching_frames), None)
+    return WholeBodyModel(robot_kinematics(name), hand)
 
 
 @pytest.fixture(params=NAMES)
@@ -88,7 +87,7 @@ def clarabel_torques(qp, tolerance):
 
 
 def test_the_torques_are_those_of_inverse_dynamics_and_the_base_has_none(model):
-    """Drake's own inverse dynamics, which shares no line with how the program is built."""
+    # Drake's own inverse dynamics, which shares no line with how the program is built.
     rng = np.random.default_rng(0)
     kinematics = model.kinematics
     plant, context = kinematics.plant, kinematics.context
@@ -128,9 +127,8 @@ def test_the_torques_are_those_of_an_interior_point_solver(model):
     rng = np.random.default_rng(2)
     for size in (0.0, 0.3, 1.0):
         qp = build_qp(model, *random_program(model, rng, size))
-        np.testing.assert_allclose(
-            solve_qp(qp).torques, clarabel_torques(qp, 1e-10), rtol=0, atol=1e-3
-        )
+        expected = clarabel_torques(qp, 1e-10)
+        np.testing.assert_allclose(solve_qp(qp).torques, expected, rtol=0, atol=1e-3)
 
 
 def test_the_same_program_has_the_same_solution_to_the_last_bit(model):
@@ -184,26 +182,32 @@ def test_a_standing_foot_loses_its_velocity_at_the_rate_of_the_contact_damping(m
     np.testing.assert_allclose(changes, -damping * foot_rates(q, v), rtol=1e-3, atol=1e-3)
 
 
+def turning_of(model, body_name):
+    """A function of q and v: the angular velocity of a body in the world."""
+    plant, context = model.kinematics.plant, model.kinematics.context
+    body = plant.GetBodyByName(body_name)
+
+    def turning(q, v):
+        plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+        return body.EvalSpatialVelocityInWorld(context).rotational()
+
+    return turning
+
+
 def test_a_sole_loses_its_turning_and_an_edge_may_turn_about_itself():
     robot = copy.deepcopy(robot_model("biped"))
     robot.feet["left"].contact_points = [[-0.06, 0.0, -0.05], [0.1, 0.0, -0.05]]
     model = WholeBodyModel(RobotKinematics(robot))
     kinematics = model.kinematics
-    bodies = [kinematics.plant.GetBodyByName(foot.body) for foot in robot.feet.values()]
     q, v, reference = random_program(model, np.random.default_rng(5))
     solution = solved(model, q, v, reference)
-
-    def turning(q, v):
-        kinematics.plant.SetPositionsAndVelocities(kinematics.context, np.concatenate([q, v]))
-        return np.array(
-            [body.EvalSpatialVelocityInWorld(kinematics.context).rotational() for body in bodies]
-        )
-
-    left, right = rate_of_change(model, q, v, solution.vdot, turning)
-    w_left, w_right = turning(q, v)
+    turnings = [turning_of(model, foot.body) for foot in robot.feet.values()]
+    left, right = (rate_of_change(model, q, v, solution.vdot, one) for one in turnings)
+    w_left, w_right = (one(q, v) for one in turnings)
     damping = model.parameters.contact_damping
     np.testing.assert_allclose(right, -damping * w_right, rtol=1e-3, atol=1e-3)
-    edge = bodies[0].EvalPoseInWorld(kinematics.context).rotation().matrix()[:, 0]
+    body = kinematics.plant.GetBodyByName(robot.feet["left"].body)
+    edge = body.EvalPoseInWorld(kinematics.context).rotation().matrix()[:, 0]
     across = np.eye(3) - np.outer(edge, edge)
     np.testing.assert_allclose(across @ left, -damping * across @ w_left, rtol=1e-3, atol=1e-2)
     assert abs(edge @ left + damping * edge @ w_left) > 0.1
@@ -212,18 +216,13 @@ def test_a_sole_loses_its_turning_and_an_edge_may_turn_about_itself():
 def only(model, task):
     """The same model with one task that outweighs all others."""
     robot = copy.deepcopy(model.kinematics.robot)
-    for gains in (
-        robot.whole_body.center_of_mass,
-        robot.whole_body.reaching,
-        robot.whole_body.posture,
-    ):
+    whole = robot.whole_body
+    for gains in (whole.center_of_mass, whole.reaching, whole.posture, *whole.orientation.values()):
         gains.weight = 1e-3
-    for gains in robot.whole_body.orientation.values():
-        gains.weight = 1e-3
-    gains = robot.whole_body.tasks()[task]
+    gains = whole.tasks()[task]
     gains.weight, gains.stiffness, gains.damping = 1e3, 64.0, 11.0
-    hand = next(iter(robot.reaching_frames), None)
-    return WholeBodyModel(RobotKinematics(robot), hand if task == "reaching" else None)
+    hand = next(iter(robot.reaching_frames)) if task == "reaching" else None
+    return WholeBodyModel(RobotKinematics(robot), hand)
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if robot_kinematics(n).robot.reaching_frames])
@@ -247,11 +246,8 @@ def test_a_point_accelerates_by_feedforward_and_the_gains_times_its_errors(name,
     setattr(reference, task, wanted)
     solution = solved(model, q, v, reference)
     acceleration = rate_of_change(model, q, v, solution.vdot, rate, step=1e-4)
-    expected = (
-        wanted.acceleration
-        + 64.0 * (wanted.position - position(q))
-        + 11.0 * (wanted.rate - rate(q, v))
-    )
+    expected = wanted.acceleration + 64.0 * (wanted.position - position(q))
+    expected += 11.0 * (wanted.rate - rate(q, v))
     np.testing.assert_allclose(acceleration, expected, atol=0.01)
 
 
@@ -270,11 +266,7 @@ def test_bodies_turn_towards_their_orientation(name):
         angle = np.linalg.norm(turn)
         R_turn = RotationMatrix(AngleAxis(angle, turn / angle))
         reference.orientations[model.body_names.index(body_name)] = R_turn @ R_WB
-
-        def turning(q, v, body=body, kinematics=kinematics):
-            kinematics.plant.SetPositionsAndVelocities(kinematics.context, np.concatenate([q, v]))
-            return body.EvalSpatialVelocityInWorld(kinematics.context).rotational()
-
+        turning = turning_of(model, body_name)
         solution = solved(model, q, v, reference)
         acceleration = rate_of_change(model, q, v, solution.vdot, turning)
         expected = 64.0 * turn - 11.0 * turning(q, v)
@@ -297,7 +289,6 @@ def test_a_foot_that_does_not_stand_takes_no_force_and_may_move():
     model = whole_body_model("hexapod")
     q, v, reference = standing_still(model)
     reference.is_stance[2] = False
-    v[:] = 0.0
     reference.posture = reference.posture.copy()
     leg = [model.kinematics.joint_names.index(f"{name}_2") for name in ("swing", "lift", "knee")]
     reference.posture[leg] += [0.0, -0.2, 0.0]
@@ -322,7 +313,7 @@ def test_a_lighter_robot_moves_alike_with_torques_and_forces_in_proportion():
 
 
 def test_the_torques_do_not_depend_on_place_or_heading(model):
-    """The friction pyramid points along the world's axes, so by quarter turns."""
+    # The friction pyramid points along the world's axes, so by quarter turns.
     kinematics = model.kinematics
     q, v, reference = random_program(model, np.random.default_rng(10), size=0.3)
     X = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [3.0, -2.0, 0.0])
@@ -334,27 +325,21 @@ def test_the_torques_do_not_depend_on_place_or_heading(model):
     for point in filter(None, (moved.center_of_mass, moved.reaching)):
         point.position, point.rate = X @ point.position, turn @ point.rate
     moved.orientations = [X.rotation() @ R for R in reference.orientations]
-    np.testing.assert_allclose(
-        solved(model, moved_q, moved_v, moved).torques,
-        solved(model, q, v, reference).torques,
-        atol=1e-5,
-    )
+    there, here = solved(model, moved_q, moved_v, moved), solved(model, q, v, reference)
+    np.testing.assert_allclose(there.torques, here.torques, atol=1e-5)
 
 
 def test_a_mirrored_robot_needs_the_mirrored_torques():
-    """The biped is symmetric in its masses too."""
-    model = whole_body_model("biped")
+    model = whole_body_model("biped")  # Symmetric in its masses too.
     mirror = Mirror(model.kinematics)
     q, v, reference = random_program(model, np.random.default_rng(11), size=0.3)
     mirrored_q, mirrored_v = mirror.plant_state(q, v, np.zeros(3))
     mirrored = copy.deepcopy(reference)
     for point in (mirrored.center_of_mass, mirrored.reaching):
         point.position, point.rate = mirror.points(point.position), mirror.points(point.rate)
-    np.testing.assert_allclose(
-        solved(model, mirrored_q, mirrored_v, mirrored).torques,
-        mirror.joints(solved(model, q, v, reference).torques),
-        atol=1e-6,
-    )
+    expected = mirror.joints(solved(model, q, v, reference).torques)
+    found = solved(model, mirrored_q, mirrored_v, mirrored).torques
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_joint_without_an_actuator_gets_no_torque():
@@ -376,21 +361,23 @@ def test_a_program_that_no_torque_can_satisfy_says_so():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
-@pytest.mark.parametrize("where", ["quaternion", "position", "velocity", "reaching", "rate"])
+@pytest.mark.parametrize("where", ["quaternion", "orientation", "base", "velocity", "hand", "rate"])
 def test_a_state_or_set_point_that_is_not_finite_is_refused_not_fatal(value, where):
     model = whole_body_model("biped")
     q, v, reference = standing_still(model)
-    if where in ("reaching", "rate"):
-        name = "position" if where == "reaching" else "rate"
+    if where == "orientation":
+        q[:4] = 0.0
+    elif where in ("hand", "rate"):
+        name = "position" if where == "hand" else "rate"
         setattr(reference.reaching, name, np.array([0.0, value, 0.0]))
     else:
-        (v if where == "velocity" else q)[5 if where == "position" else 3] = value
+        (v if where == "velocity" else q)[5 if where == "base" else 3] = value
     with pytest.raises(ValueError, match="robot 'biped': state and set points must be finite"):
         build_qp(model, q, v, reference)
 
 
 def test_a_program_that_takes_long_is_given_up_and_says_so(monkeypatch):
-    """Far from standing, as after a fall, programs of Talos take 230 iterations; near it, 61."""
+    # Far from standing, as after a fall, programs of Talos take 230 iterations; near it, 61.
     counts = []
 
     def counted(*arguments, **options):
@@ -410,11 +397,3 @@ def test_a_program_that_takes_long_is_given_up_and_says_so(monkeypatch):
     assert statuses[5.0] == {SOLVED}
     assert ITERATION_LIMIT in statuses[50.0]
     assert max(counts) <= 1.5 * len(programs[0].upper)
-
-
-def test_a_state_without_orientation_is_refused():
-    model = whole_body_model("biped")
-    q, v, reference = standing_still(model)
-    q[:4] = 0.0
-    with pytest.raises(ValueError, match="robot 'biped': state and set points must be finite"):
-        build_qp(model, q, v, reference)

@@ -1,10 +1,7 @@
-"""The whole loop: nominal episodes, Γ learned from them, Γ and recovery steps in a diagram."""
-
 import copy
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.assessments import load_assessment
@@ -96,34 +93,3 @@ def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot():
     assert log.violations["legs_collide"] == 0
     assert log.violations["joint_position"] == 0
     assert log.violations["joint_effort"] == 0
-
-
-def test_the_lines_of_the_readme_run_a_simulation(scenario, assessment):
-    loop = scenario.make_loop(variation="actual", assessment=assessment)
-    simulator = Simulator(loop)
-    loop.reset(simulator.get_mutable_context(), np.random.default_rng(0))
-    simulator.AdvanceTo(0.2)
-    belief = loop.GetOutputPort("belief").Eval(simulator.get_context())
-    assert belief.sum() == pytest.approx(1.0)
-
-
-def test_an_assessment_of_another_scenario_is_refused_with_both_sides_named(assessment):
-    other = load_scenario("laikago_balancing")
-    other.variations["nominal"].mass_scale = 0.7
-    with pytest.raises(ValueError, match=r"scenario hash.*learned with.*the diagram has"):
-        other.make_loop("actual", assessment=assessment)
-    other = load_scenario("laikago_balancing")
-    other.step_s = 0.05
-    with pytest.raises(ValueError, match=r"step_s.*0\.04.*0\.05"):
-        other.make_loop("actual", assessment=assessment)
-
-
-def test_an_input_that_is_not_finite_is_answered_with_dont_know(assessment):
-    info = assessment.info_
-    state = np.zeros(len(info.state_names))
-    state[3] = np.nan
-    result = assessment.predict_one(
-        state, np.zeros(3 * info.horizon), np.zeros(len(info.feature_names))
-    )
-    np.testing.assert_array_equal(result.belief, [0.0, 0.0, 1.0])
-    assert result.probability == 0.0

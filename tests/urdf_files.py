@@ -13,6 +13,13 @@ def written(folder, *parts, name="r.urdf"):
     return path
 
 
+def with_shape(text, link, shape):
+    """The text of a URDF with one more visual or collision in a link."""
+    head, name, tail = text.partition(f'<link name="{link}"')
+    assert name
+    return head + name + tail.replace("</link>", f"{shape}</link>", 1)
+
+
 def stl(path, corners):
     """Writes a binary STL of one triangle."""
     facets = np.zeros(1, [("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")])

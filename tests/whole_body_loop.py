@@ -37,14 +37,10 @@ class WholeBodyLoop:
         )
         self.plant.Finalize()
         self.kinematics = RobotKinematics(robot)
+        B = actuation_matrix(self.plant, robot, self.kinematics.joint_names)
+        options = {"actuation_matrix": B, "period_s": PERIOD_S, "offset_s": offset_s}
         self.controller = builder.AddSystem(
-            WholeBodyController(
-                self.kinematics,
-                hand=hand,
-                actuation_matrix=actuation_matrix(self.plant, robot, self.kinematics.joint_names),
-                period_s=PERIOD_S,
-                offset_s=offset_s,
-            )
+            WholeBodyController(self.kinematics, hand=hand, **options)
         )
         builder.Connect(
             self.plant.get_state_output_port(instance), self.controller.GetInputPort("plant_state")

@@ -60,8 +60,7 @@ def adapt(
     ] = 160,
     variation: Annotated[str, typer.Option(help="Variation of the actual plant.")] = "actual",
     evaluate: Annotated[
-        int,
-        typer.Option(help="Fresh actual episodes for evaluation; 0 for none.", min=0),
+        int, typer.Option(help="Fresh actual episodes for evaluation; 0 for none.", min=0)
     ] = 0,
     log: Annotated[
         list[Path] | None,

@@ -35,8 +35,7 @@ def play(
     hand: HandOption = None,
     variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
     recovery: Annotated[
-        bool | None,
-        typer.Option("--recovery/--no-recovery", help="Recovery steps; on by default."),
+        bool | None, typer.Option("--recovery/--no-recovery", help="Recovery steps; on by default.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",

@@ -8,13 +8,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from drake_safety.cli.console import (
-    ScenarioArgument,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-)
+from drake_safety.cli.console import ScenarioArgument, console, new_table, open_stages, print_path
 from drake_safety.control.policy_template import survey_policy
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.robot_figure import robot_figure

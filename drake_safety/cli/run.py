@@ -20,12 +20,7 @@ from drake_safety.cli.console import (
     print_shipped,
 )
 from drake_safety.cli.free_run import run_episode_alone
-from drake_safety.cli.run_settings import (
-    LOG_PERIOD_S,
-    Recording,
-    RunSettings,
-    events_table,
-)
+from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, events_table
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
@@ -84,8 +79,7 @@ def run(
     ] = None,
     variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
     recovery: Annotated[
-        bool | None,
-        typer.Option("--recovery/--no-recovery", help="Recovery; the task's default."),
+        bool | None, typer.Option("--recovery/--no-recovery", help="Recovery; the task's default.")
     ] = None,
     duration: Annotated[
         float | None,

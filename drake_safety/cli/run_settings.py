@@ -72,11 +72,7 @@ class RunSettings:
             **options: More options of the diagram.
         """
         return self.scenario.make_loop(
-            self.variation,
-            assessment=self.assessment,
-            meshcat=meshcat,
-            **self.options,
-            **options,
+            self.variation, assessment=self.assessment, meshcat=meshcat, **self.options, **options
         )
 
 

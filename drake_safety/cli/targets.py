@@ -27,8 +27,7 @@ TargetOption = Annotated[
     ),
 ]
 HandOption = Annotated[
-    str | None,
-    typer.Option("--hand", help="Reaching hand; the trained one by default."),
+    str | None, typer.Option("--hand", help="Reaching hand; the trained one by default.")
 ]
 
 _SEARCH_SEED = 0  # Fixed, so that results are reproducible.

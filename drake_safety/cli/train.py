@@ -126,10 +126,7 @@ def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
 
 
 def _learn(
-    scenario: Scenario,
-    mode: str,
-    out: Path,
-    stages: StageProgress | None = None,
+    scenario: Scenario, mode: str, out: Path, stages: StageProgress | None = None
 ) -> tuple[int, str, float]:
     """Trains and saves one mode.
 

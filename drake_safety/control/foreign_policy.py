@@ -62,11 +62,6 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
 
     Returns:
         The keys. ``network`` is an absolute path, ``gait`` may lack its period.
-
-    Raises:
-        MissingExtraError: The package that evaluates the network is not installed.
-        ValueError: The file does not exist, is neither of both, does not name its joints, or has
-            entries of another form or width, or ones that cannot be supported.
     """
     with reading(path):
         raw = _parsed(path)

@@ -34,11 +34,8 @@ def solve_inverse_kinematics(
     and every joint stays inside its limits.
 
     Args:
-        kinematics: The robot.
-        X_WB: Base pose.
         p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
         guess: Initial joint positions, (n_j,) [rad].
-        max_iterations: Largest number of Newton steps.
 
     Returns:
         Joint positions (n_j,) [rad].
@@ -48,23 +45,11 @@ def solve_inverse_kinematics(
 
 
 def solve_from(
-    kinematics: RobotKinematics,
-    q: np.ndarray,
-    p_WC: np.ndarray,
-    *,
-    max_iterations: int = 20,
+    kinematics: RobotKinematics, q: np.ndarray, p_WC: np.ndarray, *, max_iterations: int = 20
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`solve_inverse_kinematics`, and returns the contact Jacobian too.
+    """As :func:`solve_inverse_kinematics` from ``q`` (n_q,), whose joints are overwritten.
 
-    Args:
-        kinematics: The robot.
-        q: Base pose and initial joint positions, (n_q,); the joints are overwritten.
-        p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
-        max_iterations: Largest number of Newton steps.
-
-    Returns:
-        Joint positions (n_j,) [rad], and the contact Jacobian (3 n_c, n_v) at the last iterate, at
-        most one small step away.
+    Also returns the contact Jacobian (3 n_c, n_v) at the last iterate, at most one small step away.
     """
     lowest, highest = kinematics.position_limits.T
     joints = np.minimum(np.maximum(q[NUM_BASE_POSITIONS:], lowest), highest)

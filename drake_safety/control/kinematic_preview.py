@@ -32,12 +32,6 @@ class KinematicPreview:
 
     These are computed by Gauss-Newton steps: one per sample, more while the hand is off the plan,
     and a few at the last sample.
-
-    Args:
-        model: Tasks and weights of the controller, with a hand.
-
-    Raises:
-        ValueError: The model has no hand.
     """
 
     def __init__(self, model: WholeBodyModel):
@@ -51,15 +45,7 @@ class KinematicPreview:
 
     @one_blas_thread
     def follow(self, q: np.ndarray, path: np.ndarray) -> np.ndarray:
-        """Follows a path of the hand.
-
-        Args:
-            q: Initial positions (n_q,).
-            path: Positions of the hand in the world, (M, 3) [m].
-
-        Returns:
-            Positions at the samples, (M, n_q).
-        """
+        """Positions (M, n_q) along a path (M, 3) [m] of the hand in the world, from ``q``."""
         model, kinematics = self.model, self.model.kinematics
         reference = model.reference(q)
         contacts = kinematics.contact_positions(q)

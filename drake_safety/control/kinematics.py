@@ -48,15 +48,7 @@ class RobotKinematics:
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
     ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
-    method overwrites.
-
-    Args:
-        robot: The robot.
-        variation: Plant variation of the controller's model; only masses are used.
-
-    Raises:
-        ValueError: The robot has no feet, its base is not the only floating body, or a foot's body
-            or joint does not exist.
+    method overwrites. Of a plant variation only the masses are used.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -136,11 +128,7 @@ class RobotKinematics:
         return self.positions_at(RigidTransform([0.0, 0.0, self.standing_height]), self.posture)
 
     def set_positions(self, q: np.ndarray) -> None:
-        """Sets the positions of the scratch Context.
-
-        Raises:
-            ValueError: The positions (n_q,) are not finite.
-        """
+        """Sets the positions (n_q,) of the scratch Context."""
         # Drake's plant aborts the process for positions that are not finite.
         if not q.dot(q) < math.inf:
             raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
@@ -196,18 +184,10 @@ class RobotKinematics:
     def gravity_torques(
         self, q: np.ndarray, is_stance: np.ndarray, J: np.ndarray | None = None
     ) -> np.ndarray:
-        """Computes joint torques for static equilibrium on the stance points.
+        """Joint torques (n_j,) [N·m] for static equilibrium on the stance points, (n_c,).
 
         The ground forces minimise the sum of squared point forces subject to the six floating-base
-        rows ``0 = g_b + J_bᵀ f``.
-
-        Args:
-            q: Positions (n_q,).
-            is_stance: Whether each contact point carries weight, (n_c,).
-            J: The contact Jacobian at ``q``, if known.
-
-        Returns:
-            Torques (n_j,) [N·m].
+        rows ``0 = g_b + J_bᵀ f``; J is the contact Jacobian at ``q``, if known.
         """
         if J is None:
             J = self.contact_jacobian(q)  # Sets the positions.
@@ -251,16 +231,10 @@ def yaw_of(R_WB: RotationMatrix) -> float:
 
 
 def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
-    """Fits the planar pose that maps the nominal contact points to the given ones.
+    """The pose ``[x, y, yaw]`` of the stance frame S at contact points (n_c, 3) [m] in the world.
 
-    Least squares in closed form (planar Procrustes).
-
-    Args:
-        p_WC: Contact points in the world, (n_c, 3) [m].
-        nominal_contacts: The standing posture's points relative to their centroid, (n_c, 2) [m].
-
-    Returns:
-        ``[x, y, yaw]`` of the stance frame S in the world (3,).
+    The least-squares fit of the standing posture's points, ``nominal_contacts`` (n_c, 2) relative
+    to their centroid, in closed form (planar Procrustes).
     """
     # Floats are several times faster than arrays for a few points.
     points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()

@@ -7,11 +7,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint
 
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    NUM_BASE_VELOCITIES,
-    RobotKinematics,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 
 _POLAR = np.array([1.0, -1.0, 1.0])  # Reflection of positions and velocities.
 _AXIAL = -_POLAR  # Reflection of angular velocities, torques and rotation vectors.
@@ -24,13 +20,6 @@ class Mirror:
     Each joint is exchanged with its partner in robot.yaml's ``mirror``. Its sign follows from the
     joints' axes with all joints at zero, as pseudovectors are reflected to (-x, y, -z). The base's
     x-z plane is its plane of symmetry. Reflecting twice is the identity.
-
-    Args:
-        kinematics: The robot.
-
-    Raises:
-        ValueError: ``mirror`` pairs joints that are not reflections of each other, or a joint is
-            neither revolute nor prismatic.
     """
 
     def __init__(self, kinematics: RobotKinematics):
@@ -96,26 +85,13 @@ class Mirror:
         return _POLAR * p
 
     def stance_state(self, state: np.ndarray) -> np.ndarray:
-        """Reflects the states of :func:`~drake_safety.control.observation.stance_state`.
-
-        Args:
-            state: (..., 12 + 2 n_j).
-        """
+        """Reflects states (..., 12 + 2 n_j) of `drake_safety.control.observation.stance_state`."""
         return self._state_signs * state[..., self._state_order]
 
     def plant_state(
         self, q: np.ndarray, v: np.ndarray, stance_pose: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Reflects positions and velocities through the x-z plane of a stance.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,).
-            stance_pose: ``[x, y, yaw]`` of the stance; that of ``q`` by default.
-
-        Returns:
-            Mirrored positions (n_q,) and velocities (n_v,).
-        """
+        """Reflects (q, v) in the x-z plane of a stance ``[x, y, yaw]``, by default of ``q``."""
         kinematics = self._kinematics
         if stance_pose is None:
             stance_pose = kinematics.stance_pose(q)
@@ -145,11 +121,7 @@ class Mirror:
         return mirrored_q, mirrored_v
 
     def hand(self, name: str) -> str:
-        """Returns the name of the mirrored reaching frame.
-
-        Raises:
-            ValueError: The hand does not exist, or no reaching frame has its joints' partners.
-        """
+        """Returns the name of the mirrored reaching frame."""
         robot, names = self._kinematics.robot, self._kinematics.joint_names
         partners = robot.mirror_partners(names)
         wanted = {partners[joint] for joint in robot.reaching_frame(name).joints}

@@ -45,11 +45,6 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     robot stands. Departure: the paper's s_k has configurations only; without velocities a pushed
     robot cannot be distinguished from one at rest, and the recall of unsafe states collapses.
 
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-
     Returns:
         (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; all NaN if a
         position or velocity is not finite.
@@ -62,14 +57,7 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     # R_SW R_WB; Drake's product of rotations is wrapped in Python.
     R_SB = R_SW.inverse().InvertAndCompose(RotationMatrix(quaternion_of(q)))
     return np.concatenate(
-        [
-            R @ (q[4:7] - (x, y, 0.0)),
-            rotation_vector(R_SB),
-            R @ v[:3],
-            R @ v[3:6],
-            q[7:],
-            v[6:],
-        ]
+        [R @ (q[4:7] - (x, y, 0.0)), rotation_vector(R_SB), R @ v[:3], R @ v[3:6], q[7:], v[6:]]
     )
 
 
@@ -88,11 +76,6 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
     Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
     direction of gravity and the velocities are in the base's frame.
 
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-
     Returns:
         (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; all NaN if
         a position or velocity is not finite.
@@ -104,15 +87,7 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
 
 
 def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Returns the base's planar velocity in its heading frame, and its yaw rate.
-
-    Args:
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-
-    Returns:
-        (v_x, v_y, ω_z) (3,) [m/s, rad/s], the output of a walking robot.
-    """
+    """(v_x, v_y, ω_z) [m/s, rad/s] of the base in its heading frame: a walking robot's output."""
     x_axis = RotationMatrix(quaternion_of(q)).matrix()[:2, 0]
     length = math.hypot(*x_axis)
     c, s = x_axis / length if length > 0 else (1.0, 0.0)
@@ -122,18 +97,11 @@ def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 def gravity_in_foot_plane(
     kinematics: RobotKinematics, q: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Returns the components of gravity's direction along the plane of the feet.
+    """Components (2,) of gravity's direction along the x and y axes of the stance frame.
 
     On level ground they are zero; on a slope, the sine of its inclination downhill. The plane is
-    fitted to the contact points; along a direction in which these do not extend it is level.
-
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        gravity: Gravity in the world, (3,) [m/s²].
-
-    Returns:
-        Along the x and the y axis of the stance frame, (2,); NaN if an argument is not finite.
+    fitted to the contact points; along a direction in which these do not extend it is level. NaN if
+    ``q`` or gravity (3,) [m/s²] is not finite.
     """
     if not q.dot(q) + gravity @ gravity < math.inf:
         return np.full(2, np.nan)
@@ -153,16 +121,9 @@ def gravity_in_foot_plane(
 def add_noise(
     q: np.ndarray, v: np.ndarray, unit_noise: np.ndarray, noise: ObservationNoise
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Adds measurement noise to a state; noise of the orientation is a small rotation.
+    """Adds noise to a state, from standard normal samples (2 n_v,) for positions and velocities.
 
-    Args:
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-        unit_noise: Standard normal samples (2 n_v,) for positions and velocities.
-        noise: Standard deviations.
-
-    Returns:
-        Noisy positions (n_q,) and velocities (n_v,).
+    Noise of the orientation is a small rotation.
     """
     n_v = len(v)
     dq = noise.position * unit_noise[:n_v]
@@ -177,7 +138,4 @@ def add_noise(
         ]
     )
     quaternion /= math.sqrt(quaternion @ quaternion)
-    return (
-        np.concatenate([quaternion, q[4:] + dq[3:]]),
-        v + noise.velocity * unit_noise[n_v:],
-    )
+    return np.concatenate([quaternion, q[4:] + dq[3:]]), v + noise.velocity * unit_noise[n_v:]

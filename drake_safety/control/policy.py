@@ -9,38 +9,13 @@ from typing import TypeVar
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    NUM_BASE_VELOCITIES,
-    RobotKinematics,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
-from drake_safety.control.policy_terms import (
-    TERMS,
-    PolicyInput,
-    Term,
-    observation_term,
-    registered_terms,
-)
+from drake_safety.control.policy_terms import TERMS, PolicyInput, Term, registered_terms
+from drake_safety.control.policy_terms import observation_term as observation_term
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern, load_typed_file
-
-__all__ = [
-    "CommandLimits",
-    "GaitClock",
-    "ObservationTerm",
-    "Policy",
-    "PolicyInput",
-    "PolicyParameters",
-    "WholeHistory",
-    "load_policy",
-    "network_file",
-    "observation_term",
-    "read_policy_file",
-    "registered_terms",
-    "with_policy",
-]
 
 _Value = TypeVar("_Value")
 
@@ -164,21 +139,13 @@ class Policy:
     """A network with its observation, for one robot.
 
     Args:
-        parameters: Contents of ``policy.yaml``.
         joint_names: The robot's joints, in the order of its positions.
-        robot: Name of the robot, for messages.
-        folder: Folder of the YAML file.
-
-    Raises:
-        ValueError: A value is missing, a joint or term does not exist, or the network has other
-            widths.
 
     Attributes:
         parameters: Contents of ``policy.yaml``.
         joints: The policy's joints as indices into the robot's, (n_a,).
         default_positions: Of all joints of the robot at zero action, (n_j,) [rad].
         action_scale: (n_a,) [rad].
-        sizes: Width of every term.
     """
 
     def __init__(
@@ -245,7 +212,9 @@ class Policy:
             _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
         )
         self._terms = self._registered(who)
-        still = self._still()
+        q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
+        v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))
+        still = self.see(q, v, np.zeros(3), np.zeros(len(names)), self.initial_phases)
         widths = [np.asarray(term(still)).size for term, _ in self._terms]
         for (_, spec), width in zip(self._terms, widths, strict=True):
             if not width:
@@ -297,20 +266,6 @@ class Policy:
         self._entries = np.array([entry for entry, _ in places], dtype=int)
         self._earlier = np.array([places.get((i, age - 1), -1) for i, age in places], dtype=int)
 
-    def _still(self) -> PolicyInput:
-        n = len(self.joint_names)
-        zero = np.zeros(3)
-        return PolicyInput(
-            R_WB=np.eye(3),
-            w_WB=zero,
-            v_WB=zero,
-            positions=np.zeros(n),
-            rates=np.zeros(n),
-            command=zero,
-            action=np.zeros(n),
-            phases=self.initial_phases,
-        )
-
     def see(
         self,
         q: np.ndarray,
@@ -319,15 +274,7 @@ class Policy:
         action: np.ndarray,
         phases: np.ndarray,
     ) -> PolicyInput:
-        """Returns the input of the observation terms in a state.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,).
-            command: (3,) [m/s, rad/s].
-            action: The last action, (n_a,).
-            phases: (n_p,) [rad].
-        """
+        """The input of the terms, with a command (3,) [m/s, rad/s] and phases (n_p,) [rad]."""
         joints = q[NUM_BASE_POSITIONS:] - self.default_positions
         return PolicyInput(
             R_WB=RotationMatrix(quaternion_of(q)).matrix(),
@@ -341,12 +288,7 @@ class Policy:
         )
 
     def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
-        """Returns the network's input.
-
-        Args:
-            seen: The present input.
-            history: The last input of the network, (n_o,); NaN before the first.
-        """
+        """The network's input; ``history`` is its last one, (n_o,), NaN before the first."""
         present = np.concatenate(
             [
                 np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)
@@ -388,12 +330,7 @@ class Policy:
 
 
 def network_file(parameters: PolicyParameters, folder: str = "") -> Path:
-    """Returns the file of a policy's network, named relative to the folder of the YAML file.
-
-    Raises:
-        MissingExtraError: The package that has it is not installed.
-        ValueError: No network is named, or its package is unknown.
-    """
+    """Returns the file of a policy's network, named relative to the folder of the YAML file."""
     if not parameters.network:
         raise ValueError("policy: network must name an ONNX or TorchScript file")
     return model_file(parameters.network, folder, parameters.requires)
@@ -404,21 +341,12 @@ def _wrapped(phases: np.ndarray) -> np.ndarray:
 
 
 def read_policy_file(path: Path) -> PolicyParameters:
-    """Reads a ``policy.yaml``.
-
-    Raises:
-        ValueError: The file does not exist, is not YAML, or does not fit the schema.
-    """
+    """Reads a ``policy.yaml``."""
     return load_typed_file(PolicyParameters, path, f"policy file '{path}'")
 
 
 def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
-    """Loads a policy for a robot.
-
-    Raises:
-        MissingExtraError: The package that has the network is not installed.
-        ValueError: The file does not fit the schema, the robot or the network.
-    """
+    """Loads a policy for a robot."""
     return Policy(
         read_policy_file(path),
         kinematics.joint_names,

@@ -50,11 +50,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
 class PolicyNetwork:
     """A network that maps an observation (n_o,) to an action (n_a,).
 
-    Args:
-        path: Its file, for messages.
-        evaluate: Maps a batch (1, n_o) of float32 to (1, n_a).
-        widths: n_o and n_a; None where the file does not say.
-        metadata: What the file says of the policy.
+    ``evaluate`` takes a batch (1, n_o) of float32; widths that the file does not say are None.
     """
 
     def __init__(
@@ -75,17 +71,7 @@ class PolicyNetwork:
         return np.asarray(self._evaluate(batch), dtype=float).reshape(-1)
 
     def check(self, who: str, num_inputs: int, num_outputs: int, terms: str) -> None:
-        """Checks the widths of the network.
-
-        Args:
-            who: Beginning of messages.
-            num_inputs: Width of the observation.
-            num_outputs: Number of actions.
-            terms: The observation's terms and their widths, for messages.
-
-        Raises:
-            ValueError: The network has other widths.
-        """
+        """Checks the widths of the network."""
         seen, acting = self.widths
         if seen not in (None, num_inputs):
             raise ValueError(
@@ -107,12 +93,7 @@ class PolicyNetwork:
 
 
 def load_network(path: Path) -> PolicyNetwork:
-    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file.
-
-    Raises:
-        MissingExtraError: The package that evaluates it is not installed.
-        ValueError: The file does not exist, is of another kind, or cannot be read.
-    """
+    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file."""
     loaders = {".onnx": _load_onnx, ".pt": _load_torchscript, ".jit": _load_torchscript}
     if path.suffix not in loaders:
         raise ValueError(
@@ -179,11 +160,7 @@ def _width(shape: list[Any]) -> int | None:
 
 
 def _read_metadata(path: Path, raw: dict[str, str]) -> PolicyMetadata:
-    """Reads the entries of metadata that describe the policy.
-
-    Raises:
-        ValueError: An entry has another form, or there is not one per joint.
-    """
+    """Reads the entries of metadata that describe the policy."""
     found: dict[str, Any] = {}
     for entry, keys in _KEYS.items():
         for key in keys:

@@ -22,9 +22,7 @@ class PolicyTemplate:
     """What the files of a policy tell.
 
     Attributes:
-        network: The network.
         found: What a file of another project says, by key of ``policy.yaml``.
-        source: Name of the file that was read.
     """
 
     network: PolicyNetwork
@@ -39,11 +37,7 @@ class PolicyTemplate:
     def write(
         self, folder: Path, robot_joints: list[str], posture: dict[str, float]
     ) -> tuple[list[Path], list[str]]:
-        """Writes ``policy.yaml`` into a robot's folder, and copies the network there.
-
-        Returns:
-            The files, and what the user must supply.
-        """
+        """Writes ``policy.yaml`` into a robot's folder, and copies the network there."""
         network, path = folder / self.network.path.name, folder / "policy.yaml"
         shutil.copyfile(self.network.path, network)
         text, asked = self.yaml(robot_joints, posture)
@@ -134,9 +128,6 @@ def survey_policy(path: Path, motors: Sequence[str] = ()) -> PolicyTemplate:
         path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
             ``config.yaml`` of rl_sar.
         motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
-
-    Raises:
-        ValueError: The file is none of these, or one that it names cannot be read.
     """
     found = {} if path.suffix in _NETWORKS else converted_policy(path, motors)
     network = load_network(Path(found.pop("network", path)))

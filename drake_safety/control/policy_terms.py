@@ -39,11 +39,7 @@ TERMS: dict[str, Term] = {}
 
 
 def observation_term(name: str) -> Callable[[Term], Term]:
-    """Registers a function of a :class:`PolicyInput` as an observation term.
-
-    Raises:
-        ValueError: Another function has this name.
-    """
+    """Registers a function of a :class:`PolicyInput` as an observation term."""
 
     def register(term: Term) -> Term:
         if TERMS.setdefault(name, term) is not term:

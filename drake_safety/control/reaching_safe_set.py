@@ -8,11 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
-from drake_safety.control.kinematics import (
-    NUM_BASE_POSITIONS,
-    NUM_BASE_VELOCITIES,
-    planar_pose,
-)
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, planar_pose
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
     DIRECTIONS,
@@ -77,22 +73,14 @@ class ReachingSafeSet:
 
     Args:
         model: Tasks and weights of the controller, with the reaching hand.
-        clearance: Distances to the obstacles.
-        limits: The limits.
         is_mirrored: Whether features are mirrored.
-
-    Raises:
-        ValueError: The model has no hand, or the hand no joints.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")
     fall_name = "fall"
     angular_names = ("joint_limits",)
     watched_features = MappingProxyType(
-        {
-            "capture_point_margin": "capture_point_support",
-            "support_margin": "now_support_polygon",
-        }
+        {"capture_point_margin": "capture_point_support", "support_margin": "now_support_polygon"}
     )
     """Features for baseline monitors, by name of the monitor."""
 
@@ -167,12 +155,7 @@ class ReachingSafeSet:
         return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (4,) of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (4,) of a state, always finite."""
         del v
         return np.array(
             [
@@ -184,17 +167,10 @@ class ReachingSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """Returns the margins now, along the plan, and along a preview of the whole body.
+        """Margins (n_f,) [m, rad] now, along the plan, and along a preview of the whole body.
 
-        Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
-            preview: Desired positions of the hand from now to the goal, in the stance frame,
-                (M, 3) [m].
-
-        Returns:
-            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; all NaN if an argument
-            is not finite.
+        The preview has the desired positions of the hand from now to the goal, in the stance frame,
+        (M, 3) [m]. All are NaN if an argument is not finite.
         """
         if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
             return np.full(len(self.feature_names), np.nan)

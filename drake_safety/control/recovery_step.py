@@ -63,15 +63,10 @@ class RecoveryStepParameters:
 
 
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
-    """Returns the groups of feet that swing together: every second foot around the body.
+    """Two groups of feet that swing together: every second foot around the body.
 
-    Two feet step alternately, four in diagonal pairs, six in tripods.
-
-    Args:
-        foot_positions: Feet in the standing posture relative to their centroid, (n_feet, 2) [m].
-
-    Returns:
-        Two groups of foot indices.
+    Two feet step alternately, four in diagonal pairs, six in tripods. ``foot_positions`` (n_feet,
+    2) [m] are relative to their centroid.
     """
     around = np.argsort(np.arctan2(foot_positions[:, 1], foot_positions[:, 0]), kind="stable")
     return [sorted(around[0::2].tolist()), sorted(around[1::2].tolist())]
@@ -83,15 +78,9 @@ def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
 
 
 def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.ndarray:
-    """Position of a linear inverted pendulum with its centre of pressure at the capture point.
+    """Position (3,) [m] of a linear inverted pendulum with its support at the capture point.
 
-    Args:
-        p_WB: Initial position, at the constant height, (3,) [m].
-        v_WB: Initial horizontal velocity, (3,) [m/s].
-        elapsed_s: Time since then [s].
-
-    Returns:
-        The position, (3,) [m].
+    Its height is constant, its velocity ``v_WB`` horizontal.
     """
     time_constant_s = math.sqrt(p_WB[2] / GRAVITY_M_S2)
     return p_WB - v_WB * time_constant_s * math.expm1(-elapsed_s / time_constant_s)
@@ -112,13 +101,7 @@ def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
 
 
 def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) -> int:
-    """Returns the group to swing first, with the other's stance line nearest the capture point.
-
-    Args:
-        groups: See :func:`gait_groups`.
-        feet: Foot positions on the ground, (n_feet, 2) [m].
-        point: The capture point, (2,) [m].
-    """
+    """The group whose swing leaves the other's stance line nearest the capture point (2,) [m]."""
     distances = [distance_to_feet(point, feet[groups[1 - swing]]) for swing in (0, 1)]
     return int(np.argmin(distances))
 
@@ -143,7 +126,6 @@ def foothold(
         yaw: Yaw of the heading frame [rad].
         hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
-        parameters: Parameters of the step.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     R_WS = np.array([[c, -s], [s, c]])
@@ -162,16 +144,10 @@ def foothold(
 def swing_position(
     start: np.ndarray, target: np.ndarray, phase: float, lift_m: float
 ) -> np.ndarray:
-    """Returns a point of the swing trajectory (3,) [m].
+    """A point of the swing trajectory (3,) [m] at a phase in [0, 1].
 
-    Horizontally it follows a minimum-jerk profile from start to target; vertically it rises by
-    ``lift_m`` at mid-swing and reaches the target with zero speed.
-
-    Args:
-        start: Lift-off position (3,) [m].
-        target: Touchdown position (3,) [m].
-        phase: Phase of the swing, clipped to [0, 1].
-        lift_m: Largest height over the line from start to target [m].
+    Horizontally it follows a minimum-jerk profile from start to target; vertically it rises over
+    the line between them by ``lift_m`` at mid-swing and reaches the target with zero speed.
     """
     s = min(max(phase, 0.0), 1.0)
     point = start + minimum_jerk(s) * (target - start)

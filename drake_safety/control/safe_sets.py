@@ -18,14 +18,7 @@ DIRECTION_NAMES = [f"{round(math.degrees(angle))}deg" for angle in _ANGLES]
 
 
 def convex_hull(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
-    """Computes the convex hull, counter-clockwise (Andrew's monotone chain).
-
-    Args:
-        points: n points (2,) [m]; lists of floats are faster than an array.
-
-    Returns:
-        The corners; one or two if the points coincide or are collinear.
-    """
+    """Corners of the hull, counter-clockwise (monotone chain); two if points are collinear."""
     ordered = sorted((x, y) for x, y in points)
 
     def chain(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -47,12 +40,10 @@ def convex_hull(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
 def signed_distance_to_polygon(
     point: Sequence[float] | np.ndarray, corners: list[tuple[float, float]]
 ) -> float:
-    """Returns the signed distance of a point to a convex polygon's boundary, positive inside [m].
+    """Signed distance of a point (2,) to a convex polygon's boundary, positive inside [m].
 
-    Args:
-        point: (2,) [m].
-        corners: Counter-clockwise corners. For a segment or a point (two or one corners) the
-            distance is never positive, without corners it is minus infinity.
+    Corners are counter-clockwise. For a segment or a point (two or one corners) the distance is
+    never positive, without corners it is minus infinity.
     """
     if not corners:
         return -math.inf
@@ -75,14 +66,10 @@ def signed_distance_to_polygon(
 
 
 def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: float) -> float:
-    """Returns the signed distance of the base's ground projection to the support polygon [m].
+    """Signed distance of the base's ground projection to the support polygon [m].
 
-    In the air it is the negative distance to the centroid of the feet.
-
-    Args:
-        kinematics: The robot.
-        q: Positions (n_q,).
-        clearance_m: Height below which a contact point is on the ground [m].
+    Contact points below ``clearance_m`` are on the ground. In the air it is the negative distance
+    to the centroid of the feet.
     """
     p_WC = kinematics.contact_positions(q)
     points = zip(p_WC.tolist(), kinematics.foot_radii.tolist(), strict=True)
@@ -96,15 +83,10 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
 def fall_margin(
     kinematics: RobotKinematics, q: np.ndarray, lowest_height_m: float, cos_fall_tilt: float
 ) -> float:
-    """Returns the smaller of the margins of height and tilt before a fall [m].
+    """The smaller of the margins of height and tilt before a fall [m].
 
-    The margin of tilt is the height that a rigid pendulum loses before the largest tilt.
-
-    Args:
-        kinematics: The robot, whose standing height is the pendulum's length.
-        q: Positions (n_q,).
-        lowest_height_m: Lowest height of the base.
-        cos_fall_tilt: Cosine of the largest angle between the base's z axis and the vertical.
+    The margin of tilt is the height that a rigid pendulum of the standing height loses before the
+    largest angle between the base's z axis and the vertical.
     """
     # Floats are faster than short arrays.
     w, x, y, z, _, _, height = q[:7].tolist()
@@ -148,10 +130,6 @@ class BalanceSafeSet:
     - ``height``: distance to the nearer limit of the height [m];
     - ``fall``: the smaller of the height over ``fall_height_m`` and the height that a rigid
       pendulum of the standing height loses before ``fall_tilt_rad`` [m].
-
-    Args:
-        kinematics: The robot.
-        limits: The limits.
     """
 
     names = ("support_polygon", "height", "fall")
@@ -178,12 +156,7 @@ class BalanceSafeSet:
         self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (3,) [m] of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (3,) [m] of a state, always finite."""
         del v
         kinematics, limits = self.kinematics, self.limits
         height, (lowest, highest) = float(q[6]), limits.height_m
@@ -202,15 +175,8 @@ class BalanceSafeSet:
         the polygon extends beyond the point in that direction. Their number does not depend on the
         number of feet.
 
-        Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
-            preview: Desired base positions from now to the goal, in the stance frame, (M, 3)
-                [m].
-
-        Returns:
-            Features (n_f,), in the order of :attr:`feature_names` [m, rad]; all NaN if an argument
-            is not finite.
+        ``preview`` has the desired base positions from now to the goal, in the stance frame, (M, 3)
+        [m]. All are NaN if an argument is not finite.
         """
         if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
             return np.full(len(self.feature_names), np.nan)

@@ -58,13 +58,6 @@ class WalkingSafeSet:
     - ``joint_limits``: distance of the joint nearest to a stop, more ``stop_rad`` [rad];
     - ``fall``: the smaller of the height over the fallen height [m] and the tilt left until
       ``fall_tilt_rad``, times the standing height [m].
-
-    Args:
-        kinematics: The robot.
-        limits: The limits.
-
-    Raises:
-        ValueError: A listed body does not exist.
     """
 
     names = ("tilt", "height", "clearance", "joint_limits", "fall")
@@ -130,12 +123,7 @@ class WalkingSafeSet:
         )
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (5,) of a state, always finite.
-
-        Args:
-            q: Positions (n_q,).
-            v: Velocities (n_v,); unused by these constraints.
-        """
+        """Returns the signed margins (5,) of a state, always finite."""
         del v
         tilt, height = _tilt(q), float(q[6])
         fallen = min(
@@ -153,16 +141,10 @@ class WalkingSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """Returns the margins now, the coming commands, the tracking error and the capture point.
+        """The margins now, the coming commands, the tracking error and the capture point, (n_f,).
 
-        Args:
-            q: Positions (n_q,), measured.
-            v: Velocities (n_v,), measured.
-            preview: Commands from now on, (M, 3) [m/s, rad/s].
-
-        Returns:
-            Features (n_f,), in the order of :attr:`feature_names`; all NaN if an argument is not
-            finite.
+        The preview has the commands from now on, (M, 3) [m/s, rad/s]. All are NaN if an argument is
+        not finite.
         """
         if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
             return np.full(len(self.feature_names), np.nan)
@@ -192,12 +174,7 @@ class WalkingSafeSet:
         )
 
     def with_commands(self, features: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Returns features as if constant commands had been asked for, (C, n_f).
-
-        Args:
-            features: Features of this safe set, possibly followed by others, (n_f,).
-            commands: (C, 3) [m/s, rad/s].
-        """
+        """Features (C, n_f) as if constant commands (C, 3) [m/s, rad/s] had been asked for."""
         changed = np.tile(features, (len(commands), 1))
         for axis, name in enumerate(_AXES):
             column = self.feature_names.index

@@ -91,15 +91,7 @@ class StandingFoot:
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of a robot's whole-body program.
-
-    Args:
-        kinematics: The controller's model of the robot.
-        hand: Name of the reaching frame; None omits the reaching task.
-
-    Raises:
-        ValueError: The hand does not exist.
-    """
+    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand."""
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
         robot, plant = kinematics.robot, kinematics.plant
@@ -157,14 +149,10 @@ class WholeBodyModel:
         return self._stances[key]
 
     def reference(self, q: np.ndarray, *, posture: np.ndarray | None = None) -> WholeBodyReference:
-        """Returns the reference for standing on the feet of ``q``.
+        """The reference for standing on the feet of ``q`` in a posture (n_j,) [rad].
 
         The centre of mass is over the stance at its height in ``q``, the bodies have the
         orientations of the standing posture with the yaw of the stance, and the hand is at rest.
-
-        Args:
-            q: Positions (n_q,).
-            posture: Joint positions (n_j,) [rad]; the robot's standing posture by default.
         """
         kinematics = self.kinematics
         x, y, yaw = kinematics.stance_pose(q)
@@ -186,11 +174,7 @@ class WholeBodyModel:
         return reference
 
     def check_reference(self, reference: WholeBodyReference) -> None:
-        """Checks a reference.
-
-        Raises:
-            ValueError: A part is missing, not finite, or of a wrong size.
-        """
+        """Checks that a reference is complete and finite, and of the right sizes."""
         who = f"robot '{self.kinematics.robot.name}': the whole-body reference"
         for name, entries in (
             ("posture", self.kinematics.joint_names),
@@ -210,11 +194,7 @@ class WholeBodyModel:
             raise ValueError(f"{who}'s posture must be finite; got {reference.posture}")
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
-        """Returns the reaching point in the world, (3,) [m].
-
-        Raises:
-            ValueError: The model has no hand.
-        """
+        """Returns the reaching point in the world, (3,) [m]."""
         kinematics = self.kinematics
         if self.hand is None:
             raise ValueError(

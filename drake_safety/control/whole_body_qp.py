@@ -99,17 +99,7 @@ class _TaskRows:
 def build_qp(
     model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
 ) -> WholeBodyQP:
-    """Builds the quadratic program at one instant.
-
-    Args:
-        model: The model.
-        q: Positions (n_q,).
-        v: Velocities (n_v,).
-        reference: References of the tasks.
-
-    Raises:
-        NotFiniteError: A state or a point is not finite or implausibly large.
-    """
+    """Builds the quadratic program at one instant, or raises a `NotFiniteError`."""
     _check_size(model, "the state", q.dot(q) + v.dot(v))
     # Drake's plant aborts the process for a zero quaternion, as for a state that is not finite.
     _check_size(model, "the inverse of the quaternion", 1.0 / max(q[:4].dot(q[:4]), _TINY))
@@ -211,12 +201,7 @@ def _add_contacts(
 def task_errors(
     model: WholeBodyModel, reference: WholeBodyReference
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest.
-
-    Args:
-        model: The model, at the positions of its scratch Context.
-        reference: References of the tasks.
-    """
+    """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest."""
     kinematics = model.kinematics
     plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
     kv = JacobianWrtVariable.kV

@@ -17,6 +17,7 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
     spoken,
 )
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-    from drake_safety.learning.assessment import SafetyAssessment
-
 _MAX_POINTS = 12000
 FIRST_CAUSE = 3
 """Column of the first cause in the masses of a cell."""
@@ -40,11 +39,7 @@ SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the map: segments in the embedding, beliefs of the cells, and causes.
 
-    It shows the first map of an ensemble.
-
-    Args:
-        assessment: A fitted assessment.
-        episodes: Episodes whose segments are drawn, preferably not the training episodes.
+    It shows the first map of an ensemble. The episodes should not be those of the training.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     count = assessment.training_.counts(grid)[0]
@@ -54,16 +49,7 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         _draw_segments(fig, left, assessment, episodes)
         safe, is_empty = cells[:, SAFE], cells[:, UNCERTAINTY] >= 1.0
         most = max(1.0 - assessment.parameters.initial_uncertainty, safe.max())
-        draw_safety(
-            fig,
-            middle,
-            grid,
-            safe,
-            is_empty,
-            count,
-            label="belief: safe",
-            most=most,
-        )
+        draw_safety(fig, middle, grid, safe, is_empty, count, label="belief: safe", most=most)
         middle.set_title("Belief of each cell: safe")
         _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
         for axes in (left, middle, last):
@@ -114,18 +100,7 @@ def draw_safety(
     label: str,
     most: float = 1.0,
 ) -> None:
-    """Draws cells coloured by safety, with their numbers of training segments.
-
-    Args:
-        fig: The figure.
-        axes: Its axes.
-        grid: The grid.
-        safe: Value of each cell, (R*R,).
-        is_empty: Whether each cell holds no belief, (R*R,).
-        count: Number of segments in each cell, (R*R,).
-        label: Label of the colour bar.
-        most: Upper end of the colour scale.
-    """
+    """Draws cells coloured by safety (R*R,), with their numbers of training segments (R*R,)."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 

@@ -25,19 +25,8 @@ def evaluate_episodes(
     """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
     Thresholds maximise the balanced accuracy on the calibration set, separately for all segments
-    and for k = 0.
-
-    Args:
-        scorers: The scorers.
-        calibration: Fresh episodes for thresholds.
-        test: Other fresh episodes.
-
-    Returns:
-        The estimates by dotted key, the unsafe score of every test segment by scorer, (N,) each,
-        and the test segments.
-
-    Raises:
-        ValueError: A scorer has used the seed of a set.
+    and for k = 0. Returns the estimates by dotted key, the unsafe score of every test segment by
+    scorer, (N,) each, and the test segments.
     """
     _check(scorers, calibration, test)
     segments = split(test, stride=1, discount=1.0)
@@ -74,18 +63,8 @@ def evaluate_plans(
     Thresholds that are not given are chosen on the calibration set: each accepts most while a
     future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what the number of
     unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
-
-    Args:
-        scorers: The scorers.
-        calibration: Fresh episodes for thresholds.
-        test: Other fresh episodes.
-        thresholds: By scorer, the unsafe score above which a plan is refused.
-
-    Returns:
-        As :func:`evaluate_episodes`, of the first segments, with the outcomes' shares.
-
-    Raises:
-        ValueError: A scorer has used the seed of a set, or no calibration plan is unsafe.
+    Given ones are the unsafe score above which a plan is refused, by scorer. Returns what
+    :func:`evaluate_episodes` does, of the first segments, with the outcomes' shares.
     """
     _check(scorers, calibration, test)
     first, seen = first_segments(test), first_segments(calibration)
@@ -118,9 +97,6 @@ def promised_miss_rate(is_unsafe: np.ndarray) -> float:
     """Miss rate that thresholds promise if chosen on plans with these labels, (N,).
 
     It is higher than wanted with few unsafe plans.
-
-    Raises:
-        ValueError: No plan is unsafe.
     """
     num_unsafe, wanted = int(is_unsafe.sum()), 1.0 - PROMISED_UNSAFE_RECALL
     if num_unsafe == 0:

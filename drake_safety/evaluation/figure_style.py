@@ -91,12 +91,7 @@ def drawing_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Creates an empty figure without a window.
-
-    Args:
-        width: Its width [inches].
-        height: Its height [inches].
-    """
+    """Creates an empty figure without a window; sizes in inches."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(width, height), layout="constrained")
@@ -105,13 +100,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
-    """Writes a threshold beside its line, outside the axes.
-
-    Args:
-        axes: The axes, whose y axis has the threshold's quantity.
-        threshold: The threshold.
-        colour: Colour of the text.
-    """
+    """Writes a threshold beside its line, outside the axes."""
     axes.annotate(
         f"threshold {threshold:.3g}",
         (1.0, threshold),
@@ -125,14 +114,9 @@ def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
 
 
 def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
-    """Writes a figure as PNG, at twice the usual resolution, and as SVG.
+    """Writes a figure as PNG, at twice the usual resolution, and as SVG; returns both paths.
 
-    Args:
-        fig: The figure.
-        path: Path of the files; its suffix is replaced.
-
-    Returns:
-        The two paths, PNG first.
+    The suffix of the path is replaced.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -24,11 +24,7 @@ _MARKS = "osD^vP"
 
 
 def interval_figure(rows: Sequence[Result]) -> Figure:
-    """Plots a panel for each metric: methods below each other, sets side by side in colours.
-
-    Args:
-        rows: Rows of the table of results, at least one.
-    """
+    """Plots a panel for each metric: methods below each other, sets side by side in colours."""
     metrics, methods, sets = (
         list(dict.fromkeys(getattr(row, name) for row in rows))
         for name in ("metric", "method", "set")

@@ -22,8 +22,6 @@ class Estimate:
 
     Attributes:
         value: The estimate; NaN without samples.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
         n: Number of independent samples: episodes or throws, never segments.
     """
 
@@ -43,22 +41,10 @@ class Estimate:
         value, low, high = (math.nan if end is None else float(end) for end in row[:3])
         return cls(value, low, high, int(row[3] or 0))
 
-    def to_json(self) -> dict[str, float | int | None]:
-        """The estimate as JSON types; non-finite numbers become None."""
-        fields = {"value": self.value, "low": self.low, "high": self.high}
-        finite = {k: float(v) if math.isfinite(v) else None for k, v in fields.items()}
-        return {**finite, "n": int(self.n)}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
-    """Bootstrap intervals: percentiles over resamples of the independent samples.
-
-    Attributes:
-        confidence: Confidence of the interval.
-        num_resamples: Number of resamples.
-        seed: Seed of the resamples.
-    """
+    """Bootstrap intervals: percentiles over resamples of the independent samples."""
 
     confidence: float = 0.95
     num_resamples: int = 1000
@@ -99,11 +85,7 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
-
-    Raises:
-        ValueError: `count` is not in 0..n.
-    """
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
     if not 0 <= count <= n:
         raise ValueError(f"proportion: count is {count}, expected 0..{n}")
     from scipy.stats import binomtest
@@ -118,9 +100,6 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values are allowed: a fall that never happens is later than any other.
-
-    Raises:
-        ValueError: A value is NaN.
     """
     values = np.sort(np.asarray(values, dtype=float))
     if np.isnan(values).any():
@@ -224,18 +203,8 @@ def segment_estimates(
     """AUC, recalls and Brier score of a scorer on segments.
 
     Intervals are over episodes: bootstraps, and those of :func:`share` for the recalls.
-
-    Args:
-        segments: The N segments, as `split(episodes, stride=1, ...)` gives them.
-        unsafe_score: Unsafe score of each, (N,), in [0, 1].
-        threshold: Score above which a segment is classified unsafe.
-        bootstrap: Settings of the intervals.
-
-    Returns:
-        `auc`, `safe_recall`, `unsafe_recall` and `brier`.
-
-    Raises:
-        ValueError: The number of scores differs, or one is outside [0, 1].
+    Segments are as `split(episodes, stride=1, ...)` gives them; scores (N,) are in [0, 1], and
+    unsafe above the threshold.
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode = segments.episode
@@ -258,9 +227,6 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     """The threshold of scores (N,) with the best balanced accuracy, the mean of both recalls.
 
     It is midway between two scores; of equally good ones, it is the middle one.
-
-    Raises:
-        ValueError: One of the classes is missing, or no score is finite.
     """
     score, label = _checked("threshold_at", unsafe_score, is_unsafe)
     num_unsafe = int(label.sum())

@@ -9,18 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.evaluation.embedding_figure import draw_safety
-from drake_safety.evaluation.figure_style import (
-    INK,
-    drawing_style,
-    label_threshold,
-    new_figure,
-)
+from drake_safety.evaluation.figure_style import INK, drawing_style, label_threshold, new_figure
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import UNCERTAINTY, safe_share
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from drake_safety.learning.assessment import SafetyAssessment
 
 
 def path_figure(
@@ -31,17 +25,10 @@ def path_figure(
     threshold: float,
     events: Mapping[str, float],
 ) -> Figure:
-    """Plots Ψ(x) of a motion over the beliefs of the cells, and its probability over time.
+    """Plots Ψ(x) (N, 2) over the beliefs of the cells, and the probability (N,) over time [s].
 
-    As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble.
-
-    Args:
-        assessment: The fitted assessment of the motion.
-        time_s: Times [s], (N,).
-        points: Ψ(x), (N, 2).
-        probability: Probability, (N,).
-        threshold: Threshold of triggers.
-        events: Times of named events [s]; they are marked and numbered in both panels.
+    As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble. Events are
+    times [s] by name, marked and numbered in both panels.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     is_empty = cells[:, UNCERTAINTY] >= 1.0

@@ -27,16 +27,11 @@ _BOOTSTRAP = Bootstrap(num_resamples=100)
 def verdict_shares(
     calibration: Calibration, unsafe_score: np.ndarray, is_unsafe: np.ndarray
 ) -> dict[str, Estimate]:
-    """Shares of the verdicts of stored thresholds on fresh episodes.
+    """Shares of the verdicts of stored thresholds on fresh episodes (N,).
 
-    Args:
-        calibration: The calibration.
-        unsafe_score: 1 - probability of each episode, (N,), for the kind of the calibration.
-        is_unsafe: Whether each ended unsafely, (N,).
-
-    Returns:
-        `promised_miss_rate`; `miss_rate` and `unsafe_unknown`, shares of the unsafe episodes;
-        `safe_recall`, `safe_unknown` and `false_alarm_rate`, shares of the safe ones.
+    Scores are 1 - probability. The shares are `promised_miss_rate`; `miss_rate` and
+    `unsafe_unknown`, shares of the unsafe episodes; `safe_recall`, `safe_unknown` and
+    `false_alarm_rate`, shares of the safe ones.
     """
     verdict = calibration.verdicts(1.0 - np.asarray(unsafe_score, dtype=float))
     label = np.asarray(is_unsafe, dtype=bool)
@@ -77,17 +72,9 @@ def reliability(
     num_bins: int = 10,
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Reliability:
-    """Compares probabilities with outcomes.
+    """Compares 1 - probability of rows, (N,), NaN counting as one, with outcomes of their episodes.
 
-    Args:
-        unsafe_probability: 1 - probability of each row, (N,), in [0, 1]; NaN counts as one.
-        is_unsafe: Whether the row's episode ended unsafely, (N,).
-        episode: Index of each row's episode, (N,).
-        num_bins: Number of bins; fewer if rows share probabilities.
-        bootstrap: Settings of the intervals, which are over episodes.
-
-    Raises:
-        ValueError: There is no row, or a probability outside [0, 1].
+    There are fewer than ``num_bins`` bins if rows share probabilities.
     """
     p = np.asarray(unsafe_probability, dtype=float)
     p = np.where(np.isnan(p), 1.0, p)
@@ -120,11 +107,7 @@ def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
 
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
-    """Plots the observed share of unsafe ends over the predicted probability.
-
-    Args:
-        curves: Reliability by name.
-    """
+    """Plots the observed share of unsafe ends over the predicted probability."""
     with drawing_style():
         fig = new_figure(5.4, 6.0)
         axes = fig.subplots()

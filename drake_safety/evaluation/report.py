@@ -26,15 +26,8 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     """Writes the page into the folder of a run, from what is there.
 
     Assessments, results and pictures are those of `train`, `calibrate`, `evaluate`, `run` and
-    `adapt`. Recordings are linked, all else is inside the page.
-
-    Args:
-        folder: The folder.
-        episodes: Folder of the training episodes, for the command of the training.
-        versions: Versions of the packages that write the page.
-
-    Raises:
-        ValueError: The folder holds neither an assessment nor results, or a damaged one.
+    `adapt`. Recordings are linked, all else is inside the page. The command of the training names
+    ``episodes``.
     """
     require_extra("report", "report")
     from jinja2 import Environment, StrictUndefined

@@ -38,11 +38,7 @@ class Result(Estimate):
 
     @classmethod
     def of(cls, key: str, estimate: Estimate) -> Result:
-        """The row with a key "set.method.metric", "set.metric" or "metric"; a set may have dots.
-
-        Raises:
-            ValueError: The key has other characters than letters, digits, spaces, "_", "-", ".".
-        """
+        """The row with a key "set.method.metric", "set.metric" or "metric"; a set may have dots."""
         if not _KEY.fullmatch(key):
             raise ValueError(
                 f"a result has the key '{key[:80]}', expected letters, digits, spaces, '_' and "
@@ -55,12 +51,7 @@ class Result(Estimate):
 
 
 class Results(Mapping[str, Result]):
-    """Rows by key "set.method.metric", in their order, and what made them.
-
-    Args:
-        estimates: By key.
-        entries: Command, scenario, seeds, versions and the like, as JSON types.
-    """
+    """Rows by key "set.method.metric", in their order, and what made them, as JSON types."""
 
     def __init__(self, estimates: Mapping[str, Estimate], entries: Mapping[str, Any] | None = None):
         self._rows = {key: Result.of(key, estimate) for key, estimate in estimates.items()}
@@ -92,11 +83,7 @@ class Results(Mapping[str, Result]):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Results:
-        """Reads a file that `write` wrote.
-
-        Raises:
-            ValueError: The file holds no results.
-        """
+        """Reads a file that `write` wrote."""
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
             found = (content["schema"], content["schema_version"])

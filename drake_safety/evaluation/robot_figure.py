@@ -31,11 +31,10 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
 )
 from drake_safety.evaluation.stills import StillCamera
+from drake_safety.simulation.legged_loop import LeggedLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from drake_safety.simulation.legged_loop import LeggedLoop
 
 _COLOURS: dict[type[Shape], tuple[str, str]] = {
     Box: ("boxes", SAFE_COLOUR),
@@ -50,11 +49,7 @@ _VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
 
 
 def robot_figure(loop: LeggedLoop) -> Figure:
-    """Draws a robot in its standing posture: as it looks, and as it collides.
-
-    Args:
-        loop: A closed loop with a legged robot.
-    """
+    """Draws a robot in its standing posture: as it looks, and as it collides."""
     context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
     positions = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
@@ -82,15 +77,7 @@ def robot_figure(loop: LeggedLoop) -> Figure:
 
 
 def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
-    """Shows a robot's collision shapes in place of its visuals, coloured by kind.
-
-    Args:
-        loop: A closed loop with a legged robot.
-        context: Its root Context, which changes.
-
-    Returns:
-        Number of shapes by kind.
-    """
+    """Shows a robot's collision shapes, coloured by kind, for its visuals, and counts them."""
     from matplotlib.colors import to_rgb
 
     plant, scene_graph = loop.plant, loop.GetSubsystemByName("scene_graph")

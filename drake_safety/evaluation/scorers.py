@@ -18,7 +18,6 @@ class Scorer:
     """A source of safety probabilities.
 
     Attributes:
-        name: Its key in tables.
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
             (N, n_f); NaN where nothing is known.
         uses_true_state: Whether it takes the state without noise in nominal episodes.
@@ -38,12 +37,7 @@ class Scorer:
 
 
 def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
-    """The probability of an assessment as a scorer.
-
-    Args:
-        name: Its key in tables.
-        assessment: A fitted assessment.
-    """
+    """The probability of an assessment as a scorer."""
 
     def probability(
         state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray

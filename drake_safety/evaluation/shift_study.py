@@ -136,8 +136,6 @@ class JudgedShift:
     """The verdicts of all methods on the motions of a shift.
 
     Attributes:
-        motions: The motions.
-        assessment: Γ, with the monitor's innovation.
         verdicts: By method, on all rows of all motions; "gamma" is Γ.
     """
 
@@ -210,16 +208,9 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     """
     is_unsafe, motion = judged.is_unsafe, judged.motion
     found = {"unsafe": proportion(int(is_unsafe.sum()), len(is_unsafe))}
-
-    def share(mask: np.ndarray) -> Estimate:
-        def mean(weight: np.ndarray) -> float:
-            return float(np.average(mask, weights=weight)) if weight.any() else np.nan
-
-        return BOOTSTRAP.over_episodes(mean, motion)
-
     for name, verdicts in judged.verdicts.items():
-        found[f"{name}.confident_error"] = share(judged.is_wrong(name))
-        found[f"{name}.unknown"] = share(verdicts.is_unknown)
+        found[f"{name}.confident_error"] = _mean(judged.is_wrong(name), motion)
+        found[f"{name}.unknown"] = _mean(verdicts.is_unknown, motion)
         if 0 < is_unsafe.sum() < len(is_unsafe):
             score = 1.0 - np.nan_to_num(verdicts.probability)
             found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
@@ -239,7 +230,7 @@ def monitor_estimates(judged: JudgedShift) -> dict[str, Estimate]:
         for span in SPANS_S:
             errors[span].append(float(until[: round(span / step_s)].mean()))
     found = {
-        f"monitor.confident_error_{span:g}s": _mean(np.array(values))
+        f"monitor.confident_error_{span:g}s": _mean(np.array(values), np.arange(len(values)))
         for span, values in errors.items()
     }
     found["monitor.delay_s"] = _quantile(np.array(delay), 0.5)
@@ -248,10 +239,11 @@ def monitor_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     return found
 
 
-def _mean(values: np.ndarray) -> Estimate:
-    return BOOTSTRAP.over_episodes(
-        lambda weight: float(np.average(values, weights=weight)), np.arange(len(values))
-    )
+def _mean(values: np.ndarray, motion: np.ndarray) -> Estimate:
+    def mean(weight: np.ndarray) -> float:
+        return float(np.average(values, weights=weight)) if weight.any() else np.nan
+
+    return BOOTSTRAP.over_episodes(mean, motion)
 
 
 def _quantile(values: np.ndarray, quantile: float) -> Estimate:
@@ -271,10 +263,6 @@ def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Est
     """False alarms of the monitor per hour, on nominal motions one after another.
 
     Motions that end unsafely are left out; the charts begin anew after an alarm.
-
-    Args:
-        motions: Nominal motions.
-        assessment: Γ, with the monitor's innovation.
     """
     innovation = assessment.innovation_
     x = [
@@ -304,12 +292,7 @@ def evaluate_shifts(
 ) -> dict[str, Estimate]:
     """Estimates of every shift by dotted key; of the monitor on changed plants and sensors.
 
-    Args:
-        sets: By shift, its kind and its motions.
-        judges: Methods by name; "gamma" is Γ.
-        assessment: Γ, with the monitor's innovation.
-        progress: Called with a stage, the number done and the number wanted.
-        more: Other estimates of a shift of a kind.
+    Judges are methods by name; "gamma" is Γ.
     """
     found: dict[str, Estimate] = {}
     for i, (name, (kind, motions)) in enumerate(sets.items()):

@@ -39,8 +39,6 @@ class PlantShift:
 
     Attributes:
         kind: "plant" or "sensor".
-        variation: The plant, with its sensors.
-        options: Options of the diagram.
     """
 
     kind: str
@@ -49,14 +47,9 @@ class PlantShift:
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
-    """Shifts of plant and sensors, each from the nominal plant, and the scenario's variations.
+    """Shifts of plant and sensors from the nominal plant, and the scenario's variations, by name.
 
-    Args:
-        scenario: The scenario.
-        loop: Its diagram; that of a robot with legs has shifts besides the scenario's variations.
-
-    Returns:
-        The shifts by name.
+    Robots with legs have more.
     """
     own = {
         f"variation {name}": PlantShift(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import (
@@ -24,13 +23,10 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import Context
 from pydrake.systems.sensors import CameraInfo
 
 from drake_safety.models import load_robot
-
-if TYPE_CHECKING:
-    from drake_safety.simulation.legged_loop import LeggedLoop, View
+from drake_safety.simulation.legged_loop import LeggedLoop, View
 
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
@@ -44,11 +40,10 @@ class StillCamera:
     """A camera that looks at a closed loop's robot from a fixed direction and follows its base.
 
     Args:
-        loop: A closed loop that has its MultibodyPlant as ``plant``.
         positions: Positions of the plant from which distance and lights are set, such as the first
             of a log, (n_q,).
         width: Width of the stills [pixels].
-        height: Height of the stills [pixels].
+        height: Their height [pixels].
         view: View of the camera; that of the task by default.
     """
 
@@ -65,8 +60,8 @@ class StillCamera:
         robot = load_robot(loop.scenario.robot)
         self._instance = plant.GetModelInstanceByName(robot.name)
         self._base = plant.GetBodyByName(robot.base, self._instance)
-        self._context = loop.CreateDefaultContext()
-        self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
+        self.context = loop.CreateDefaultContext()  # The root Context that is rendered.
+        self._plant_context = plant.GetMyMutableContextFromRoot(self.context)
         self._pose(positions)
 
         centre, radius = self._extent()
@@ -93,7 +88,7 @@ class StillCamera:
         self._camera = ColorRenderCamera(core)
         scene_graph = loop.GetSubsystemByName("scene_graph")
         scene_graph.AddRenderer(
-            scene_graph.GetMyMutableContextFromRoot(self._context),
+            scene_graph.GetMyMutableContextFromRoot(self.context),
             _RENDERER,
             MakeRenderEngineVtk(
                 _lighting(centre, radius, brightness=_PBR_BRIGHTNESS if self._has_gltf() else 1.0)
@@ -102,17 +97,7 @@ class StillCamera:
         self._world = scene_graph.world_frame_id()
 
     def render(self, positions: np.ndarray) -> np.ndarray:
-        """Renders the plant at given positions.
-
-        Args:
-            positions: All positions of the plant, including those of a ball, (n_q,).
-
-        Returns:
-            RGB, (height, width, 3), uint8.
-
-        Raises:
-            ValueError: The positions are not finite.
-        """
+        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         target = np.append(base[:2] + self._offset, self._look_at_height)
@@ -124,11 +109,6 @@ class StillCamera:
         rows, columns = pixels.shape[0] // _SUPERSAMPLING, pixels.shape[1] // _SUPERSAMPLING
         blocks = pixels.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
-
-    @property
-    def context(self) -> Context:
-        """The root Context that is rendered."""
-        return self._context
 
     def _pose(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
@@ -167,18 +147,7 @@ class StillCamera:
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """All positions of a plant from the logged states of its model instances.
-
-    Args:
-        loop: A closed loop that has its MultibodyPlant as ``plant``.
-        states: Positions, or positions and velocities, by name of the model instance, (N, n).
-
-    Returns:
-        Positions, (N, n_q).
-
-    Raises:
-        ValueError: A model instance with positions is missing, or another is given.
-    """
+    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances."""
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
@@ -198,15 +167,9 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 def still_times(
     time_s: np.ndarray, events_s: Iterable[float] = (), *, num_stills: int = 2
 ) -> list[float]:
-    """Times of stills of a motion: those of events, and others spread between them.
+    """Logged instants [s] of stills: those of events, and ``num_stills`` others between them.
 
-    Args:
-        time_s: Instants of the log [s], (N,), increasing.
-        events_s: Times of events [s].
-        num_stills: Number of evenly spread times, of which those close to an event are dropped.
-
-    Returns:
-        Logged instants [s], increasing.
+    Of the others, those close to an event are dropped.
     """
     kept = [*events_s]
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
@@ -224,18 +187,9 @@ def render_stills(
     width: int = 720,
     height: int = 540,
 ) -> list[tuple[float, np.ndarray]]:
-    """Renders stills of a logged simulation.
+    """Logged instants [s] and RGB images (height, width, 3) nearest to the times of stills [s].
 
-    Args:
-        loop: The closed loop that was simulated, or one with the same plant.
-        time_s: Instants of the log [s], (N,), increasing.
-        positions: All positions of the plant at these instants, (N, n_q).
-        still_times_s: Times of the stills [s]; the nearest logged instant is shown.
-        width: Width of the stills [pixels].
-        height: Height of the stills [pixels].
-
-    Returns:
-        (time [s] of the logged instant, RGB image (height, width, 3)) of each still.
+    ``time_s`` (N,) increases; ``positions`` (N, n_q) are all positions of the loop's plant.
     """
     camera = StillCamera(loop, positions[0], width=width, height=height)
     rows = _nearest_rows(time_s, still_times_s)

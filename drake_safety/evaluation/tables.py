@@ -24,12 +24,9 @@ class Column:
     """A column of a table: a metric and how it is written.
 
     Attributes:
-        key: The metric.
-        title: Its heading.
         unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "n" for a number
             of trials, "/h" for a rate, or "=" and "=%" for values without interval.
         better: 1 if larger is better, -1 if smaller is, 0 otherwise.
-        digits: Digits after the decimal point.
     """
 
     key: str
@@ -73,8 +70,6 @@ class Row:
     """A row of a table.
 
     Attributes:
-        key: Its method, or its part of the keys of its results.
-        label: Its label.
         estimates: One a column; None if missing.
     """
 
@@ -85,15 +80,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of estimates.
-
-    Attributes:
-        corner: Heading of the row labels.
-        columns: The columns.
-        rows: The rows.
-        title: Its heading.
-        meaning: Its explanation.
-    """
+    """A table of estimates."""
 
     corner: str
     columns: Sequence[Column]
@@ -182,13 +169,7 @@ class Table:
 
 
 def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Column]) -> list[Row]:
-    """Rows of the results with given beginnings of their keys; empty rows are left out.
-
-    Args:
-        results: The results.
-        labels: Label of the row by beginning, such as "plans.sharpened".
-        columns: The columns.
-    """
+    """Rows of the results by beginning of their keys and label; empty rows are left out."""
     rows = [
         Row(prefix, label, [results.get(f"{prefix}.{column.key}") for column in columns])
         for prefix, label in labels.items()

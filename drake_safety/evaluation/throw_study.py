@@ -22,13 +22,7 @@ PAPER_THRESHOLD = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class TriggerRule:
-    """A scorer with a threshold that triggers recovery.
-
-    Attributes:
-        name: Its key in tables.
-        scorer: The scorer.
-        threshold: Γ_thre.
-    """
+    """A scorer with a threshold that triggers recovery."""
 
     name: str
     scorer: Scorer
@@ -36,18 +30,9 @@ class TriggerRule:
 
 
 def trigger_rules(
-    sharpened: SafetyAssessment,
-    paper: SafetyAssessment,
-    *,
-    threshold: float,
+    sharpened: SafetyAssessment, paper: SafetyAssessment, *, threshold: float
 ) -> list[TriggerRule]:
-    """The scenario's rule, named "sharpened", and the paper's.
-
-    Args:
-        sharpened: An assessment in the sharpened mode.
-        paper: An assessment in the paper's mode.
-        threshold: The scenario's Γ_thre.
-    """
+    """The scenario's rule, named "sharpened", and the paper's."""
     own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
     return [
         TriggerRule(name="sharpened", scorer=own, threshold=threshold),
@@ -58,11 +43,7 @@ def trigger_rules(
 def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
     """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
 
-    Args:
-        log: The log.
-        scorer: The scorer.
-        persistence_s: Where nothing is known, the highest probability within this time counts [s];
-            before it has passed, 1.
+    Where nothing is known, the highest within ``persistence_s`` counts; before it has passed, 1.
     """
     probability = scorer.probability(log.state, log.desired_preview, log.features)
     if len(probability) < 2 or not persistence_s:
@@ -86,18 +67,8 @@ def evaluate_throws(
 ) -> tuple[dict[str, Estimate], list[ThrowLog]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
-    Args:
-        scenario: The scenario.
-        rules: The rules.
-        num_throws: Number of throws.
-        seed: Their seed.
-        persistence_s: Time for which "don't know" must have lasted to trigger [s].
-        variation: Variation of the plant.
-        num_workers: Number of worker processes.
-        progress: Called with a stage, the number done and the number wanted.
-
-    Returns:
-        The estimates by dotted key, and the throws without recovery.
+    "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
+    and the throws without recovery.
     """
     report = progress or (lambda stage, done, total: None)
     throw = partial(run_throws, scenario, seed=seed, variation=variation, num_workers=num_workers)

@@ -25,14 +25,13 @@ from drake_safety.evaluation.figure_style import (
     spoken,
 )
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+from drake_safety.plants.balls import Throw
+from drake_safety.plants.pushes import Push
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import GridSpecBase
-
-    from drake_safety.plants.balls import Throw
-    from drake_safety.plants.pushes import Push
 
 _WIDTH = 12.0  # All sizes are in inches.
 _CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
@@ -67,22 +66,13 @@ def timeline_figure(
     Args:
         time_s: Instants [s], (N,).
         probability: Held until the next instant, (N,).
-        threshold: Threshold of triggers or alarms.
-        throws: Balls, marked at the time of impact.
-        pushes: Pushes, marked for their duration.
         trigger_times_s: Times of triggers or alarms [s].
-        trigger_label: Label of these.
         leave_time_s: Time at which the robot leaves the safe set [s]; infinite for never.
         recovery_intervals_s: (start, end) of each recovery [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
-        constraint_names: Names of the columns of `margins`.
         angular_constraints: Constraints whose margins are angles.
-
-    Raises:
-        ValueError: Arrays have different lengths, the number of names is not that of margins, or
-            a still is outside the time range.
     """
     time_s, probability = (np.asarray(one, dtype=float) for one in (time_s, probability))
     for name, values in (("probability", probability), ("belief", belief), ("margins", margins)):
@@ -114,8 +104,10 @@ def timeline_figure(
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
         curve_axes, *others = panels
         curve_axes.set_xlim(time_s[0], time_s[-1])
-        _draw_curve(curve_axes, time_s, probability, threshold)
-        curve_axes.set_ylabel("probability")
+        curve_axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
+        label_threshold(curve_axes, threshold, UNSAFE_COLOUR)
+        curve_axes.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
+        curve_axes.set(yticks=[0.0, 0.5, 1.0], ylabel="probability")
         remaining = iter(others)
         if belief is not None:
             _draw_belief(next(remaining), time_s, belief)
@@ -129,7 +121,10 @@ def timeline_figure(
             curve_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
         top = _draw_labels(curve_axes, labels, rows)
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
-            _draw_still(axes, image, f"({letter})  {instant:.2f} s")
+            axes.imshow(image, interpolation="antialiased")
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            axes.set_title(f"({letter})  {instant:.2f} s", fontsize=10, pad=4)
             row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
             height = probability[row] if np.isfinite(probability[row]) else 0.0
             _join(fig, axes, curve_axes, (instant, height), top)
@@ -143,15 +138,7 @@ def timeline_figure(
 def _lay_out(
     heights: Sequence[float], images: Sequence[np.ndarray]
 ) -> tuple[Figure, list[Axes], list[Axes]]:
-    """Lays out a strip of images, if any, above panels with a common time axis.
-
-    Args:
-        heights: Heights of the panels [inches], from the top.
-        images: The images, (height, width, 3) each.
-
-    Returns:
-        The figure, the axes of the images, and the axes of the panels.
-    """
+    """Lays out a strip of images, if any, above panels of some heights [inches]."""
     pictures: list[Axes] = []
     if images:
         aspect = max(image.shape[0] / image.shape[1] for image in images)
@@ -168,13 +155,6 @@ def _lay_out(
     for i in range(len(heights)):
         panels.append(fig.add_subplot(rows[i, 0], sharex=panels[0] if panels else None))
     return fig, pictures, panels
-
-
-def _draw_curve(axes: Axes, time_s: np.ndarray, probability: np.ndarray, threshold: float) -> None:
-    axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
-    label_threshold(axes, threshold, UNSAFE_COLOUR)
-    axes.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
-    axes.set_yticks([0.0, 0.5, 1.0])
 
 
 def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
@@ -330,13 +310,6 @@ def _draw_labels(axes: Axes, labels: Sequence[_Label], rows: Sequence[int]) -> f
             path_effects=[withStroke(linewidth=3.0, foreground="white")],
         )
     return top
-
-
-def _draw_still(axes: Axes, image: np.ndarray, title: str) -> None:
-    axes.imshow(image, interpolation="antialiased")
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
-    axes.set_title(title, fontsize=10, pad=4)
 
 
 def _join(

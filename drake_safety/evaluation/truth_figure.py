@@ -9,17 +9,15 @@ import numpy as np
 from drake_safety.evaluation.embedding_figure import safety_colours
 from drake_safety.evaluation.figure_style import FAINT_INK, INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.metrics import area_under_curve
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import check_unused
-from drake_safety.learning.segments import DIVERGED
+from drake_safety.learning.segments import DIVERGED, Episodes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.segments import Episodes
 
 _OUTSIDE_COLOUR = "#6b7178"
 _HATCH = "////"
@@ -42,15 +40,9 @@ def truth_figure(
     unsafe. Diverged episodes are left out.
 
     Args:
-        assessment: A fitted assessment.
         episodes: Episodes that it has not used.
         x: Name of the state variable on the horizontal axis, of `episodes.info.state_names`.
-        y: Name of that on the vertical axis.
         labels: Labels of the two axes, such as "tilt [rad]"; the names by default.
-
-    Raises:
-        ValueError: A state variable does not exist, the assessment has used the episodes' seed, or
-            no episode starts inside the safe set and has an outcome.
     """
     names = episodes.info.state_names
     for name in (x, y):

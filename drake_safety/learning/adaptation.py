@@ -25,7 +25,6 @@ class Adaptation:
     Attributes:
         method: "paper" or "recalibration".
         variation: Plant variation of the actual episodes.
-        num_sets: Number of feedback sets.
         num_differing: Number of feedback sets whose twin ended differently.
     """
 
@@ -60,18 +59,9 @@ class TrainingScores:
 
     @classmethod
     def of(
-        cls,
-        segments: Segments,
-        output: EmbeddingOutput,
-        base_logit: BaseLogit | None,
+        cls, segments: Segments, output: EmbeddingOutput, base_logit: BaseLogit | None
     ) -> TrainingScores:
-        """Those of training segments, in the precision in which files store them.
-
-        Args:
-            segments: The training segments.
-            output: What the maps give for them.
-            base_logit: The base logit; None for maps without heads.
-        """
+        """Those of training segments, in the precision in which files store them."""
         heads = nearest = None
         if base_logit is not None:
             margins = output.margins.mean(axis=0)
@@ -109,10 +99,6 @@ class TrainingScores:
         A segment is kept with probability p = min(1, c / n), n the number of segments in its cell
         and c = 500; with several maps, the largest p. It then stands for 1 / p segments, so that
         sums over cells keep their expectations (Horvitz and Thompson, 1952).
-
-        Args:
-            grid: The grid.
-            seed: Seed of the draws.
         """
         probability, count = np.zeros(len(self.score)), self.counts(grid)
         for points, member_count in zip(self.points, count, strict=True):
@@ -145,16 +131,7 @@ METHODS = ("recalibration", "paper")
 
 
 def chosen_method(method: str | None, *, has_heads: bool, who: str) -> str:
-    """The method of an adaptation.
-
-    Args:
-        method: One of `METHODS`; None for the first that the maps allow.
-        has_heads: Whether the maps have heads, which "recalibration" needs.
-        who: The assessment, for messages.
-
-    Raises:
-        ValueError: Unknown method, or maps without heads for "recalibration".
-    """
+    """The method of an adaptation."""
     method = method or METHODS[0 if has_heads else 1]
     if method not in METHODS or (method == "recalibration" and not has_heads):
         raise ValueError(
@@ -171,15 +148,7 @@ def prior_beliefs(
     num_causes: int,
     uncertainty: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Computes beliefs of every map's cells from the training segments, (K, R*R, 3 + n_c).
-
-    Args:
-        training: The training segments.
-        grid: The grid.
-        parameters: The assessment's parameters.
-        num_causes: n_c.
-        uncertainty: mu of every segment in every map, (K, N); mu_ini by default.
-    """
+    """Beliefs of every map's cells, (K, R*R, 3 + n_c); `uncertainty` is mu, (K, N)."""
     if uncertainty is None:
         uncertainty = np.full(training.points.shape[:2], parameters.initial_uncertainty)
     return np.stack(
@@ -205,16 +174,7 @@ def paper_beliefs(
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> np.ndarray:
-    """Computes beliefs by the paper's adaptation, (K, R*R, 3 + n_c).
-
-    Args:
-        training: The training segments.
-        feedback: Segments of all feedback so far.
-        points: Psi(x) of the feedback, (K, M, 2).
-        grid: The grid.
-        parameters: The assessment's parameters.
-        num_causes: n_c.
-    """
+    """Beliefs by the paper's adaptation, (K, R*R, 3 + n_c), of feedback at Psi(x) (K, M, 2)."""
     settings = parameters.adaptation
     difference = np.abs(feedback.score - feedback.nominal_score)
     uncertainty = []
@@ -235,8 +195,7 @@ def paper_beliefs(
     return np.stack(
         [
             combined(
-                member_prior,
-                feedback_beliefs(certain, grid.locate(member_points), grid, settings),
+                member_prior, feedback_beliefs(certain, grid.locate(member_points), grid, settings)
             )
             for member_prior, member_points in zip(prior, points, strict=True)
         ]
@@ -244,10 +203,7 @@ def paper_beliefs(
 
 
 def feedback_beliefs(
-    certain: np.ndarray,
-    cells: np.ndarray,
-    grid: Grid,
-    settings: AdaptationParameters,
+    certain: np.ndarray, cells: np.ndarray, grid: Grid, settings: AdaptationParameters
 ) -> np.ndarray:
     """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 
@@ -257,8 +213,6 @@ def feedback_beliefs(
     Args:
         certain: Beliefs of the feedback segments, mu = 0, (M, 3 + n_c).
         cells: Cell of each, -1 for outside, (M,).
-        grid: The grid.
-        settings: beta, alpha and the definition of n_f.
     """
     num_feedback = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
     if settings.count == "segments":

@@ -25,9 +25,6 @@ class AdaptiveThreshold:
 
     Attributes:
         threshold: Present lower bound of the probability for "safe"; above 1 if none is.
-
-    Raises:
-        ValueError: The step is not positive.
     """
 
     def __init__(self, calibration: Calibration, step: float = 1.0):
@@ -48,12 +45,7 @@ class AdaptiveThreshold:
         return _logit(safety_probability) >= self._logit
 
     def update(self, safety_probability: float, is_unsafe: bool) -> None:
-        """Takes in the outcome of an episode; a safe one changes nothing.
-
-        Args:
-            safety_probability: Probability of the first row, or the least of a motion.
-            is_unsafe: Whether it ended unsafely.
-        """
+        """Takes in the outcome of an episode; a safe one changes nothing."""
         if is_unsafe:
             missed = self.is_safe(safety_probability)
             self._logit += self._step * (missed - self._miss_rate)

@@ -104,17 +104,8 @@ class SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
-            episodes: Nominal episodes with the parameters' horizon.
             progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
                 "beliefs"), the percentage done and 100; True shows it.
-
-        Returns:
-            Itself.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: The horizons differ, a parameter is not an expected value, or the episodes
-                give too few segments.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
@@ -196,18 +187,9 @@ class SafetyAssessment:
         Departure ("recalibration"): see `recalibration.recalibrated_beliefs`.
 
         Args:
-            feedback: Pairs of actual episodes and their nominal twins.
             method: "recalibration" corrects the base logit and with it the training scores;
                 "paper" is the paper's update by a discrepancy function and feedback beliefs.
                 Default: "recalibration" for maps with heads, else "paper".
-
-        Returns:
-            A new assessment with the same maps.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
-                feedback of another scenario.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
@@ -261,12 +243,8 @@ class SafetyAssessment:
         """Checks that seeds were not used for training, calibration or adaptation.
 
         Args:
-            *seeds: Seeds of the sets of episodes.
             purpose: "calibration" or "adaptation" if the sets replace those of an earlier one,
                 which are then ignored; the default is evaluation.
-
-        Raises:
-            ValueError: A seed was used; the message names its purpose and a free seed.
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
@@ -275,16 +253,7 @@ class SafetyAssessment:
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
     ) -> None:
-        """Replaces the thresholds with a promised miss rate.
-
-        Args:
-            calibrations: One of each kind.
-            info: The `EpisodesInfo` of the calibration episodes.
-            num_episodes: Number of calibration episodes.
-
-        Raises:
-            ValueError: The episodes were used for training or adaptation.
-        """
+        """Replaces the calibrations; ValueError if their episodes trained or adapted the maps."""
         self.check_unused(info.seed, purpose="calibration")
         kept = [one for one in self.used_ if one.purpose != "calibration"]
         self.calibrations_ = {one.kind: one for one in calibrations}
@@ -353,9 +322,6 @@ class SafetyAssessment:
         Returns:
             The assessments. Novel inputs and those that are not finite get the empty belief, whose
             probability is 0. A row has the same bits whatever the others are.
-
-        Raises:
-            ValueError: A width or a shape is wrong, or the assessment is not fitted.
         """
         self._check_fitted()
         x = self.inputs_of(state, desired_preview, features)
@@ -411,10 +377,7 @@ class SafetyAssessment:
         return self._predict(x[None], beliefs, correction, novelty).one(0)
 
     def strangest_input(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
         """Returns the entry of x that contradicts the others most, and by how much.
 
@@ -430,10 +393,7 @@ class SafetyAssessment:
         return input_names(self.info_, self.parameters)[column], float(found[column])
 
     def unsafe_logits(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
+        self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mean logit of an unsafe end and its gradient with respect to x.
 
@@ -442,9 +402,6 @@ class SafetyAssessment:
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).
-
-        Raises:
-            ValueError: The maps have no safety head, as in the paper's mode.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)
@@ -460,13 +417,6 @@ class SafetyAssessment:
 
         It is that of the present beliefs, correction and novelty, and its metadata say what its
         inputs are, what its thresholds promise and for which plant.
-
-        Args:
-            path: The file.
-
-        Raises:
-            MissingExtraError: The extra "onnx" is not installed.
-            ValueError: The assessment is not fitted.
         """
         from drake_safety.learning import onnx_graph
 
@@ -475,11 +425,7 @@ class SafetyAssessment:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
-        """Reads a file written by `save`.
-
-        Raises:
-            ValueError: The file is truncated, not an assessment, or of another schema version.
-        """
+        """Reads a file written by `save`."""
         parameters, learned = assessment_file.read(Path(path))
         assessment = cls(parameters)
         vars(assessment).update(learned)

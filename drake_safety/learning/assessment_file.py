@@ -54,11 +54,6 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
 
     Its metadata is one JSON text with the SHA-256 of all else. The same assessment gives the same
     bytes.
-
-    Args:
-        path: The file.
-        parameters: The assessment's parameters.
-        learned: The assessment's learned attributes by name.
     """
     from safetensors.numpy import save
 
@@ -106,15 +101,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
-    """Reads a file written by `write`.
-
-    Returns:
-        The parameters, and the learned attributes by name.
-
-    Raises:
-        ValueError: The file is truncated, not an assessment, of another schema version, or
-            incomplete.
-    """
+    """Reads parameters and learned attributes; ValueError if the file is damaged or foreign."""
     metadata, tensors = _open(path)
     # Before version 9 schema and version were entries of their own.
     version = metadata.get("schema_version", "none")

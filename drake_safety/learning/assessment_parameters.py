@@ -1,7 +1,8 @@
 """The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
 from drake_safety.learning.distance import BACKENDS, WARPING_COSTS
 
@@ -17,10 +18,22 @@ def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
         raise ValueError(f"{who}: {name} is {value}, expected {expected}")
 
 
-def _expect_sizes(parameters: object) -> None:
-    sizes: list[int] = getattr(parameters, "hidden_sizes")  # noqa: B009
-    is_valid = bool(sizes) and all(size >= 1 for size in sizes)
-    _expect(parameters, "hidden_sizes", is_valid, "one width >= 1 per layer")
+_RANGES: dict[str, Callable[[Any], bool]] = {
+    ">= 0": lambda value: value >= 0.0,
+    "> 0": lambda value: value > 0.0,
+    ">= 1": lambda value: value >= 1.0,
+    "a value in [0, 1]": lambda value: 0.0 <= value <= 1.0,
+    "a value in [0, 1)": lambda value: 0.0 <= value < 1.0,
+    "a value in (0, 1)": lambda value: 0.0 < value < 1.0,
+    "one width >= 1 per layer": lambda sizes: bool(sizes) and all(size >= 1 for size in sizes),
+}
+
+
+def _expect_ranges(parameters: object, names: Mapping[str, str]) -> None:
+    """Checks the values of names, separated by spaces, by the range that is expected of them."""
+    for expected, separated in names.items():
+        for name in separated.split():
+            _expect(parameters, name, _RANGES[expected](getattr(parameters, name)), expected)
 
 
 @dataclass(kw_only=True)
@@ -58,19 +71,17 @@ class AdaptationParameters:
         self.check()
 
     def check(self) -> None:
-        """Checks all values, which may have been set since the construction.
-
-        Raises:
-            ValueError: A value is not an expected one.
-        """
-        for name in ("least_uncertainty", "first_uncertainty"):
-            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
-        for name in ("offset_std", "slope_std", "hidden_std"):
-            _expect(self, name, getattr(self, name) > 0.0, "> 0")
-        for name in ("gate", "decay_rate"):
-            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
+        """Checks all values, which may have been set since the construction."""
+        _expect_ranges(
+            self,
+            {
+                "a value in [0, 1]": "least_uncertainty first_uncertainty",
+                "> 0": "offset_std slope_std hidden_std",
+                ">= 0": "gate decay_rate",
+                ">= 1": "update_interval",
+            },
+        )
         _expect(self, "count", self.count in COUNTS, f"one of {list(COUNTS)}")
-        _expect(self, "update_interval", self.update_interval >= 1, ">= 1")
 
 
 @dataclass(kw_only=True)
@@ -118,20 +129,18 @@ class PaperReading:
         self.check()
 
     def check(self) -> None:
-        """Checks all values, which may have been set since the construction.
-
-        Raises:
-            ValueError: A value is not an expected one.
-        """
-        _expect(self, "stride", self.stride >= 0, ">= 0")
+        """Checks all values, which may have been set since the construction."""
+        _expect_ranges(
+            self,
+            {
+                ">= 0": "stride weight_decay",
+                ">= 1": "epochs",
+                "one width >= 1 per layer": "hidden_sizes",
+                "a value in [0, 1)": "dropout held_out",
+                "a value in [0, 1]": "neighbour_weight",
+            },
+        )
         _expect(self, "loss", self.loss in LOSSES, f"one of {list(LOSSES)}")
-        _expect_sizes(self)
-        _expect(self, "weight_decay", self.weight_decay >= 0.0, ">= 0")
-        _expect(self, "epochs", self.epochs >= 1, ">= 1")
-        for name in ("dropout", "held_out"):
-            _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
-        share = self.neighbour_weight
-        _expect(self, "neighbour_weight", 0.0 <= share <= 1.0, "a value in [0, 1]")
 
 
 @dataclass(kw_only=True)
@@ -239,11 +248,7 @@ class AssessmentParameters:
         self.check()
 
     def check(self) -> None:
-        """Checks all values, which may have been set since the construction.
-
-        Raises:
-            ValueError: A value is not an expected one.
-        """
+        """Checks all values, which may have been set since the construction."""
         if self.mode not in MODES:
             raise ValueError(
                 f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
@@ -254,47 +259,22 @@ class AssessmentParameters:
             ("initialization", INITIALIZATIONS),
         ):
             _expect(self, name, getattr(self, name) in known, f"one of {list(known)}")
-        for name in ("discount", "initial_uncertainty"):
-            _expect(self, name, 0.0 <= getattr(self, name) <= 1.0, "a value in [0, 1]")
-        for name in (
-            "score_weight",
-            "target_weight",
-            "safety_weight",
-            "margin_weight",
-            "feature_unit",
-        ):
-            _expect(self, name, getattr(self, name) >= 0.0, ">= 0")
-        for name in (
-            "horizon",
-            "preview_stride",
-            "min_count",
-            "resolution",
-            "batch_size",
-            "epochs",
-            "ensemble_size",
-        ):
-            _expect(self, name, getattr(self, name) >= 1, ">= 1")
-        for name in (
-            "cell_length",
-            "learning_rate",
-            "margin_unit",
-            "first_row_weight",
-            "raw_input_scale",
-        ):
-            _expect(self, name, getattr(self, name) > 0.0, "> 0")
-        _expect(
+        _expect_ranges(
             self,
-            "shortest_segment",
-            0 <= self.shortest_segment <= self.horizon,
-            "a value in 0..horizon",
+            {
+                "a value in [0, 1]": "discount initial_uncertainty",
+                ">= 0": "score_weight target_weight safety_weight margin_weight feature_unit "
+                "candidates_per_neighbour",
+                ">= 1": "horizon preview_stride min_count resolution batch_size epochs "
+                "ensemble_size perplexity exaggeration",
+                "> 0": "cell_length learning_rate margin_unit first_row_weight raw_input_scale",
+                "a value in (0, 1)": "novelty_rate",
+                "a value in [0, 1)": "dropout held_out",
+                "one width >= 1 per layer": "hidden_sizes",
+            },
         )
-        _expect(self, "candidates_per_neighbour", self.candidates_per_neighbour >= 0, ">= 0")
-        _expect(self, "novelty_rate", 0.0 < self.novelty_rate < 1.0, "a value in (0, 1)")
-        for name in ("perplexity", "exaggeration"):
-            _expect(self, name, getattr(self, name) >= 1.0, ">= 1")
-        for name in ("dropout", "held_out"):
-            _expect(self, name, 0.0 <= getattr(self, name) < 1.0, "a value in [0, 1)")
-        _expect_sizes(self)
+        is_within = 0 <= self.shortest_segment <= self.horizon
+        _expect(self, "shortest_segment", is_within, "a value in 0..horizon")
         _expect(
             self,
             "margin_range",

@@ -37,20 +37,12 @@ def from_scores(
     cause: np.ndarray | None = None,
     num_causes: int = 0,
 ) -> np.ndarray:
-    """Converts unsafety scores to beliefs.
+    """Converts unsafety scores to beliefs, (N, 3 + n_c).
 
     Args:
         score: Unsafety scores lambda in [0, 1], (N,).
         uncertainty: mu in [0, 1], scalar or (N,).
         cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
-        num_causes: n_c.
-
-    Returns:
-        Beliefs (N, 3 + n_c).
-
-    Raises:
-        ValueError: A score or an uncertainty lies outside [0, 1], `cause` is missing although
-            `num_causes` > 0, or an unsafe score has no cause.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -85,9 +77,6 @@ def fuse(beliefs: np.ndarray) -> np.ndarray:
     Departure: the printed products of uncertainties underflow from about 600 beliefs on. Divided
     by their common product they become the weights w = (1 - mu) / mu, which give the same value.
 
-    Args:
-        beliefs: A set of beliefs, (k, 3 + n_c).
-
     Returns:
         The fused belief, (3 + n_c,); empty if the set is empty or all beliefs are vacuous.
     """
@@ -103,7 +92,7 @@ def fuse_cells(
     min_count: int,
     multiplicity: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Fuses the beliefs in every grid cell jointly.
+    """Fuses the beliefs in every grid cell jointly, (V, 3 + n_c).
 
     Args:
         beliefs: Beliefs, (N, 3 + n_c).
@@ -111,12 +100,6 @@ def fuse_cells(
         num_cells: Number of cells V.
         min_count: k_min, the number of beliefs below which a cell stays empty.
         multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
-
-    Returns:
-        Beliefs (V, 3 + n_c).
-
-    Raises:
-        ValueError: `cells` and `beliefs` differ in length.
     """
     beliefs = np.asarray(beliefs, dtype=float)
     cells = np.asarray(cells)
@@ -167,9 +150,6 @@ def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarra
 
     Returns:
         Beliefs (V, 3 + n_c); cells without beliefs are empty.
-
-    Raises:
-        ValueError: `cells` and `beliefs` differ in length.
     """
     if cells.shape != beliefs.shape[:1]:
         raise ValueError(

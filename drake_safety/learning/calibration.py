@@ -57,12 +57,6 @@ class Calibration:
             over calibration sets.
         threshold: Lower bound of the probability for "safe".
         unsafe_below: Upper bound of the probability for "unsafe"; at most `threshold`.
-        num_unsafe: Number of unsafe calibration episodes.
-        num_safe: Number of safe calibration episodes.
-        num_missed: Number of unsafe calibration episodes with the verdict "safe".
-        num_accepted: Number of safe calibration episodes with the verdict "safe".
-        seed: Seed of the episodes.
-        scenario_hash: Hash of the simulation.
         variation: The plant of the episodes, for which alone the rates are promised.
     """
 
@@ -142,13 +136,9 @@ def calibrate(
     Args:
         unsafe_score: 1 - probability of each episode, (N,); NaN counts as most unsafe.
         is_unsafe: Whether each episode ended unsafely, (N,).
-        kind: "plan" or "motion", the score of an episode.
         miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe", in (0, 1).
         confidence: Confidence of both rates, in (0, 1); None for rates on average.
-        seed: Seed of the episodes.
-        scenario_hash: Hash of the simulation.
-        variation: The plant of the episodes.
 
     Raises:
         ValueError: Too few unsafe or safe episodes for the promised rates; the message names the
@@ -196,9 +186,6 @@ def score_threshold(
     Returns:
         The midpoint between the k-th lowest unsafe score and the next lower score of either label;
         just below the former if there is none.
-
-    Raises:
-        ValueError: Too few samples have the label, no score is finite, or a rate is not in (0, 1).
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
@@ -220,16 +207,7 @@ def score_threshold(
 
 
 def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | None = None) -> int:
-    """Returns how many of n unsafe episodes may be missed; -1 if n is too small for the promise.
-
-    Args:
-        num_unsafe: n.
-        miss_rate: Promised miss rate, in (0, 1).
-        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
-
-    Raises:
-        ValueError: A rate is not in (0, 1).
-    """
+    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small."""
     _check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.floor(miss_rate * (num_unsafe + 1) + 1e-9) - 1
@@ -243,15 +221,7 @@ def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | Non
 
 
 def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int:
-    """Returns the least number of unsafe episodes for a promised miss rate.
-
-    Args:
-        miss_rate: Promised miss rate, in (0, 1).
-        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
-
-    Raises:
-        ValueError: A rate is not in (0, 1).
-    """
+    """Returns the least number of unsafe episodes for a promised miss rate."""
     _check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.ceil(1.0 / miss_rate - 1e-9) - 1
@@ -275,13 +245,9 @@ def episode_scores(
     Args:
         segments: The N segments of some episodes, from every row.
         unsafe_score: Unsafe score of each, (N,); NaN counts as most unsafe.
-        kind: "plan" or "motion".
 
     Returns:
         Score and label of each episode that has segments, (M,) each.
-
-    Raises:
-        ValueError: Unknown kind.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")

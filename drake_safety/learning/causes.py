@@ -47,14 +47,7 @@ def likely_cause(
     predicted_margins: np.ndarray,
     margin_unit: float | np.ndarray = 1.0,
 ) -> str:
-    """Name of the constraint that is most likely to be violated first; "" without evidence.
-
-    Args:
-        names: The n_c constraints.
-        cause_probability: b_unsafe split by constraint, (n_c,).
-        predicted_margins: Smallest margin predicted for each [m, rad], (n_c,), or NaN.
-        margin_unit: See :func:`likely_causes`.
-    """
+    """`likely_causes` of one input, (n_c,) each, as the constraint's name; "" without evidence."""
     (column,) = likely_causes(cause_probability[None], predicted_margins[None], margin_unit)
     return "" if column == NO_CAUSE else names[column]
 
@@ -63,9 +56,7 @@ def describe_margin(name: str, margin: float, angular_constraints: Collection[st
     """Text of a constraint and its margin, such as ``collision, -1.2 cm``.
 
     Args:
-        name: The constraint.
         margin: Its margin [m, rad]; the text is the name alone if it is not finite.
-        angular_constraints: Names of the constraints whose margins are angles.
     """
     if not math.isfinite(margin):
         return name

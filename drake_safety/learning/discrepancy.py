@@ -19,18 +19,7 @@ class DiscrepancyFunction:
     """
 
     def fit(self, points: np.ndarray, difference: np.ndarray) -> DiscrepancyFunction:
-        """Fits D.
-
-        Args:
-            points: Psi(x) of the feedback, (N, 2), in grid units.
-            difference: |lambda actual - lambda nominal|, (N,).
-
-        Returns:
-            Itself.
-
-        Raises:
-            ValueError: No point is finite.
-        """
+        """Fits D to |lambda actual - lambda nominal|, (N,), at Psi(x) of the feedback, (N, 2)."""
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF
 
@@ -48,13 +37,9 @@ class DiscrepancyFunction:
         return self
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predicts the mean m, clipped to [0, 1], and the standard deviation sigma without noise.
+        """Predicts the mean m, clipped to [0, 1], and sigma without noise at points (M, 2).
 
-        Args:
-            points: (M, 2).
-
-        Returns:
-            m and sigma, (M,) each; the prior's 0 and 1 where a point is not finite.
+        Where a point is not finite, they are the prior's 0 and 1.
         """
         mean, deviation = np.zeros(len(points)), np.ones(len(points))
         rows = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -84,20 +69,7 @@ def _fitted_kernel(points: np.ndarray, difference: np.ndarray) -> Any:
 
 
 def updated_uncertainty(
-    mean: np.ndarray,
-    deviation: np.ndarray,
-    *,
-    gate: float,
-    least: float,
-    initial: float,
+    mean: np.ndarray, deviation: np.ndarray, *, gate: float, least: float, initial: float
 ) -> np.ndarray:
-    """Returns the uncertainty mu of nominal beliefs under a discrepancy, (N,).
-
-    Args:
-        mean: m of the discrepancy at each belief's point, (N,).
-        deviation: sigma at each belief's point, (N,).
-        gate: sigma_thre.
-        least: mu_min.
-        initial: mu_ini, used where sigma exceeds the gate.
-    """
+    """The uncertainty mu of nominal beliefs, (N,), from m and sigma of the discrepancy there."""
     return np.where(deviation <= gate, least + mean * (1.0 - least), initial)

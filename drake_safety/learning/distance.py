@@ -75,15 +75,9 @@ def neighbour_graph(
             cost grows as N^2.
         cost: One of `WARPING_COSTS`.
         backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
-        progress: Called with the fraction done.
 
     Returns:
         The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
-
-    Raises:
-        MissingExtraError: The extra "train" is not installed.
-        ValueError: Unknown backend or cost, errors that are not finite, or too few segments or
-            candidates.
     """
     for name, value, known in (("backend", backend, BACKENDS), ("cost", cost, WARPING_COSTS)):
         if value not in known:
@@ -159,11 +153,6 @@ def _places(held: np.ndarray, score: np.ndarray, power: float) -> np.ndarray:
 
     For the cost "squared" the squared distance of two points is the bound itself, but for the
     rounding of scores and the components with the least variance.
-
-    Args:
-        held: Error sequences in units of w_max's root, (N, H*n_z).
-        score: Scores times their weight, (N,).
-        power: 2 for the cost "squared", else 1.
     """
     part = score[:, None]
     if power == 2.0:
@@ -237,10 +226,7 @@ def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _max_dtw(
-    series: list[np.ndarray],
-    held: np.ndarray,
-    dtw: Callable[..., np.ndarray],
-    looseness: float,
+    series: list[np.ndarray], held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float
 ) -> float:
     """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
     held = held - held.mean(axis=0)

@@ -33,15 +33,8 @@ def tsne(
     do not speed up the FFT of large sets.
 
     Args:
-        graph: The neighbour graph.
         perplexity: Effective number of neighbours.
         exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
-        initialization: "spectral" or "random".
-        seed: Seed of the initial points.
-        progress: Called with the fraction done.
-
-    Raises:
-        ValueError: The graph has fewer than three times `perplexity` neighbours per segment.
     """
     num_neighbours = graph.indices.shape[1]
     if num_neighbours < int(3 * perplexity):
@@ -147,11 +140,8 @@ def train_map(
     Args:
         data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
             nearly constant columns are not amplified.
-        parameters: The assessment's parameters. A head whose weight is 0 is omitted.
-        seed: Seed of the initial weights, the batches and the dropout.
         held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
             these inputs are kept instead of the last epoch's.
-        progress: Called with the fraction done.
 
     Returns:
         The weights of one member, named as in `Embedding`, without the leading member axis.
@@ -262,12 +252,6 @@ def _neighbour_loss(torch: Any, y: Any, neighbour: Any, unit: float) -> Any:
 
     InfoNC-t-SNE (Damrich et al., 2023), the contrastive form of t-SNE's loss: -log(q / (q + sum of
     those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
-
-    Args:
-        torch: The module.
-        y: Points of the inputs, (N, 2).
-        neighbour: Point of one neighbour of each, (N, 2).
-        unit: Length of y's unit in that of t-SNE.
     """
     near = 1.0 / (1.0 + (unit * (y - neighbour)).square().sum(dim=1))
     others = 1.0 / (1.0 + (unit * (y[:, None] - y[None])).square().sum(dim=2))

@@ -25,10 +25,6 @@ class FeedbackSet:
     twin's first row, and the end of both.
 
     Attributes:
-        info: The `EpisodesInfo` of the actual episodes.
-        nominal_hash: Scenario hash of the twin.
-        twin_seed: Seed of the twin's set.
-        index: Number of the pair.
         state: Measured state, (N, n_s).
         true_state: State without observation noise, (N, n_s).
         desired_preview: Desired outputs over the horizon, (N, H*n_z).
@@ -39,8 +35,6 @@ class FeedbackSet:
         twin_state: Measured state at the twin's first row, (n_s,).
         twin_desired_preview: Desired preview at the twin's first row, (H*n_z,).
         twin_features: Features at the twin's first row, (n_f,).
-        is_unsafe: Whether the actual episode ended unsafely.
-        nominal_is_unsafe: Whether the twin ended unsafely.
         cause: Column of the constraint that ended the actual episode, -1 when safe.
     """
 
@@ -77,13 +71,9 @@ def feedback_sets(
     """Pairs actual episodes with their nominal twins by index, without diverged pairs.
 
     Args:
-        actual: Episodes of the actual robot.
         nominal: The twins; further episodes are ignored.
         nominal_hash: Scenario hash of the nominal plant, if the twins' hash also covers the options
             of the pairs; the twins' hash by default.
-
-    Raises:
-        ValueError: The tasks differ, a twin is missing, or a twin starts in another state.
     """
     _check_same_task(actual.info, nominal.info)
     twins = {episode.index: episode for episode in nominal}
@@ -149,15 +139,7 @@ def _check_same_task(actual: EpisodesInfo, nominal: EpisodesInfo) -> None:
 
 
 def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> None:
-    """Checks that feedback is of the scenario that an assessment was trained on.
-
-    Args:
-        feedback: The feedback sets.
-        learned: The `EpisodesInfo` of the training episodes.
-
-    Raises:
-        ValueError: There is no feedback, or it differs; the message names both values.
-    """
+    """Checks that feedback is of the scenario that an assessment was trained on."""
     if not feedback:
         raise ValueError(f"feedback of '{learned.scenario}': got none, expected at least one set")
     for one in feedback:
@@ -235,15 +217,9 @@ def segments_of(
     A twin that has left the safe set before a segment starts scores 1 there.
 
     Args:
-        feedback: The feedback sets.
-        stride: Rows between two starts.
         shortest: Least number of samples of a safe episode's segment.
-        discount: gamma of the unsafety score.
         plain: Whether to use the state without noise for "actual" episodes of the nominal plant, as
             in training in the paper's mode.
-
-    Raises:
-        ValueError: No set has a segment of that length.
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in FeedbackSegments.__annotations__}
     for one in feedback:

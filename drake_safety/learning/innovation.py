@@ -90,9 +90,6 @@ class Innovation:
 
         Args:
             x: Inputs of each motion in the order of time, (K + 1, n_x); the state is first.
-            num_states: n_s.
-            step_s: Time between two rows [s].
-            novelty: Its limits scale the distance.
         """
         x = [one for one in x if len(one) > 1]
         if not x:
@@ -140,12 +137,7 @@ class Innovation:
         )
 
     def with_feedback(self, x: Sequence[np.ndarray], novelty: Novelty) -> Innovation:
-        """Returns the innovation of an actual robot: corrected prediction, no lower limits.
-
-        Args:
-            x: Inputs of each motion of the robot, (K + 1, n_x).
-            novelty: The novelty adapted to them.
-        """
+        """Returns the innovation of an actual robot: corrected prediction, no lower limits."""
         x = [one for one in x if len(one) > 1]
         if not x:
             return self
@@ -200,17 +192,7 @@ class Innovation:
     def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], *, num_inputs: int, num_states: int
     ) -> Innovation:
-        """Makes the innovation of arrays written by `arrays`.
-
-        Args:
-            arrays: The arrays by name.
-            num_inputs: n_x.
-            num_states: n_s.
-
-        Raises:
-            KeyError: One is missing.
-            ValueError: A shape is wrong.
-        """
+        """Makes the innovation of arrays written by `arrays`."""
         n_s, n_charts = num_states, len(TIME_CONSTANTS_S)
         shapes: dict[str, tuple[int, ...]] = {
             "mean": (num_inputs,),
@@ -246,12 +228,7 @@ class Innovation:
         )
 
     def of(self, x: np.ndarray, next_state: np.ndarray) -> np.ndarray:
-        """Returns whitened innovations of limited norm, (N, n_s).
-
-        Args:
-            x: Inputs, (N, n_x).
-            next_state: State one step later, (N, n_s).
-        """
+        """Returns whitened innovations of limited norm, (N, n_s), of x and the next state."""
         return self.limited(next_state - x[:, : self.num_states] - self.predictor(x))
 
     def limited(self, errors: np.ndarray) -> np.ndarray:
@@ -261,13 +238,7 @@ class Innovation:
         return whitened * np.minimum(1.0, self.clip / np.maximum(norm, 1e-12))[:, None]
 
     def next_sums(self, sums: np.ndarray, distance: float, innovation: np.ndarray) -> np.ndarray:
-        """Returns both CUSUMs (2,) after one more step.
-
-        Args:
-            sums: The CUSUMs before it, (2,).
-            distance: Novelty of the input.
-            innovation: Whitened innovation of limited norm, (n_s,).
-        """
+        """Returns both CUSUMs (2,) after one more step with a whitened innovation (n_s,)."""
         found = np.array([distance, math.sqrt(innovation @ innovation)])
         step = np.minimum((found - self.sums[:, 0]) / self.sums[:, 1], _LARGEST_STEP)
         added: np.ndarray = np.maximum(sums + step - _ALLOWANCE, 0.0)
@@ -313,14 +284,9 @@ class Innovation:
         return found[last]
 
     def deviations(self, kind: str, average: np.ndarray) -> np.ndarray:
-        """Returns the mean error of each state, in its standard deviations on the nominal plant.
+        """Mean error of each state, (n_s,), in its standard deviations on the nominal plant.
 
-        Args:
-            kind: The chart, "fast" or "slow".
-            average: The chart's mean of whitened innovations, (n_s,).
-
-        Returns:
-            (n_s,), positive where the state grows more than predicted.
+        It is positive where the state grows more than predicted.
         """
         chart_whitening = self.chart_whitenings[("fast", "slow").index(kind)]
         unwhitening = np.linalg.inv(self.whitening)
@@ -334,7 +300,6 @@ def describe(kind: str, deviations: np.ndarray, state_names: Sequence[str]) -> s
     Args:
         kind: One of ``KINDS``.
         deviations: Mean error of each state in standard deviations, (n_s,); for charts only.
-        state_names: Names of the states.
     """
     if kind == "frozen":
         return "input frozen"

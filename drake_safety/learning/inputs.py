@@ -47,11 +47,7 @@ def inputs(
         state: Measured states, (..., n_s).
         desired_preview: Desired outputs over the horizon, row-major in time, (..., H*n_z).
         features: Features, (..., n_f); ignored in the paper's mode.
-        info: The episodes' metadata.
         parameters: The assessment's. A feature unit u appends asinh(features / u).
-
-    Raises:
-        ValueError: One of them has another width or number of rows, is missing, or is no number.
     """
     is_used = used_states(info, parameters)
     given = [("state", state, len(is_used))]

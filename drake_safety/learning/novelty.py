@@ -21,13 +21,7 @@ _LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; a
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Mean and covariance of inputs x.
-
-    Attributes:
-        count: Number of inputs.
-        mean: Their mean, (n_x,).
-        covariance: Their covariance, (n_x, n_x).
-    """
+    """Mean (n_x,) and covariance (n_x, n_x) of inputs x."""
 
     count: int
     mean: np.ndarray
@@ -133,21 +127,14 @@ class Novelty:
     The object is immutable.
 
     Args:
-        training: Moments of the training inputs.
         limits: Largest distances of a known input: of all of it, along redundancies, and of the
             plan, (3,).
-        plan: The plan's columns of x.
         feedback: Moments of an actual robot's inputs, which are known as well; None before
             adaptation.
     """
 
     def __init__(
-        self,
-        *,
-        training: Moments,
-        limits: np.ndarray,
-        plan: slice,
-        feedback: Moments | None = None,
+        self, *, training: Moments, limits: np.ndarray, plan: slice, feedback: Moments | None = None
     ):
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         self.plan = plan
@@ -162,13 +149,7 @@ class Novelty:
 
     @classmethod
     def fit(
-        cls,
-        x: np.ndarray,
-        episode: np.ndarray,
-        is_unsafe: np.ndarray,
-        rate: float,
-        *,
-        plan: slice,
+        cls, x: np.ndarray, episode: np.ndarray, is_unsafe: np.ndarray, rate: float, *, plan: slice
     ) -> Novelty:
         """Computes the moments of training inputs and chooses the limits.
 
@@ -178,11 +159,8 @@ class Novelty:
         known.
 
         Args:
-            x: Inputs, those of an episode in the order of time, (N, n_x).
-            episode: Episode of each, (N,).
             is_unsafe: Whether it ended unsafely, (N,).
             rate: Share of episodes with a novel input, in (0, 1).
-            plan: The plan's columns of x.
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
         distances = np.full((len(x), NUM_DISTANCES), np.inf)
@@ -213,7 +191,6 @@ class Novelty:
         training inputs, these alone describe the robot.
 
         Args:
-            x: Inputs, (N, n_x).
             rate: Largest share of novel inputs of a robot without a reality gap, in (0, 1).
         """
         alone = Novelty(training=self.training, limits=self.limits, plan=self.plan)
@@ -250,9 +227,6 @@ class Novelty:
         """Returns how far each column is from what the other columns say, (n_x,).
 
         The unit is the standard deviation of that prediction by linear regression.
-
-        Args:
-            x: One input, (n_x,).
         """
         precision = self.quadratic.precision()
         return precision @ (x - self._known.mean) / np.sqrt(np.diag(precision))

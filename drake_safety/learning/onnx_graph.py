@@ -59,13 +59,6 @@ def write(path: Path, assessment: SafetyAssessment) -> None:
     """Writes `SafetyAssessment.predict` as one ONNX file, atomically.
 
     The same assessment gives the same bytes.
-
-    Args:
-        path: The file.
-        assessment: A fitted assessment, adapted or not.
-
-    Raises:
-        MissingExtraError: The extra `onnx` is not installed.
     """
     require_extra("onnx", f"export to '{path}'")
     import onnx
@@ -297,9 +290,7 @@ def _cell_weights(nodes: _Nodes, y: str, grid: Grid, is_sharpened: bool) -> tupl
     position = nodes("Div", nodes("Add", y, grid.half_width), grid.cell_length)
     # False for NaN.
     is_within = nodes(
-        "And",
-        nodes("GreaterOrEqual", position, 0.0),
-        nodes("Less", position, float(resolution)),
+        "And", nodes("GreaterOrEqual", position, 0.0), nodes("Less", position, float(resolution))
     )
     inside = nodes("ReduceMin", nodes.double(is_within), axes=[2], keepdims=1)
     position = nodes("Where", nodes("Greater", inside, 0.0), position, 0.0)

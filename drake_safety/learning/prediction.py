@@ -75,11 +75,7 @@ class Assessment:
         )
 
     def outside(self, cause: int) -> Assessment:
-        """The assessment of a state outside the safe set: what was safe is unsafe.
-
-        Args:
-            cause: Number of the violated constraint.
-        """
+        """The assessment of a state outside the safe set: what was safe is unsafe."""
         safe, unsafe, uncertainty = self.belief
         cause_probability = self.cause_probability.copy()
         cause_probability[cause] += safe
@@ -101,9 +97,6 @@ class BaseLogit:
     Attributes:
         margin_unit: Unit of margins [unit of the margins].
         margin_range: Range that margins are clipped to [unit of the margins].
-        offset: The base logit where both heads are zero.
-        safety_slope: Slope in the logit of the safety heads.
-        margin_slope: Slope in the negative margin, in `margin_unit`.
     """
 
     margin_unit: float
@@ -115,9 +108,7 @@ class BaseLogit:
     def heads(self, output: EmbeddingOutput, margins: np.ndarray | None = None) -> np.ndarray:
         """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head.
 
-        Args:
-            output: Outputs of the maps.
-            margins: The mean of their margins, (N, n_c), if known.
+        The mean of the maps' margins, (N, n_c), is computed if it is not given.
         """
         found = np.zeros((output.embedding.shape[1], 2))
         logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
@@ -177,13 +168,7 @@ class Correction:
         return _clip(added, *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
-        """Returns the shift of the base logit, (N,).
-
-        Args:
-            heads: z and -m / margin_unit, (N, 2).
-            residual: Contribution of the hidden layer, (N,).
-            guard: Interpolated guard of the cells, (N,).
-        """
+        """The shift of the base logit, (N,), from heads, hidden layer and interpolated guard."""
         offset, safety, margin = self.change
         shift = offset + heads[:, 0] * safety + heads[:, 1] * margin + residual
         shift = _clip(shift, -SHIFT_LIMIT, SHIFT_LIMIT)
@@ -191,11 +176,7 @@ class Correction:
 
 
 def check_shapes(given: tuple[np.ndarray, Correction], own: tuple[np.ndarray, Correction]) -> None:
-    """Checks that beliefs and a correction are shaped as those of an assessment.
-
-    Raises:
-        ValueError: An array has another shape.
-    """
+    """Checks that beliefs and a correction are shaped as those of an assessment."""
     pairs = [("beliefs", given[0], own[0])]
     for name in _CORRECTION:
         pairs.append((name, getattr(given[1], name), getattr(own[1], name)))
@@ -217,12 +198,7 @@ def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
 
 
 def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
-    """Returns where a belief is "don't know": half of it or more comes from empty cells, (...).
-
-    Args:
-        belief: (b_safe, b_unsafe, mu), (..., 3).
-        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
-    """
+    """Returns where a belief is "don't know": half of it or more comes from empty cells, (...)."""
     return belief[..., belief_masses.UNCERTAINTY] > unknown_above(initial_uncertainty)
 
 
@@ -261,13 +237,7 @@ def predict(
     """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
     Args:
-        x: Inputs, (N, n_x).
-        embedding: The maps.
-        grid: The grid.
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        correction: Correction of the base logit by feedback.
-        base_logit: The base logit; None without heads.
-        novelty: Says which inputs are novel.
         initial_uncertainty: mu_ini, the uncertainty of a filled cell.
         is_sharpened: Whether beliefs are interpolated between cell centres.
     """

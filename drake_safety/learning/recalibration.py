@@ -38,9 +38,6 @@ def row_weights(num_rows: np.ndarray) -> np.ndarray:
     """Returns sample weights: one for an episode's first row, and two spread over all its rows.
 
     The rows of an episode share one label, so an episode counts as a few samples.
-
-    Args:
-        num_rows: Number of rows of each episode, in order.
     """
     first = np.cumsum(num_rows) - num_rows
     weight = np.repeat(2.0 / num_rows, num_rows)
@@ -54,17 +51,7 @@ def outcomes(
     embedding: Embedding,
     base_logit: BaseLogit,
 ) -> tuple[Outcomes, Outcomes]:
-    """Evaluates the maps on all rows of the actual episodes and on the twins' first rows.
-
-    Args:
-        feedback: The feedback sets.
-        inputs: Function of states, previews and features that returns x.
-        embedding: The maps.
-        base_logit: The base logit.
-
-    Returns:
-        The actual episodes' outcomes and the twins'.
-    """
+    """Outcomes of all rows of the actual episodes, and of the twins' first rows."""
     num_rows = np.array([len(one) for one in feedback])
     sides = (
         (
@@ -108,12 +95,6 @@ def fitted_change(
     no counterpart, as the twin is then in another state. Activations are centred and divided by
     their mean distance from the mean, so that their joint contribution has the standard deviation
     `hidden_std`. The corrected slopes stay >= 0.
-
-    Args:
-        actual: Rows of the actual episodes.
-        twins: The twins' first rows.
-        base_logit: The base logit.
-        settings: Standard deviations of the prior.
 
     Returns:
         `change` (3,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
@@ -168,19 +149,9 @@ def fitted_correction(
     grid: Grid,
     parameters: AdaptationParameters,
 ) -> Correction:
-    """Fits the correction of the base logit to feedback; zero without a pair that differs.
+    """Fits the correction to segments at Psi(x) (K, N, 2); zero without a pair that differs.
 
     Only pairs with different outcomes are evidence of a reality gap.
-
-    Args:
-        feedback: The feedback sets.
-        segments: Their segments.
-        points: Psi(x) of the segments, (K, N, 2).
-        inputs: Maps states, previews and features to x.
-        embedding: The maps.
-        base_logit: The base logit.
-        grid: The grid.
-        parameters: Parameters of the adaptation.
     """
     if not any(one.differs for one in feedback):
         return Correction.none(embedding, grid)
@@ -205,21 +176,7 @@ def recalibrated(
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> tuple[Correction, np.ndarray]:
-    """Corrects the base logit by feedback, and the beliefs, (K, R*R, 3 + n_c), with it.
-
-    Args:
-        feedback: Pairs of actual episodes and their nominal twins.
-        segments: Their segments.
-        x: Inputs of the segments, (M, n_x).
-        points: Psi(x), (K, M, 2).
-        inputs: Maps states, previews and features to x.
-        embedding: The maps.
-        base_logit: The base logit.
-        training: Scores of the training segments.
-        grid: The grid.
-        parameters: The assessment's parameters.
-        num_causes: n_c.
-    """
+    """Corrects base logit and beliefs, (K, R*R, 3 + n_c), by segments at Psi(x) (K, M, 2)."""
     correction = fitted_correction(
         feedback,
         segments,
@@ -237,13 +194,7 @@ def recalibrated(
 
 
 def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Averages values (M,) in every map's cells, (K, R*R); 0 in cells without points.
-
-    Args:
-        values: One value per point.
-        points: Psi(x), (K, M, 2).
-        grid: The grid.
-    """
+    """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty ones."""
     means = []
     for member_points in points:
         cells = grid.locate(member_points)
@@ -255,13 +206,7 @@ def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray
 
 
 def guarded_cells(feedback: FeedbackSegments, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns 1 in every map's cells where most feedback was unsafe, else 0, (K, R*R).
-
-    Args:
-        feedback: The feedback.
-        points: Psi(x) of the feedback, (K, M, 2).
-        grid: The grid.
-    """
+    """Returns 1 in every map's cells where most feedback was unsafe, else 0, (K, R*R)."""
     vote = np.where(feedback.is_unsafe, 1.0, -1.0)
     return (cell_means(vote, points, grid) > 0.0).astype(float)
 
@@ -288,15 +233,8 @@ def recalibrated_beliefs(
     used for all training segments of the cell.
 
     Args:
-        training: The training segments.
-        base_logit: The base logit.
-        correction: The correction of the base logit.
-        feedback: Segments of all feedback so far.
         points: Psi(x) of the feedback, (K, M, 2).
         residual: Contribution of the hidden layer at the feedback, (M,).
-        grid: The grid.
-        parameters: The assessment's parameters.
-        num_causes: n_c.
     """
     if training.heads is None or training.nearest is None:
         raise ValueError("recalibrated_beliefs: the maps have no heads")

@@ -56,8 +56,6 @@ class UsedEpisodes:
 
     Attributes:
         purpose: "training", "calibration" or "adaptation".
-        variation: The simulated plant variation.
-        scenario_hash: Hash of the simulation.
         seed: Seed of the set, or `NOT_DRAWN`.
         num_episodes: Number of episodes; None if unknown, as in files of earlier versions.
     """
@@ -85,16 +83,7 @@ class UsedEpisodes:
 
 
 def check_unused(used: Sequence[UsedEpisodes], seeds: Iterable[int], who: str) -> None:
-    """Checks that an assessment has not used seeds.
-
-    Args:
-        used: The episodes that the assessment has used.
-        seeds: Seeds of the sets to be drawn.
-        who: Prefix of the error message.
-
-    Raises:
-        ValueError: A seed was used; the message names its purpose and the next free seed.
-    """
+    """Raises ValueError if a seed was used, with its purpose and the next free seed."""
     wanted = sorted(seeds)
     spent = {one.seed: one for one in used if one.seed != NOT_DRAWN}
     found = next((seed for seed in wanted if seed in spent), None)

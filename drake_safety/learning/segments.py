@@ -38,11 +38,7 @@ class EpisodeError(RuntimeError):
 
 
 def installed_versions(*packages: str) -> dict[str, str]:
-    """Versions of this package and of others, by name.
-
-    Args:
-        packages: Names of distributions; those that are not installed are left out.
-    """
+    """Versions of this package and of those others that are installed, by name."""
     found = {"drake_safety": "0+uninstalled"}
     for name in ("drake_safety", *packages):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -55,7 +51,6 @@ class EpisodesInfo:
     """Metadata that all episodes of a set share.
 
     Attributes:
-        scenario: Name of the scenario.
         scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
         variation: The simulated plant variation, e.g. "nominal" or "actual".
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
@@ -66,7 +61,6 @@ class EpisodesInfo:
         state_names: Names of the n_s columns of `state`.
         output_names: Names of the n_z columns of `output`.
         feature_names: Names of the n_f columns of `features`.
-        versions: Package versions at the time of the simulation.
         num_steps: T, rows after the first one of a complete episode; 0 if unknown.
         preview_stride: Rows between two of the H samples of a preview or a segment.
     """
@@ -86,20 +80,16 @@ class EpisodesInfo:
     preview_stride: int = 1
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(
-                f"episodes of '{self.scenario}': horizon is {self.horizon}, expected >= 1"
-            )
-        if not self.step_s > 0.0:
-            raise ValueError(
-                f"episodes of '{self.scenario}': step_s is {self.step_s}, expected > 0"
-            )
-
-        if self.preview_stride < 1:
-            raise ValueError(
-                f"episodes of '{self.scenario}': preview_stride is {self.preview_stride}, "
-                "expected >= 1"
-            )
+        for name, is_valid, expected in (
+            ("horizon", self.horizon >= 1, ">= 1"),
+            ("step_s", self.step_s > 0.0, "> 0"),
+            ("preview_stride", self.preview_stride >= 1, ">= 1"),
+        ):
+            if not is_valid:
+                raise ValueError(
+                    f"episodes of '{self.scenario}': {name} is {getattr(self, name)}, expected "
+                    f"{expected}"
+                )
 
     @property
     def preview_step_s(self) -> float:
@@ -107,18 +97,23 @@ class EpisodesInfo:
         return self.preview_stride * self.step_s
 
     @property
+    def columns(self) -> dict[str, list[str]]:
+        """Names of the columns of each recorded array."""
+        preview = [f"{name}[{k}]" for k in range(self.horizon) for name in self.output_names]
+        return {
+            "state": self.state_names,
+            "true_state": self.state_names,
+            "output": self.output_names,
+            "desired_output": self.output_names,
+            "desired_preview": preview,
+            "features": self.feature_names,
+            "margins": self.constraint_names,
+        }
+
+    @property
     def widths(self) -> dict[str, int]:
         """Number of columns of each recorded array by name."""
-        num_states, num_outputs = len(self.state_names), len(self.output_names)
-        return {
-            "state": num_states,
-            "true_state": num_states,
-            "output": num_outputs,
-            "desired_output": num_outputs,
-            "desired_preview": self.horizon * num_outputs,
-            "features": len(self.feature_names),
-            "margins": len(self.constraint_names),
-        }
+        return {name: len(names) for name, names in self.columns.items()}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -128,7 +123,6 @@ class Episode:
     The last row is the sample at t = T or at the instant when the safe set was left.
 
     Attributes:
-        index: Number of the episode within its set.
         time_s: Time [s], (K+1,).
         state: Measured state, with observation noise, (K+1, n_s).
         true_state: State without observation noise, (K+1, n_s).
@@ -141,7 +135,6 @@ class Episode:
         is_safe: Whether the whole rollout stayed in the safe set.
         cause: "" when safe, else the name of the violated constraint, or "diverged".
         first_step: First row with an undisturbed future; earlier rows are not used for training.
-        num_controller_failures: Number of failed controller updates.
     """
 
     index: int
@@ -168,12 +161,7 @@ class Episodes(Sequence[Episode]):
     """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
-        """Checks every episode against `info`.
-
-        Raises:
-            ValueError: An array's shape does not fit `info` and `time_s`, or the cause is unknown
-                or contradicts `is_safe`.
-        """
+        """Checks every episode against `info`."""
         self.info = info
         self._episodes = list(episodes)
         for episode in self._episodes:
@@ -211,22 +199,11 @@ class Episodes(Sequence[Episode]):
             "row": np.concatenate([np.arange(0), *map(np.arange, counts)]),
             "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
         }
-        names = {
-            "state": info.state_names,
-            "true_state": info.state_names,
-            "output": info.output_names,
-            "desired_output": info.output_names,
-            "desired_preview": [
-                f"{name}[{k}]" for k in range(info.horizon) for name in info.output_names
-            ],
-            "features": info.feature_names,
-            "margins": info.constraint_names,
-        }
-        for array in RECORDED:
+        for array, names in info.columns.items():
             table = np.concatenate(
-                [np.empty((0, len(names[array]))), *(getattr(one, array) for one in episodes)]
+                [np.empty((0, len(names))), *(getattr(one, array) for one in episodes)]
             )
-            for name, column in zip(names[array], table.T, strict=True):
+            for name, column in zip(names, table.T, strict=True):
                 columns[f"{array}.{name}"] = column
         columns["is_safe"] = repeated([episode.is_safe for episode in episodes])
         columns["cause"] = repeated([episode.cause for episode in episodes])
@@ -281,15 +258,10 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
 def unsafety_score(
     remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float
 ) -> np.ndarray:
-    """Computes the unsafety score lambda of segments, in [0, 1].
+    """Computes the unsafety score lambda of segments, (N,), in [0, 1]; 0 where safe.
 
     Args:
         remaining_steps: R, steps from the segment's start to the termination, (N,).
-        is_unsafe: Whether the segment's episode ended unsafely, (N,).
-        discount: gamma in [0, 1].
-
-    Returns:
-        The unsafety scores, (N,): 0 for segments of safe episodes.
     """
     # Eq. (unsafety_score): lambda = gamma^R(i) if the trajectory is unsafe, else 0.
     return np.where(is_unsafe, float(discount) ** np.asarray(remaining_steps, dtype=float), 0.0)
@@ -353,14 +325,9 @@ def split(
     reach beyond the end are cut short and keep the terminal sample. Diverged episodes are skipped.
 
     Args:
-        episodes: The episodes; H is `episodes.info.horizon`.
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
         shortest: Least number of samples left of a complete episode; H by default.
-
-    Raises:
-        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
-            segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")

@@ -49,9 +49,6 @@ class Embedding:
         num_margins: n_c, the number of predicted margins.
         input_range: Least and largest value of each column, to which inputs are clipped, (2, n_x);
             None for no clipping.
-
-    Raises:
-        ValueError: Weights are missing or shapes are inconsistent.
     """
 
     def __init__(
@@ -203,9 +200,6 @@ class Embedding:
         """Returns the mean safety logit at x (N, n_x) and its gradient: (N,) and (N, n_x).
 
         The gradient is zero along a column that is clipped.
-
-        Raises:
-            ValueError: The maps have no safety head.
         """
         if not self.has_safety_head:
             raise ValueError("Embedding.logit_gradient: the maps have no safety head")

@@ -11,12 +11,7 @@ import numpy as np
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
-from drake_safety.learning.embedding import (
-    MapData,
-    stack_members,
-    train_map,
-    tsne,
-)
+from drake_safety.learning.embedding import MapData, stack_members, train_map, tsne
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
 from drake_safety.learning.segments import Episodes, EpisodesInfo, Segments, split
@@ -30,15 +25,9 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _logger = logging.getLogger("drake_safety")
 
-"""Called with a stage and the fraction done."""
-
 
 def check_preview(info: EpisodesInfo, parameters: AssessmentParameters) -> None:
-    """Checks that episodes have the preview of an assessment's parameters.
-
-    Raises:
-        ValueError: They have another one.
-    """
+    """Checks that episodes have the preview of an assessment's parameters."""
     for name in ("horizon", "preview_stride"):
         here, there = getattr(parameters, name), getattr(info, name)
         if here != there:
@@ -55,9 +44,6 @@ def segments_for(
 
     Returns:
         The segments, and whether each is embedded by t-SNE, (N,).
-
-    Raises:
-        ValueError: The episodes give too few segments for t-SNE.
     """
     is_sharpened, horizon = parameters.is_sharpened, parameters.horizon
     segments = split(
@@ -98,11 +84,9 @@ def learned_maps(
     """Embeds the segments by t-SNE and trains the maps Psi to reproduce the embedding.
 
     Args:
-        segments: The training segments.
         has_target: Whether each is embedded by t-SNE, (N,).
         x: Their inputs, (N, n_x).
         grid: The grid that t-SNE's points are scaled to.
-        parameters: The assessment's parameters.
         progress: Called with "distances", "t-SNE", "training", the percentage done and 100.
 
     Returns:
@@ -176,9 +160,6 @@ def known_range(x: np.ndarray) -> np.ndarray:
 
     Departure: a map of rectifiers extrapolates linearly, off the grid or into cells of others; of a
     clipped input it knows at least the other columns, as a decision tree does.
-
-    Args:
-        x: Training inputs, (N, n_x).
     """
     return np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
 
@@ -193,10 +174,6 @@ def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> n
 
     They are held out for the base logit, a function of the ensemble's mean, so all maps hold out
     the same episodes; in the paper's mode for early stopping.
-
-    Args:
-        segments: The training segments.
-        parameters: The assessment's parameters.
     """
     episodes = np.unique(segments.episode)
     share = parameters.held_out if parameters.is_sharpened else parameters.paper.held_out
@@ -268,8 +245,6 @@ def fitted_base_logit(
     Args:
         output: The maps' outputs for held-out segments; on training segments they are
             overconfident.
-        segments: The held-out segments.
-        parameters: The assessment's parameters.
     """
     logit = BaseLogit(
         margin_unit=parameters.margin_unit,

@@ -24,17 +24,7 @@ _KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "�
 
 @contextlib.contextmanager
 def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> Iterator[None]:
-    """Serves the page in a thread; one page in a process.
-
-    Args:
-        panel: What is shown and controlled, by all viewers alike.
-        host: Address that serves the page.
-        port: Its port.
-        scene_port: Port of Meshcat, at the same address.
-
-    Raises:
-        ValueError: The server does not start.
-    """
+    """Serves the page in a thread; one page in a process."""
     options: dict[str, Any] = {
         "root": lambda: build_page(panel, scene_port),
         "title": panel.title,

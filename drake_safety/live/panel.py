@@ -49,16 +49,10 @@ class LivePanel:
     The session runs in one thread and the page in another. Each of them replaces whole values,
     which needs no lock; only a click is taken by the one and made by the other.
 
-    Args:
-        title: Title of the page.
-        threshold: Probability at which the threshold line is drawn.
-
     Attributes:
-        status: The text shown.
         probability: The probability; NaN before the first.
         belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
-        sliders: Range of each slider by its name.
         is_stopped: Whether the session has ended.
     """
 
@@ -114,13 +108,9 @@ class LivePanel:
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
-        """Shows the probability and the belief.
+        """Shows the probability, or NaN, and the belief (safe, unsafe, don't know), of sum one.
 
-        Args:
-            probability: In [0, 1], or NaN.
-            belief: (safe, unsafe, don't know), (3,), of sum one; one that is not finite is shown
-                as "don't know".
-            time_s: Time of a point of the curve, later than the previous one [s]; None for none.
+        A belief that is not finite is "don't know". With a time [s] the curve gets a point.
         """
         self.probability = float(probability)
         self.belief = tuple(belief.tolist()) if np.isfinite(belief).all() else _UNKNOWN

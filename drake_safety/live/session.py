@@ -55,18 +55,7 @@ class LiveSession(ABC):
     It starts anew when :attr:`START` is clicked. A subclass says how it starts, what its other
     controls do, and what is shown.
 
-    Args:
-        loop: A closed loop built with this Meshcat and with an assessment.
-        meshcat: The Meshcat server.
-        threshold: Threshold of the probability.
-        seed: Seed of starts, noise and pushes.
-
-    Raises:
-        ValueError: The loop was built without an assessment, or lacks a port of the assessor.
-
-    Attributes:
-        pace: Simulated and real time so far.
-        panel: What a page shows, and its controls.
+    The loop is built with this Meshcat and with an assessment.
     """
 
     START = "Stand up again"
@@ -115,26 +104,22 @@ class LiveSession(ABC):
         """Shows what the robot does."""
 
     def tick(self) -> bool:
-        """Reacts to the controls, advances by one tick, and shows belief and verdict.
-
-        Returns:
-            Whether anything was simulated.
-        """
+        """Reacts to the controls, advances by one tick, and shows belief and verdict."""
         if self.panel.take_click(self.START) or (self.STARTS_AGAIN and self._is_over):
             self._start()
         self._react()
         if self._is_over:
             return False
-        self._advance()
+        self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
+        probability, belief = self._eval("safety_probability")[0], self._eval("belief")
+        self.panel.show_belief(probability, belief, self.context.get_time())
+        if self._camera is not None:
+            self._camera.follow(self.context)
         self._show_status()
         return True
 
     def run(self, *, is_paced: bool = True) -> None:
-        """Ticks until the button Stop is clicked; however it ends, the panel says so.
-
-        Args:
-            is_paced: Whether to run in real time; False runs as fast as possible.
-        """
+        """Ticks, in real time or as fast as possible, until Stop is clicked; the panel says so."""
         late_s = 0.0
         try:
             while not self.panel.take_click(STOP):
@@ -176,13 +161,6 @@ class LiveSession(ABC):
     @property
     def _is_over(self) -> bool:
         return self.context.get_time() >= self._end_s - 1e-9
-
-    def _advance(self) -> None:
-        self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
-        probability, belief = self._eval("safety_probability")[0], self._eval("belief")
-        self.panel.show_belief(probability, belief, self.context.get_time())
-        if self._camera is not None:
-            self._camera.follow(self.context)
 
     def _show_by_probability(self, note: str, doing: str = "") -> None:
         """Shows "safe", "unsafe" or "don't know", and what the robot does."""

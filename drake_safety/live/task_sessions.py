@@ -80,14 +80,7 @@ class LiveThrows(LiveSession):
 
 
 class LiveGoals(LiveSession):
-    """A session with a robot that reaches for accepted targets.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        meshcat: The Meshcat server.
-        unsafe_below: See :func:`drake_safety.planning.goal_verdict.assess_goal`.
-        **options: See `LiveSession`.
-    """
+    """A session with a robot that reaches for accepted targets."""
 
     ASK, GO, FORCE, START = "Ask", "Go", "Go all the same", "Stand"
     BUTTONS = ((ASK, "KeyA"), (GO, "Space"), (FORCE, ""))

@@ -18,14 +18,11 @@ class Channel:
     """Columns of one table or topic, unconverted.
 
     Attributes:
-        path: The log.
         topic: Topic of the messages; empty for a table.
         time: Time in the log's unit, integers or floats, (N,).
         time_unit: Unit of ``time``.
-        time_name: Name of the time column.
         columns: The requested columns by name, (N,) floats each.
         row_name: Name of a row: "line", "row" or "message".
-        first_row: Number of the first row.
     """
 
     path: Path

@@ -29,15 +29,7 @@ _MOVING = 1.0  # Lower velocities are not compared with derivatives.
 
 
 def check_time(channel: Channel, max_gap_s: float) -> None:
-    """Checks that time is finite, increasing, in plausible units and without gaps.
-
-    Args:
-        channel: A table or topic.
-        max_gap_s: Largest time between two rows [s].
-
-    Raises:
-        ValueError: A check failed; the message names the row.
-    """
+    """Checks that time is finite, increasing, in plausible units and without gaps."""
     check_clock(channel)
     for row in rows_after_gaps(channel, max_gap_s).tolist():
         raise ValueError(
@@ -47,25 +39,13 @@ def check_time(channel: Channel, max_gap_s: float) -> None:
 
 
 def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
-    """Returns the rows before which a gap is longer than a limit.
-
-    Args:
-        channel: A table or topic.
-        max_gap_s: Largest time between two rows [s].
-    """
+    """Returns the rows before which a gap is longer than ``max_gap_s``."""
     # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
     return np.flatnonzero(channel.steps_s() > max_gap_s * (1 + 1e-6)) + 1
 
 
 def check_clock(channel: Channel) -> None:
-    """Checks that time is finite, increasing and in plausible units.
-
-    Args:
-        channel: A table or topic.
-
-    Raises:
-        ValueError: A check failed; the message names the row.
-    """
+    """Checks that time is finite, increasing and in plausible units."""
     time = channel.time
     if len(time) < MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
@@ -94,11 +74,7 @@ def check_clock(channel: Channel) -> None:
 
 
 def check_finite(channel: Channel) -> None:
-    """Checks that all values exist, are finite and of a size that quantities in SI units have.
-
-    Raises:
-        ValueError: A value is not; the message names the first row and the column.
-    """
+    """Checks that all values exist, are finite and of a size that quantities in SI units have."""
     bad = bad_values(channel)
     rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
     if rows:
@@ -116,15 +92,7 @@ def bad_values(channel: Channel) -> dict[str, np.ndarray]:
 
 
 def check_norms(channel: Channel, names: list[str]) -> None:
-    """Checks that quaternions have a norm of 1.
-
-    Args:
-        channel: Channel of the quaternion.
-        names: Its four columns.
-
-    Raises:
-        ValueError: A norm differs; the message names the first row.
-    """
+    """Checks that quaternions have a norm of 1."""
     norms = np.linalg.norm(channel.table(names), axis=1)
     is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
     if is_bad.any():
@@ -141,19 +109,10 @@ def check_first_row(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Checks that the robot stands on the ground in the first row.
+    """Checks that the robot stands on the ground in the first row, from its positions by map.
 
     A wrong order of the quaternion tilts it; wrong units lift its feet off the ground or move
     joints beyond their stops. The error suggests changes of the map that pass the check.
-
-    Args:
-        kinematics: The robot.
-        log_map: The map.
-        positions: Function that returns the first row's positions (n_q,) for a map.
-        where: Location of the first row.
-
-    Raises:
-        ValueError: The check failed; the message names the reason and plausible maps.
     """
     wrong = _implausible(kinematics, positions(log_map))
     if not wrong:
@@ -182,19 +141,10 @@ def check_stillness(
     positions: Callable[[LogMap], np.ndarray],
     where: str,
 ) -> None:
-    """Checks that the feet do not slip far less with the other order of the quaternion.
+    """Checks that feet at positions (N, n_q) slip no less with the other order of the quaternion.
 
     Reading x y z w as w x y z turns an upright robot by half a turn about the vertical: it stands,
     but the feet seem to slip twice as far as the base moves.
-
-    Args:
-        kinematics: The robot.
-        log_map: The map.
-        positions: Function that returns positions (N, n_q) at some rows for a map.
-        where: Location of the rows.
-
-    Raises:
-        ValueError: The check failed; the message has the slip in either order.
     """
     other = copy.deepcopy(log_map)
     (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
@@ -239,17 +189,7 @@ def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarra
 def check_limits(
     kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
 ) -> None:
-    """Checks that joints are not far beyond their stops.
-
-    Args:
-        kinematics: The robot.
-        joints: Joint positions at the channel's rows, (N, n_j) [rad].
-        channel: Channel of the joints.
-        names: The joints' columns.
-
-    Raises:
-        ValueError: A joint is; the message names the first row and the column.
-    """
+    """Checks that joints (N, n_j) [rad] are not far beyond their stops."""
     excess = _beyond_limits(kinematics, joints)
     is_far = excess > _FAR_RAD
     if is_far.any():
@@ -265,18 +205,7 @@ def check_limits(
 def check_rates(
     logged: np.ndarray, derived: np.ndarray, channel: Channel, names: list[str], unit: str
 ) -> None:
-    """Checks that velocities are not far larger than the derivatives of positions.
-
-    Args:
-        logged: Velocities in SI units, (N, n).
-        derived: Derivatives of the logged positions, (M, n).
-        channel: Channel of the velocities.
-        names: Their columns.
-        unit: Their unit in the map.
-
-    Raises:
-        ValueError: The check failed; the message names the column.
-    """
+    """Checks that velocities (N, n) are not far larger than the derivatives of positions (M, n)."""
     with np.errstate(over="ignore"):  # An infinite size is implausible too.
         size = np.sqrt(np.mean(logged**2, axis=0))
         expected = np.sqrt(np.mean(derived**2, axis=0))
@@ -294,18 +223,7 @@ def check_rates(
 def check_desired_output(
     kinematics: RobotKinematics, desired: np.ndarray, base: np.ndarray, where: str, unit: str
 ) -> None:
-    """Checks that the desired output is near the robot.
-
-    Args:
-        kinematics: The robot.
-        desired: z* of the first row, (3,) [m].
-        base: Position of the base in the first row, (3,) [m].
-        where: Location of the row.
-        unit: The unit of z* in the map.
-
-    Raises:
-        ValueError: The check failed; the message has the distance.
-    """
+    """Checks that the desired output (3,) [m] is near the base (3,) [m]."""
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(

@@ -36,61 +36,34 @@ def joint_table(
 def base_velocities(
     velocity: Velocity, channels: Mapping[str, Channel], rotations: Rotation
 ) -> np.ndarray:
-    """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s].
-
-    Args:
-        velocity: Its entry in the map.
-        channels: The log.
-        rotations: Orientation of the base at the velocity topic's times.
-    """
+    """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s]."""
     units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
     table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
     return table if velocity.frame == "world" else rotations.apply(table)
 
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:
-    """Interpolates rotations by slerp.
-
-    Args:
-        time_s: Times of the rotations, increasing, (N,) [s].
-        rotations: The rotations.
-        at_s: Interpolation times, (M,) [s], clipped to the range of ``time_s``.
-    """
+    """Rotations at times (M,) [s], clipped to the range of the increasing times (N,), by slerp."""
     if len(time_s) == 1:
         return rotations[np.zeros(len(at_s), dtype=int)]
     return Slerp(time_s, rotations)(np.clip(at_s, time_s[0], time_s[-1]))
 
 
 def values_at(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Interpolates columns linearly, (M, n).
-
-    Args:
-        time_s: Times of the rows, increasing, (N,) [s].
-        values: (N, n).
-        at_s: Interpolation times, (M,) [s], clipped to the range of ``time_s``.
-    """
+    """Columns (N, n) at times (M,) [s], clipped to the range of the times (N,), linearly."""
     return np.stack([np.interp(at_s, time_s, column) for column in values.T], axis=1)
 
 
 def rates(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Differentiates columns, exactly for parabolas, (N, n) [1/s].
-
-    Args:
-        time_s: Times of at least three rows, increasing, (N,) [s].
-        values: (N, n).
-    """
+    """Differentiates columns (N, n) of at least three rows, exactly for parabolas, [1/s]."""
     return np.gradient(values, time_s, axis=0, edge_order=2)
 
 
 def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
-    """Differentiates rotations to angular velocities along the world's axes, (N, 3) [rad/s].
+    """Differentiates at least three rotations to angular velocities in the world, (N, 3) [rad/s].
 
     Each is a weighted mean of the finite differences before and after the row, exact for linearly
     changing angular velocities.
-
-    Args:
-        time_s: Times of at least three rotations, increasing, (N,) [s].
-        rotations: The rotations.
     """
     step_s = np.diff(time_s)[:, None]
     between = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / step_s

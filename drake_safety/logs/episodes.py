@@ -59,10 +59,6 @@ def cut_log(
     Returns:
         The episodes and their starts: ``run_episode(nominal_loop, start=starts[i])`` is the twin
         of ``episodes[i]``.
-
-    Raises:
-        ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
-            too short for one segment.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
@@ -106,11 +102,7 @@ def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:
 def _cut(
     log: RobotLog, loop: LeggedLoop, desired: np.ndarray
 ) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
-    """Episodes and starts of a piece with z* in the world, (N, n_z) [m].
-
-    Returns:
-        These, and whether the robot has left the safe set.
-    """
+    """Episodes and starts of a piece with z* (N, n_z) [m], and whether it leaves the safe set."""
     scenario = loop.scenario
     shortest = shortest_steps(scenario.assessment)
     context = loop.CreateDefaultContext()

@@ -137,11 +137,7 @@ class LogMap:
     """Largest time between two rows [s]."""
 
     def check(self) -> None:
-        """Checks that the map is complete and consistent.
-
-        Raises:
-            ValueError: The check failed; the message names the entry.
-        """
+        """Checks that the map is complete and consistent."""
         for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
                 hint = _NO_POSITION if name == "base_position" else ""
@@ -165,14 +161,7 @@ class LogMap:
 
 
 def load_log_map(path: str | Path) -> LogMap:
-    """Reads a ``columns.yaml``.
-
-    Args:
-        path: The file.
-
-    Raises:
-        ValueError: The file does not exist or does not fit the schema.
-    """
+    """Reads a ``columns.yaml``."""
     who = f"map '{path}'"
     log_map = load_typed_file(LogMap, Path(path), who)
     try:

@@ -21,17 +21,7 @@ _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 
 
 def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
-    """Reads fields of the messages of an MCAP file with ROS 2 messages.
-
-    Args:
-        path: The file.
-        wanted: Field paths by topic.
-        time: Where the time is.
-
-    Raises:
-        ValueError: The extra is not installed, the file is damaged, or a topic or field is
-            missing.
-    """
+    """Reads the wanted fields, by topic, of an MCAP file with ROS 2 messages."""
     require_extra("logs", f"log '{path}'", "mcap", "mcap_ros2")
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
@@ -53,17 +43,7 @@ def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) ->
 
 
 def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
-    """Reads fields of the messages of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
-
-    Args:
-        path: The file or folder.
-        wanted: Field paths by topic.
-        time: Where the time is.
-
-    Raises:
-        ValueError: The extra is not installed, the bag is damaged, or a topic or field is
-            missing.
-    """
+    """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder)."""
     require_extra("logs", f"log '{path}'", "rosbags")
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -141,12 +121,8 @@ def _channels(
 def field_of(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of a message.
 
-    Args:
-        path: ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
-            index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
-
-    Raises:
-        ValueError: The path is malformed.
+    A path is ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
+    index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
     """
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")

@@ -15,18 +15,10 @@ from drake_safety.logs.channel import Channel
 def cut_channels(
     channels: Mapping[str, Channel], max_gap_s: float
 ) -> tuple[list[dict[str, Channel]], list[str]]:
-    """Cuts tables or topics where a value is missing or a gap in time is too long.
+    """Cuts tables or topics where a value is missing or a gap in time is longer than ``max_gap_s``.
 
-    Args:
-        channels: The channels by topic.
-        max_gap_s: Largest time between two rows [s].
-
-    Returns:
-        The channels of each piece in order of time, whose common time is covered by all without a
-        cut, and the reasons of the cuts.
-
-    Raises:
-        ValueError: The time of a channel is not finite, does not increase or has another unit.
+    Returns the channels of each piece in order of time, whose common time is covered by all without
+    a cut, and the reasons of the cuts.
     """
     pieces: list[dict[str, Channel]] = [{}]
     reasons: list[str] = []

@@ -41,8 +41,6 @@ class RobotLog:
     """Motion of a robot.
 
     Attributes:
-        path: The log.
-        robot: Name of the robot.
         time_s: Time since the first row, increasing, (N,) [s].
         q: Positions: base quaternion (w, x, y, z), base position, joints, (N, n_q).
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
@@ -66,11 +64,7 @@ class RobotLog:
         return float(self.time_s[-1])
 
     def states_at(self, at_s: np.ndarray) -> np.ndarray:
-        """Interpolates plant states [q, v], (M, n_q + n_v): rotations by slerp, others linearly.
-
-        Args:
-            at_s: Times (M,) [s].
-        """
+        """States (M, n_q + n_v) at times (M,) [s]: rotations by slerp, others linearly."""
         rotations = rotations_at(
             self.time_s, Rotation.from_quat(self.q[:, :4], scalar_first=True), at_s
         )
@@ -83,9 +77,7 @@ class LogPieces:
     """What is left of a log that was cut at missing values and gaps.
 
     Attributes:
-        pieces: The pieces, in order of time.
         duration_s: Duration of the whole log [s].
-        cuts: The reasons of the cuts.
     """
 
     pieces: list[RobotLog]
@@ -109,21 +101,12 @@ def read_pieces(
 
     The first piece is checked as a log is, since these checks are about the map: a later one may
     begin in mid-motion, or after a fall.
-
-    Args:
-        path: See :func:`read_log`.
-        log_map: See :func:`read_log`.
-        robot: See :func:`read_log`.
-        step_s: See :func:`read_log`.
-
-    Raises:
-        ValueError: See :func:`read_log`; or nothing is left.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     found, cuts = cut_channels(channels, log_map.max_gap_s)
     pieces: list[RobotLog] = []
     for part in found:
-        if _num_rows(log_map, part, step_s) < 2:
+        if len(_times(log_map, part, step_s)) < 2:
             continue
         checks.check_norms(part[log_map.base_orientation.topic], log_map.base_orientation.columns)
         one = _converted(path, log_map, kinematics, part, step_s, is_checked=not pieces)
@@ -137,14 +120,14 @@ def read_pieces(
     return LogPieces(pieces=pieces, duration_s=end - begin, cuts=cuts)
 
 
-def _num_rows(log_map: LogMap, channels: dict[str, Channel], step_s: float | None) -> int:
-    """Number of rows of a converted piece."""
+def _times(log_map: LogMap, channels: dict[str, Channel], step_s: float | None) -> np.ndarray:
+    """Times of the rows of a converted piece, since the first row of any channel [s]."""
     begin, end = _common_time(channels)
     if step_s is not None:
-        return int((end - begin) / step_s + 1e-9) + 1
+        return begin + step_s * np.arange(int((end - begin) / step_s + 1e-9) + 1)
     origin = min(channel.time[0] for channel in channels.values())
     base_time = channels[log_map.base_position.topic].seconds_since(origin)
-    return int(np.sum((base_time >= begin) & (base_time <= end)))
+    return base_time[(base_time >= begin) & (base_time <= end)]
 
 
 def _common_time(channels: dict[str, Channel]) -> tuple[float, float]:
@@ -166,12 +149,8 @@ def read_log(
     Args:
         path: A ``.csv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a ROS 2 bag.
         log_map: The map of its columns, or the path of a ``columns.yaml``.
-        robot: The robot.
         step_s: Time between two rows of the result [s]; by default the times are those of the
             base's positions.
-
-    Raises:
-        ValueError: A value is missing or implausible; the message names file, row and column.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     for channel in channels.values():
@@ -195,12 +174,7 @@ def _opened(
     if step_s is not None and not step_s > 0:
         raise ValueError(f"read_log: step_s must be positive; got {step_s}")
     kinematics = RobotKinematics(robot)
-    return (
-        path,
-        log_map,
-        kinematics,
-        _read_channels(path, _wanted(log_map, kinematics), log_map),
-    )
+    return path, log_map, kinematics, _read_channels(path, _wanted(log_map, kinematics), log_map)
 
 
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
@@ -274,16 +248,12 @@ def _converted(
 ) -> RobotLog:
     origin = min(channel.time[0] for channel in channels.values())
     times = {topic: channel.seconds_since(origin) for topic, channel in channels.items()}
-    start = max(time[0] for time in times.values())
-    end = min(time[-1] for time in times.values())
+    start, end = _common_time(channels)
     if not end > start:
         spans = {topic: (float(t[0]), float(t[-1])) for topic, t in times.items()}
         raise ValueError(f"log '{path}': its topics do not overlap in time: {spans} [s]")
     base_time = times[log_map.base_position.topic]
-    if step_s is None:
-        at_s = base_time[(base_time >= start) & (base_time <= end)]
-    else:
-        at_s = start + step_s * np.arange(int((end - start) / step_s + 1e-9) + 1)
+    at_s = _times(log_map, channels, step_s)
     if len(at_s) < 2:
         raise ValueError(f"log '{path}': its topics overlap for {end - start:g} s only")
     first_row = int(np.searchsorted(base_time, at_s[0]))

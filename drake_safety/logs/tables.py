@@ -20,16 +20,7 @@ if TYPE_CHECKING:
 
 
 def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
-    """Reads columns of a CSV file with a header line.
-
-    Args:
-        path: The file.
-        wanted: Names of the columns.
-        time: Where the time is.
-
-    Raises:
-        ValueError: A column is missing, duplicate or not numeric, or the extra is not installed.
-    """
+    """Reads columns of a CSV file with a header line."""
     require_extra("logs", f"log '{path}'", "pandas")
     import pandas as pd
 
@@ -44,17 +35,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> Channel:
-    """Reads columns of a Parquet file.
-
-    Args:
-        path: The file.
-        wanted: Names of the columns.
-        time: Where the time is.
-
-    Raises:
-        ValueError: The file is not a Parquet file, a column is missing or not numeric, or the extra
-            is not installed.
-    """
+    """Reads columns of a Parquet file."""
     require_extra("logs", f"log '{path}'", "pandas", "pyarrow")
     import pyarrow.parquet as pq
 

@@ -13,7 +13,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
+from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, is_in_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -28,8 +28,6 @@ class GoalVerdict:
         probability: The probability of staying safe; NaN where it was not evaluated, because the
             goal is outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
-        constraint_names: The n_c constraints, the possible causes.
-        cause_probability: b_unsafe split by the violated constraint, (n_c,).
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
             where none is predicted.
         margin_unit: Scale by which margins are compared [m, rad].
@@ -56,10 +54,7 @@ class GoalVerdict:
     def cause(self) -> str:
         """The constraint most likely to be violated; "" if there is no evidence for any."""
         return likely_cause(
-            self.constraint_names,
-            self.cause_probability,
-            self.predicted_margins,
-            self.margin_unit,
+            self.constraint_names, self.cause_probability, self.predicted_margins, self.margin_unit
         )
 
     @property
@@ -99,8 +94,6 @@ def assess_goal(
     instant.
 
     Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
             region sampled in training, is "don't know".
         threshold: Lowest probability of a safe goal.
@@ -113,7 +106,7 @@ def assess_goal(
     goal = checked_goal(goal)
     with_goals = require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
-    if np.isfinite(goal).all() and np.all((goal >= box[0]) & (goal <= box[1])):
+    if is_in_box(goal, box):
         (verdict,) = assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
         )
@@ -145,13 +138,6 @@ def assess_goals(
 
     The verdict is "don't know" where the input is novel, or half of the belief or more comes from
     cells without training data.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: The assessment learned from its episodes.
-        goals: In the world, (N, 3) [m].
-        threshold: See :func:`assess_goal`.
-        unsafe_below: See :func:`assess_goal`.
     """
     if len(goals) == 0:
         return []
@@ -199,11 +185,7 @@ def assess_goals(
 
 
 def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The assessment's inputs at the first instant of the motion from standing to each goal.
-
-    Args:
-        loop: A closed loop whose plans have a goal.
-        goals: In the world, (N, 3) [m], N ≥ 1.
+    """The assessment's inputs at the first instant of motions from standing to goals (N, 3) [m].
 
     Returns:
         State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
@@ -219,11 +201,7 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def checked_goal(goal: np.ndarray) -> np.ndarray:
-    """Returns a goal as an array, (3,) [m]; it need not be finite.
-
-    Raises:
-        ValueError: The goal is not three numbers.
-    """
+    """Returns a goal as an array, (3,) [m]; it need not be finite."""
     goal = np.asarray(goal, dtype=float)
     if goal.shape != (3,):
         raise ValueError(f"a goal is three numbers; got {goal.tolist()}")

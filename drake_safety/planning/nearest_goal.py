@@ -10,12 +10,7 @@ import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
-from drake_safety.planning.goal_verdict import (
-    GoalVerdict,
-    assess_goals,
-    checked_goal,
-    goal_inputs,
-)
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checked_goal, goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -69,11 +64,8 @@ def nearest_accepted_goal(
     All candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict.
 
     Args:
-        loop: A closed loop whose plans have a goal.
-        assessment: The assessment learned from its episodes.
         goal: In the world, (3,) [m]; it may lie outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
-        rng: Source of the candidates.
         reserve: Share of the interval from the threshold to the largest probability, in [0, 1].
         num_candidates: Candidates of the search per batch; half as many if the descent has found
             an accepted goal.
@@ -221,12 +213,7 @@ def _bisect(
 
 
 def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Rounds points to the grid of candidates.
-
-    Args:
-        points: In the world, (..., 3) [m].
-        resolution_m: Spacing of the grid [m].
-    """
+    """Rounds points to the grid of candidates."""
     # A multiple of the spacing differs in its last bits from the same number read from a text.
     return np.round(np.round(points / resolution_m) * resolution_m, 9)
 

@@ -22,7 +22,6 @@ class PlanChoice:
 
     Attributes:
         index: Position of the chosen plan among the candidates.
-        probability: Probability of each candidate, (M,).
         threshold: Lowest probability of an accepted plan.
     """
 
@@ -42,7 +41,6 @@ def plan_inputs(
     """The assessment's inputs for each plan, in the state of a Context.
 
     Args:
-        loop: A closed loop whose plans can be chosen.
         context: Its Context; it keeps its plan.
         plans: M candidates, the first of them the plan of the Context.
 
@@ -74,16 +72,9 @@ def choose_plan(
     """Sets the plan with the highest probability; the present plan is one of the candidates.
 
     Args:
-        loop: A closed loop whose plans can be chosen.
-        assessment: The assessment learned from its episodes.
         context: Its Context, in the state to plan from; the chosen plan is set in it.
         threshold: Lowest probability of an accepted plan. If no candidate reaches it, the best
             one is set, and ``is_accepted`` is False.
-        rng: Source of the candidates.
-        num_plans: Largest number of candidates.
-
-    Raises:
-        ValueError: The task's plans cannot be chosen.
     """
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)

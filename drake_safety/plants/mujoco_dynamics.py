@@ -28,11 +28,6 @@ class MujocoDynamics:
     object keeps one scratch MjData, which every method overwrites.
 
     Args:
-        robot: The robot.
-        plant: A finalised Drake plant of the robot and its scene.
-        scene_graph: The plant's scene graph.
-        variation: Differences from the published robot.
-        time_step_s: Step [s].
         servos: Whether the command is a joint state for robot.yaml's servos instead of torques.
     """
 
@@ -116,7 +111,6 @@ class MujocoDynamics:
 
         Raises:
             DivergenceError: The simulation is unstable, or an argument is not finite.
-            ValueError: A force acts on a body that MuJoCo does not have.
         """
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
             raise DivergenceError(f"robot '{self.robot.name}': MuJoCo cannot step from NaN")

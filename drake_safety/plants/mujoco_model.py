@@ -237,22 +237,9 @@ def build_model(
     plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
     defaults, with an elliptic friction cone.
 
-    Args:
-        robot: The robot.
-        plant: A finalised Drake plant of the robot and its scene.
-        scene_graph: The plant's scene graph.
-        variation: Differences from the published robot.
-        time_step_s: Step [s].
-        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
-
-    Returns:
-        The model, and for each of its controls the index of its value in the command: joint
-        positions and velocities with servos, joint torques without, in the order of
-        :func:`~drake_safety.robots.robot.servo_joints`.
-
-    Raises:
-        ValueError: The robot's model is not a URDF or MuJoCo cannot read it, its base is not the
-            root, MuJoCo does not have a shape, or another body in the scene moves.
+    Returns the model, and for each of its controls the index of its value in the command: joint
+    positions and velocities with servos, joint torques without, in the order of
+    :func:`~drake_safety.robots.robot.servo_joints`.
     """
     mujoco = import_mujoco()
     spec = _read_robot(robot)

@@ -29,7 +29,6 @@ class MujocoPlant(LeafSystem):
     start, is discrete state of the Context.
 
     Args:
-        dynamics: The robot in MuJoCo.
         plant: The finalised Drake plant of the same robot, used for the default state only.
     """
 

@@ -43,11 +43,7 @@ class Obstacle:
 
 
 def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[ModelInstanceIndex]:
-    """Welds obstacles to the world of a plant that is not finalised; returns their models.
-
-    Raises:
-        ValueError: A model cannot be read, has moving joints, or more or less than one root link.
-    """
+    """Welds obstacles to the world of a plant that is not finalised; returns their models."""
     parser = package_parser(plant)
     instances = []
     for obstacle in obstacles:
@@ -148,18 +144,9 @@ def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Cont
 
 
 class Clearance:
-    """Signed distances of a robot's arms, and of points, to obstacles.
+    """Signed distances of a robot's arms, and of points, to obstacles, clipped to ``range_m``.
 
     It has its own plant and scene graph, without ground, and one scratch Context a thread.
-
-    Args:
-        robot: The robot.
-        obstacles: The obstacles.
-        range_m: Largest distance; larger ones are clipped [m].
-
-    Raises:
-        ValueError: The range is not positive, an obstacle cannot be read, or the arms have no
-            collision geometry.
     """
 
     def __init__(self, robot: RobotModel, obstacles: list[Obstacle], *, range_m: float):
@@ -193,11 +180,7 @@ class Clearance:
         return self._query_port.Eval(self._scratch.value[2])
 
     def of_arms(self, q: np.ndarray) -> float:
-        """Distance of the arms to the nearest obstacle at q (n_q,), negative in contact [m].
-
-        Raises:
-            ValueError: The positions are not finite.
-        """
+        """Distance of the arms to the nearest obstacle at q (n_q,), negative in contact [m]."""
         # Drake's plant aborts the process for positions that are not finite.
         if not q.dot(q) < math.inf:
             raise ValueError(f"clearance: positions must be finite; got {q}")

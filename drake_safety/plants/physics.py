@@ -12,12 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import (
-    CollisionFilterDeclaration,
-    GeometrySet,
-    HalfSpace,
-    SceneGraph,
-)
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, HalfSpace, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -68,11 +63,9 @@ class DrakePhysics:
     """Physics by a MultibodyPlant; :func:`add_physics` makes it.
 
     Attributes:
-        plant, scene_graph, instance: The plant, its scene graph and the robot's model instance.
         ball: The ball, or None.
         state: Output port of the robot's ``[q; v]``.
         ball_state: Output port of the ball's ``[q; v]``, or None.
-        applied_spatial_force: Input port of external forces.
     """
 
     def __init__(
@@ -224,17 +217,7 @@ def add_physics(
 ) -> Physics:
     """Adds a robot on level ground to a diagram, simulated by the variation's engine.
 
-    Args:
-        builder: The diagram's builder.
-        robot: The robot.
-        variation: The engine, and differences from the published robot.
-        scene: The scene besides the ground.
-        time_step_s: Step of the discrete plant [s].
-        servos: Whether the joints have robot.yaml's position servos instead of torque inputs.
-
-    Raises:
-        ValueError: A body, joint or file does not exist, a leg or an arm has no motors, a
-            decoration has collision geometry, or the engine cannot simulate the scene.
+    The joints have robot.yaml's position servos, or else torque inputs.
     """
     engine = MujocoPhysics if variation.engine == "mujoco" else DrakePhysics
     return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)

@@ -54,9 +54,6 @@ def fitted_shape(
 
     Returns:
         The shape; None if nothing is above the floor.
-
-    Raises:
-        ImportError: trimesh is not installed.
     """
     if floor is not None:
         points = _above(points, *floor)

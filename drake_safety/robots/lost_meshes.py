@@ -16,14 +16,11 @@ _Floor = tuple[np.ndarray, float]
 def replace_lost_meshes(
     copy: UrdfCopy, survey: Survey, legs: list[Limb], posture: dict[str, float], scratch: Path
 ) -> Survey:
-    """Writes a shape in place of each lost collision mesh, but for those of the feet.
+    """Writes a shape in place of each lost collision mesh, and returns the robot, standing.
 
-    The feet have their contact spheres. Shapes of links that are welded to a foot end above its
+    The feet keep their contact spheres. Shapes of links that are welded to a foot end above its
     spheres, which alone touch the ground. Where two links overlap in the standing posture, convex
     hulls replace primitives, which are larger.
-
-    Returns:
-        The robot with these shapes, standing.
     """
     survey.set_joints(posture)
     floors = {link: _floor(survey, leg, link) for leg in legs for link in survey.welded(leg.body)}
@@ -68,10 +65,7 @@ def _fitted(
 
 
 def _rewritten(
-    copy: UrdfCopy,
-    shapes: dict[str, list[FittedShape]],
-    posture: dict[str, float],
-    scratch: Path,
+    copy: UrdfCopy, shapes: dict[str, list[FittedShape]], posture: dict[str, float], scratch: Path
 ) -> Survey:
     for link, fitted in shapes.items():
         copy.set_fitted(link, fitted)

@@ -57,15 +57,9 @@ def _is_transparent(materials: Path) -> bool:
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:
-    """Returns a mesh that Drake renders: the file itself, or a glTF file in the cache.
+    """The file itself if Drake renders it, or else a glTF file in the cache.
 
-    Args:
-        path: The mesh.
-        rgba: Colour of a mesh without materials, "r g b a".
-
-    Raises:
-        MissingExtraError: The mesh needs a conversion whose packages are not installed.
-        ValueError: The file does not exist or cannot be read.
+    ``rgba`` ("r g b a") colours a mesh without materials.
     """
     if is_shown(path):
         return path
@@ -98,12 +92,7 @@ def _write(target: Path, content: bytes) -> None:
 
 
 def mesh_points(path: Path) -> np.ndarray:
-    """Returns the vertices of a mesh, (n, 3), in the mesh's units.
-
-    Raises:
-        MissingExtraError: The packages that read it are not installed.
-        ValueError: The file cannot be read, or is empty.
-    """
+    """Returns the vertices of a mesh, (n, 3), in the mesh's units."""
     return np.array(_scene(path).to_mesh().vertices, dtype=float)
 
 

@@ -60,16 +60,7 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
     Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
-
-    Args:
-        url: The URL or path.
-        folder: The folder.
-        requires: Requirement by which pip installs the package without its dependencies; empty for
-            packages of an extra.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-        ValueError: The package is unknown.
+    ``requires`` is what pip installs without its dependencies; empty for packages of an extra.
     """
     parts = urlparse(url)
     if parts.scheme != "package":

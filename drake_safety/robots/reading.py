@@ -23,14 +23,8 @@ def reading(
 ) -> Iterator[None]:
     """Context manager in which a file is read: errors become `ValueError` with its name.
 
-    Args:
-        path: The file, or the folder of a log.
-        what: What the file is, such as "log"; it precedes the name.
-        errors: Errors that mean that the file is wrong. Readers of foreign formats raise any.
-
-    Raises:
-        ValueError: The file is wrong. Errors of the operating system, and classes of errors of this
-            package, pass unchanged.
+    ``what``, such as "log", precedes the name. Readers of foreign formats raise any ``errors``;
+    those of the operating system, and classes of errors of this package, pass unchanged.
     """
     try:
         yield
@@ -73,27 +67,13 @@ def is_number(value: Any) -> bool:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Says for an error message which known name is like an unknown one: `` (did you mean 'x'?)``.
-
-    Returns:
-        The words, with a space before them; "" if none is like it.
-    """
+    """`` (did you mean 'x'?)`` for an error message, or "" if no known name is like it."""
     near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1, cutoff=_LIKENESS)
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 
 def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """Parses a YAML document of plain values.
-
-    Args:
-        text: The document.
-        who: Beginning of error messages.
-        loader: A loader for further tags.
-
-    Raises:
-        ValueError: It is not YAML, is nested too deeply, contains itself, or a few aliases stand
-            for more values than a description of a robot or task can have.
-    """
+    """Parses a YAML document of plain values; deep nesting and many aliases are refused."""
     try:
         value = yaml.load(text, Loader=loader)
         _num_values(value, {})

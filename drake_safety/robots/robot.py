@@ -2,18 +2,12 @@
 
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    ProximityProperties,
-    RoleAssign,
-    SceneGraph,
-    Sphere,
-)
+from pydrake.geometry import AddContactMaterial, ProximityProperties, RoleAssign, SceneGraph, Sphere
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     JointActuator,
@@ -115,6 +109,14 @@ def _require(robot: RobotModel, what: str, name: str, known: list[str]) -> None:
         raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
+def _require_joints(
+    robot: RobotModel, what: str, patterns: Iterable[str], known: list[str]
+) -> None:
+    for pattern in patterns:
+        if not any(re.fullmatch(pattern, name) for name in known):
+            _require(robot, f"joint for {what}", pattern, known)
+
+
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
     """Returns the names of the robot's one-degree-of-freedom joints.
 
@@ -167,23 +169,15 @@ def add_robot(
 
     Args:
         plant: A plant before ``Finalize``.
-        robot: The robot.
-        variation: Differences from the published robot; none by default.
         scene_graph: Assigns the feet's friction here; None keeps the model file's friction.
         servos: Whether the joints get robot.yaml's position servos. Torque control needs False: in
             Drake 1.51 an actuator with gains whose desired state is not connected ignores its
             torque input.
-
-    Returns:
-        The model instance.
-
-    Raises:
-        ValueError: A body or joint in robot.yaml does not exist, or a pattern is ambiguous.
     """
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
     if variation.shift is not None:
-        _check_shifted_joints(plant, robot, variation.shift)
+        _require_joints(robot, "shift", variation.shift.joints, servo_joints(plant, robot))
         _add_base_force(plant, robot, variation.shift)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
@@ -249,13 +243,6 @@ def _joint_shift(robot: RobotModel, variation: PlantVariation, joint: str) -> Jo
     return by_pattern(shifts, joint, "shift", robot.name) or JointShift()
 
 
-def _check_shifted_joints(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
-    names = servo_joints(plant, robot)
-    for pattern in shift.joints:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            _require(robot, "joint for shift", pattern, names)
-
-
 def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
     """Adds a steady force: a spring so long that motion hardly changes its force or direction."""
     force_n = np.linalg.norm(shift.base_force_n)
@@ -281,9 +268,8 @@ def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> N
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     """Checks that every joint of legs and arms has a motor.
 
-    Raises:
-        ValueError: A joint has no motor. Drake adds one for a transmission with an effort limit in
-            the model file, and :func:`add_robot` for a joint in ``effort_limits``.
+    Drake adds one for a transmission with an effort limit in the model file, and :func:`add_robot`
+    for a joint in ``effort_limits``.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     driven = {
@@ -302,15 +288,9 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
-    """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none.
-
-    Raises:
-        ValueError: A posture pattern matches no joint, or two match one.
-    """
+    """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
-    for pattern in robot.posture:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            _require(robot, "joint for posture pattern", pattern, names)
+    _require_joints(robot, "posture pattern", robot.posture, names)
     positions = {}
     for name in names:
         value = by_pattern(robot.posture, name, "posture", robot.name)
@@ -321,21 +301,10 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
 def actuation_matrix(
     plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
 ) -> np.ndarray:
-    """Returns the map from joint values to the robot's actuators; friction actuators get zero.
+    """The map (n_u, n_j) from joint values to the robot's actuators; friction actuators get zero.
 
     A plant with dry joint friction needs a connected desired state, zero for a robot without
     servos: friction is modelled by a servo, which is inactive otherwise.
-
-    Args:
-        plant: The finalised plant.
-        robot: The robot.
-        joint_names: Joints in the order of the values, such as ``kinematics.joint_names``.
-
-    Returns:
-        (n_u, n_j), in the order of ``plant.get_actuation_input_port(instance)``.
-
-    Raises:
-        ValueError: An actuated joint is not among the names.
     """
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
@@ -351,17 +320,7 @@ def actuation_matrix(
 def apply_masses(
     plant: MultibodyPlant, context: Context, robot: RobotModel, variation: PlantVariation
 ) -> None:
-    """Sets a robot's masses in a plant's Context to those of a variation, with its payload.
-
-    Args:
-        plant: The finalised plant.
-        context: The plant's Context, whose parameters change.
-        robot: The robot.
-        variation: Differences from the published robot.
-
-    Raises:
-        ValueError: The payload's body does not exist.
-    """
+    """Sets a robot's masses in a plant's Context to those of a variation, with its payload."""
     instance = plant.GetModelInstanceByName(robot.name)
     bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
     for body in bodies:

@@ -30,19 +30,7 @@ _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
 
 
 def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
-    """Adds a robot's bodies, joints and shapes to a plant.
-
-    Args:
-        plant: A plant before ``Finalize``. Without a scene graph, geometry is left out.
-        robot: The robot.
-
-    Returns:
-        The model instance, named as the robot.
-
-    Raises:
-        ValueError: A ``.urdf`` file is not a URDF, its package is not installed, or a mesh cannot
-            be converted.
-    """
+    """Adds a robot's bodies, joints and shapes; without a scene graph, geometry is left out."""
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     urdf = None
@@ -90,11 +78,7 @@ def _quiet_about(robot: RobotModel) -> Iterator[None]:
 def add_stated_shapes(
     plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
 ) -> None:
-    """Adds the collision geometry of robot.yaml: contact points and shapes.
-
-    Raises:
-        ValueError: A pattern of ``shapes`` matches no body, or two match one.
-    """
+    """Adds the collision geometry of robot.yaml: contact points and shapes."""
     bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
     matched = set()
     for body in bodies:

@@ -125,11 +125,7 @@ class CollisionShape:
     """Centre of a capsule's other end, (3,)."""
 
     def check(self, who: str) -> None:
-        """Checks that the fields define exactly one shape.
-
-        Raises:
-            ValueError: Fields are missing or contradict each other.
-        """
+        """Checks that the fields define exactly one shape."""
         for name in ("position_m", "box_m", "to_m"):
             values = getattr(self, name)
             if len(values) != 3 and (values or name == "position_m"):
@@ -240,11 +236,7 @@ class RobotModel:
         return [*self.feet.values(), *self.reaching_frames.values()]
 
     def reaching_frame(self, hand: str) -> ReachingFrame:
-        """Returns the reaching frame of a hand.
-
-        Raises:
-            ValueError: The hand does not exist.
-        """
+        """Returns the reaching frame of a hand."""
         if hand not in self.reaching_frames:
             raise ValueError(
                 f"robot '{self.name}' has no reaching frame '{hand}'; "
@@ -256,9 +248,6 @@ class RobotModel:
         """Returns each joint's mirrored joint; joints without a pattern map to themselves.
 
         Patterns hold in both directions, so one side's names suffice.
-
-        Raises:
-            ValueError: A pattern matches no joint, or maps a joint to a missing one or to two.
         """
         names = list(joint_names)
         partners: dict[str, str] = {}
@@ -297,9 +286,6 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
 
     Drake's loader assigns values to a default object, after ``__post_init__``: it is run again
     here, innermost dataclass first.
-
-    Raises:
-        ValueError: An unknown key, a value of a wrong type, or a failed validation.
     """
     for misfit in _misfits(schema, raw, ()):
         raise ValueError(f"{who}: {misfit}")
@@ -314,11 +300,7 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
 
 
 def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
-    """Reads a YAML file by :func:`load_typed`.
-
-    Raises:
-        ValueError: The file does not exist, is not YAML, or does not fit the schema.
-    """
+    """Reads a YAML file by :func:`load_typed`."""
     if not path.is_file():
         raise ValueError(f"{who} does not exist")
     with reading(path):
@@ -396,14 +378,7 @@ def _validate(value: Any) -> None:
 
 
 def load_robot_file(path: str | Path) -> RobotModel:
-    """Reads a ``robot.yaml``.
-
-    Returns:
-        The robot, its ``source_dir`` set to the file's folder.
-
-    Raises:
-        ValueError: The file does not exist or does not fit the schema.
-    """
+    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``."""
     path = Path(path)
     robot = load_typed_file(RobotModel, path, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)
@@ -413,11 +388,7 @@ def load_robot_file(path: str | Path) -> RobotModel:
 def by_pattern(
     patterns: dict[str, _Value], name: str, what: str, robot_name: str, kind: str = "joint"
 ) -> _Value | None:
-    """Returns the value of the only pattern that fully matches ``name``; None without a match.
-
-    Raises:
-        ValueError: Two patterns match.
-    """
+    """Returns the value of the only pattern that fully matches ``name``; None without a match."""
     found = [key for key in patterns if re.fullmatch(key, name)]
     if len(found) > 1:
         raise ValueError(f"robot '{robot_name}': {what} of {kind} '{name}' matches {found}")

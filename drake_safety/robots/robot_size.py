@@ -27,15 +27,11 @@ class RobotSize:
     mass_kg: float
 
     def factors(self, reference: "RobotSize") -> dict[str, float]:
-        """Returns scale factors by the name of the quantity.
+        """Scale factors by quantity, from the robot that the parameters were chosen for.
 
-        Args:
-            reference: The robot that the parameters were chosen for.
-
-        Returns:
-            ``height``, ``length``, ``width`` for lengths along z, x and y; ``duration``;
-            ``speed_x``, ``speed_y``, ``speed_z``, ``rate`` for linear and angular speeds; ``mass``;
-            ``one``.
+        ``height``, ``length``, ``width`` scale lengths along z, x and y; ``speed_x``, ``speed_y``,
+        ``speed_z`` and ``rate`` linear and angular speeds; there are ``duration``, ``mass`` and
+        ``one``.
         """
         height = self.height_m / reference.height_m
         length = self.half_length_m / reference.half_length_m
@@ -64,19 +60,10 @@ BALANCING_REFERENCE = RobotSize(
 def scaled_defaults(
     defaults: Any, quantities: Mapping[str, Any], factors: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Scales the defaults of nested dataclasses.
+    """Scales the defaults of nested dataclasses, and returns the scaled fields, nested alike.
 
-    Args:
-        defaults: The dataclass.
-        quantities: Quantity of each scaled field: a name, a list of names for the entries of a
-            list, or such a mapping for a dataclass.
-        factors: Scale factors by quantity.
-
-    Returns:
-        The scaled fields, nested alike.
-
-    Raises:
-        ValueError: The dataclass has no such field.
+    A field's quantity is a name, a list of names for the entries of a list, or a mapping for a
+    dataclass.
     """
     known = [entry.name for entry in fields(defaults)]
     scaled: dict[str, Any] = {}

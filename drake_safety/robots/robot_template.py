@@ -32,8 +32,6 @@ class NewRobot:
     """A robot found in a URDF, and the folder that `write_robot` has written.
 
     Attributes:
-        copy: Its URDF, with what was changed and left out.
-        survey: The robot, standing.
         posture: Its standing joint positions [rad].
         asked: Values that the URDF lacks and the user must supply.
     """
@@ -83,16 +81,10 @@ def write_robot(
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
     Args:
-        name: Name of the robot.
-        urdf: Its URDF.
         task: ``balancing``, ``reaching`` or ``walking``.
-        folder: The folder, which must not exist yet.
         feet: Links that touch the ground; found by their height by default.
         moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
             nor a hand; None for all.
-
-    Raises:
-        ValueError: Invalid name, unknown task, existing folder, or a URDF without a legged robot.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")
@@ -289,10 +281,7 @@ def _effort_lines(found: NewRobot, names: list[str], unit: float) -> list[str]:
             found.asked.append(f"the largest torque of joint '{name}' [N·m]")
     if not lines:
         return []
-    return [
-        "effort_limits:  # where the URDF has no motor, or none with a limit [N·m]",
-        *lines,
-    ]
+    return ["effort_limits:  # where the URDF has no motor, or none with a limit [N·m]", *lines]
 
 
 def _mirror(names: list[str]) -> dict[str, str]:

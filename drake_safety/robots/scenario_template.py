@@ -16,7 +16,6 @@ class Sizes(RobotSize):
         lateral_m: Smallest distance of a foot from the midline.
         reach_m: Length of an arm; 0 without arms.
         shoulder_m: First joint of that arm, relative to the feet's centroid on the ground, (3,).
-        base: Name of the base.
         joint_friction_nm: Median dry friction of the joints; None if the URDF has none.
     """
 

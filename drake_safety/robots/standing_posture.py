@@ -32,9 +32,6 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     Returns:
         Positions of all joints by name [rad]; those of no leg are as near to zero as their stops
         allow.
-
-    Raises:
-        ValueError: No posture is within the joints' stops.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]

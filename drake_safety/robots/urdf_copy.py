@@ -25,8 +25,6 @@ class UrdfCopy:
     """An editable copy of a URDF file.
 
     Attributes:
-        source: The original file.
-        root: The root element, which is edited.
         notes: Descriptions of the changes, one sentence each.
         left_out: Notes about visuals that were removed.
         lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each;
@@ -90,13 +88,9 @@ class UrdfCopy:
             _remove(link, "collision")
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
-        """Replaces visual meshes.
+        """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
 
         The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
-
-        Args:
-            shown: Function of a mesh's URL in the URDF and its colour ("r g b a" or "") that
-                returns the new URL, or "" to remove the visual.
         """
         colours = {one.get("name", ""): one for one in self.root.findall("material")}
         for link in self.root.findall("link"):
@@ -116,11 +110,7 @@ class UrdfCopy:
                     visual.remove(material)
 
     def convert_visual_meshes(self) -> None:
-        """Replaces visual meshes that Drake does not render by glTF files in the user's cache.
-
-        Raises:
-            ValueError: A mesh does not exist or cannot be converted.
-        """
+        """Replaces visual meshes that Drake does not render by glTF files in the user's cache."""
         folder = str(self.source.parent)
 
         def shown(url: str, rgba: str) -> str:
@@ -153,13 +143,7 @@ class UrdfCopy:
             )
 
     def replace_collisions(self, link_name: str, points: np.ndarray, radius_m: float) -> None:
-        """Replaces all collision shapes of a link by spheres.
-
-        Args:
-            link_name: The link.
-            points: Centres in the link's frame, (n, 3) [m].
-            radius_m: Radius of each.
-        """
+        """Replaces all collision shapes of a link by spheres at points (n, 3) [m] in its frame."""
         link = self.link(link_name)
         _remove(link, "collision")
         for index, point in enumerate(points):
@@ -222,11 +206,7 @@ class UrdfCopy:
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF as an editable copy.
-
-    Raises:
-        ValueError: The file does not exist, is not a URDF, or has a negative mass.
-    """
+    """Reads a URDF as an editable copy."""
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")

@@ -26,11 +26,9 @@ class Limb:
     """A leg or an arm.
 
     Attributes:
-        name: Name of its last body.
         body: The body at its end, which touches the ground or reaches.
         joints: Its own joints, starting at the base.
         points: Centres of contact spheres in the body's frame, (n, 3) [m].
-        radius_m: Radius of the spheres.
         is_own_shape: Whether the URDF has these spheres.
         is_guess: Whether the URDF has no collision shape at the end.
     """
@@ -47,13 +45,7 @@ class Limb:
 class Survey:
     """A URDF in a plant, with the base at the world's origin and all joints at or near zero.
 
-    Args:
-        path: The URDF.
-        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each.
-
-    Raises:
-        ValueError: Drake cannot read the URDF, it has no floating base, or a joint has more than
-            one degree of freedom.
+    ``lost_meshes`` has the vertices of removed collision meshes by link, in its frame, (n, 3) [m].
     """
 
     def __init__(self, path: Path, lost_meshes: dict[str, list[np.ndarray]] | None = None):
@@ -164,15 +156,7 @@ class Survey:
         )
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
-        """Returns the limbs that reach lowest, or those that end in the given links.
-
-        Args:
-            feet: Links that touch the ground; found by their height by default.
-
-        Raises:
-            ValueError: A link does not exist or is not the end of a limb, or there are fewer than
-                two feet.
-        """
+        """Returns the limbs that reach lowest, or those that end in the given links."""
         groups = self.leaves()
         if feet is None:
             lowest = [self._lowest(group) for group in groups]

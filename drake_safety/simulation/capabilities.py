@@ -60,14 +60,7 @@ class HasGoals(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GoalWords:
-    """What goals are called in messages and figures.
-
-    Attributes:
-        goal: A goal.
-        axes: Its three entries.
-        units: Their units; a single one holds for all.
-        subject: What moves.
-    """
+    """What goals are called in messages and figures."""
 
     goal: str = "target"
     axes: tuple[str, str, str] = ("x", "y", "z")
@@ -117,25 +110,12 @@ class HasBall(Protocol):
         """Samples a ball with a given time of impact [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets a ball in flight towards the robot.
-
-        It hits a robot at rest after ``lead_s`` [s].
-
-        Returns:
-            The time of impact, simulation time [s].
-
-        Raises:
-            ValueError: The loop was built without its ball.
-        """
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns when."""
 
 
 @runtime_checkable
 class CanBePushed(Protocol):
-    """Forces can act on the robot's bodies.
-
-    Attributes:
-        pushes: Named pushes for single runs.
-    """
+    """Forces can act on the robot's bodies."""
 
     pushes: Mapping[str, Push]
 
@@ -154,20 +134,12 @@ class FollowsCommands(Protocol):
         """Sets a constant command (3,) from now on."""
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether a guard replaces commands that are not accepted.
-
-        Raises:
-            ValueError: The loop was built without a guard.
-        """
+        """Sets whether a guard replaces commands that are not accepted."""
 
 
 @runtime_checkable
 class OffersPlans(Protocol):
-    """There are several plans to choose from in a state.
-
-    Attributes:
-        plan_variety: Where a scenario specifies how plans may differ, for messages.
-    """
+    """There are several plans to choose from in a state."""
 
     plan_variety: str
 
@@ -186,22 +158,14 @@ class OffersPlans(Protocol):
 
 @runtime_checkable
 class CanStartAnywhere(Protocol):
-    """Episodes can begin with a given state and plan.
-
-    Attributes:
-        plant_state_sizes: n_q and n_v of the port ``plant_state``.
-    """
+    """Episodes can begin with a given state and plan."""
 
     plant_state_sizes: tuple[int, int]
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Sets plant state and plan; without ``rng`` the initial state is without noise.
-
-        Raises:
-            ValueError: The start does not fit the plant.
-        """
+        """Sets plant state and plan; without ``rng`` the initial state is without noise."""
 
     def start_of(self, context: Context) -> EpisodeStart:
         """State and plan of a Context, as a start for :meth:`reset_to`."""
@@ -220,16 +184,7 @@ _DESCRIPTIONS: dict[type, str] = {
 
 
 def require(loop: object, capability: type[_Capability], who: str = "") -> _Capability:
-    """Returns the loop if it has a capability.
-
-    Args:
-        loop: A closed loop.
-        capability: A protocol of this module.
-        who: Beginning of the message, such as the command that requires it.
-
-    Raises:
-        ValueError: The task lacks the capability.
-    """
+    """Returns the loop if it has a capability."""
     if isinstance(loop, capability):
         return loop
     present = [text for protocol, text in _DESCRIPTIONS.items() if isinstance(loop, protocol)]

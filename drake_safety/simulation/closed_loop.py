@@ -66,15 +66,8 @@ class ClosedLoop(Diagram):
     An optional port ``num_controller_failures`` counts the control periods since the start for
     which the controller found no command; episodes store its last value.
 
-    Args:
-        scenario: The scenario.
-        variation: Name of the plant variation.
-        assessment: The assessment, or None.
-
     Attributes:
-        scenario: The scenario.
         variation_name, variation: The plant variation.
-        assessment: The assessment, or None.
         monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
@@ -151,22 +144,14 @@ class ClosedLoop(Diagram):
         """Removes shapes that only pictures need from the Context of a simulation without them."""
 
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
-        """Finds this diagram's Context in that of the outermost diagram.
-
-        Args:
-            root_context: The root Context.
-        """
+        """Finds this diagram's Context in that of the outermost diagram."""
         # A root Context that pydrake returns as its own part keeps itself alive for ever.
         if self._is_outermost():
             return root_context
         return super().GetMyContextFromRoot(root_context)
 
     def GetMyMutableContextFromRoot(self, root_context: Context) -> Context:
-        """See :meth:`GetMyContextFromRoot`.
-
-        Args:
-            root_context: The root Context.
-        """
+        """See :meth:`GetMyContextFromRoot`."""
         if self._is_outermost():
             return root_context
         return super().GetMyMutableContextFromRoot(root_context)
@@ -180,7 +165,6 @@ class ClosedLoop(Diagram):
         Args:
             context: The root Context, of this diagram or of one that contains it. Its time is set
                 to zero, and the state of this diagram is overwritten.
-            rng: Random generator.
 
         Returns:
             The first step whose future is undisturbed: 0, or later if the episode begins with a
@@ -204,12 +188,6 @@ class ClosedLoop(Diagram):
         The names of the ports' entries must have been set. The scenario says what an alarm of the
         monitor does. The arguments are those of
         :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
-
-        Returns:
-            The assessor; None without an assessment.
-
-        Raises:
-            ValueError: The assessment is that of another diagram.
         """
         if self.assessment is None:
             return None
@@ -231,11 +209,7 @@ class ClosedLoop(Diagram):
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks its ports.
-
-        Raises:
-            ValueError: A required port is missing, or its size is not the number of its names.
-        """
+        """Builds the diagram and checks its ports."""
         builder.BuildInto(self)
         check_ports(self)
 
@@ -269,16 +243,7 @@ def _told_from(value: Any, other: Any) -> str:
 
 
 def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None:
-    """Checks that a loop has output ports.
-
-    Args:
-        loop: The closed loop.
-        names: The ports.
-        who: Beginning of the message.
-
-    Raises:
-        ValueError: A port is missing.
-    """
+    """Checks that a loop has output ports."""
     missing = [name for name in names if not loop.HasOutputPort(name)]
     if missing:
         ports = [loop.get_output_port(i).get_name() for i in range(loop.num_output_ports())]
@@ -287,14 +252,7 @@ def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None
 
 
 def check_ports(loop: ClosedLoop) -> None:
-    """Checks that the required ports of a loop exist and have the sizes of their names.
-
-    Args:
-        loop: The closed loop; sizes without names are not checked.
-
-    Raises:
-        ValueError: A port is missing, or has another size.
-    """
+    """Checks that the required ports exist; those with names must have as many entries."""
     who = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
     ports = {

@@ -10,16 +10,7 @@ from drake_safety.extras import require_extra
 
 @contextlib.contextmanager
 def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
-    """Simulates on a dask cluster, in place of processes of this machine, while the block runs.
-
-    Args:
-        address: Address of dask's scheduler, such as "tcp://10.0.0.1:8786".
-        timeout_s: Time to wait for the scheduler, and for its first worker [s].
-
-    Raises:
-        MissingExtraError: dask is not installed.
-        ValueError: No scheduler answers, or it has no workers.
-    """
+    """Simulates on a dask cluster, in place of processes of this machine, while the block runs."""
     require_extra("cluster", f"cluster '{address}'")
     import joblib
     from distributed import Client

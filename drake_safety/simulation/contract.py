@@ -19,9 +19,6 @@ class Finding:
     """Result of a check.
 
     Attributes:
-        item: The item checked.
-        is_ok: Whether the check passed.
-        message: Description of the result.
         remedy: How to correct a failure, or what a warning is about; "" if all is well.
     """
 
@@ -56,10 +53,6 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
 
     Its ports exist and have the sizes of its names, `reset` samples a start, and the ports' values
     are finite at the start and one assessment step later.
-
-    Args:
-        diagram: The closed loop.
-        seed: Seed of the start.
 
     Returns:
         One finding per check; checks that depend on a failed one are left out.

@@ -45,8 +45,6 @@ class EpisodeWriter:
     locked until the writer is closed or its process ends.
 
     Args:
-        path: The folder; made if it does not exist.
-        info: Metadata common to all episodes.
         extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
             ...). In a folder that is continued, it replaces entries of the same names.
         flush_episodes: Number of pending episodes that are written as a shard.
@@ -54,7 +52,6 @@ class EpisodeWriter:
             with those that are pending [s].
 
     Raises:
-        MissingExtraError: The extra "train" is not installed.
         ValueError: The folder holds another set of episodes, or something else, or has a writer.
     """
 
@@ -88,13 +85,7 @@ class EpisodeWriter:
         self._flushed_s = time.monotonic()
 
     def append(self, episode: Episode) -> None:
-        """Adds one episode; it is on disk after the next flush.
-
-        Raises:
-            ValueError: The writer is closed, the folder has an episode of this index, or the
-                episode does not fit the info.
-            OSError: The pending episodes are due and cannot be written.
-        """
+        """Adds one episode; it is on disk after the next flush."""
         if self._is_closed:
             raise ValueError(f"EpisodeWriter of {self.path} is closed; open it again to append")
         if episode.index in self._indices:
@@ -107,11 +98,7 @@ class EpisodeWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the pending episodes as one shard.
-
-        Raises:
-            OSError: They cannot be written, and stay pending.
-        """
+        """Writes the pending episodes as one shard."""
         if self._pending:
             self._write()
         self._flushed_s = time.monotonic()
@@ -152,20 +139,9 @@ class EpisodeWriter:
 
 
 def open_folder(
-    path: str | os.PathLike[str],
-    info: EpisodesInfo,
-    extra: Mapping[str, Any] | None = None,
+    path: str | os.PathLike[str], info: EpisodesInfo, extra: Mapping[str, Any] | None = None
 ) -> None:
-    """Makes the folder of a set, or checks that an existing folder holds the same set.
-
-    Args:
-        path: The folder.
-        info: Metadata of the set.
-        extra: Further content of ``info.json``, as JSON types; replaces entries of the same names.
-
-    Raises:
-        ValueError: The folder holds another set, or something else.
-    """
+    """Makes the folder of a set, or checks that an existing folder holds the same set."""
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if (path / _INFO_NAME).exists():
@@ -179,11 +155,7 @@ def open_folder(
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
-    """Reads the metadata of a folder's episodes, and the extra stored with it.
-
-    Raises:
-        ValueError: There is no ``info.json``, or it has another schema.
-    """
+    """Reads the metadata of a folder's episodes, and the extra stored with it."""
     file = Path(path) / _INFO_NAME
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -208,11 +180,7 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
-    """Indices of the episodes on disk; empty if nothing was written yet.
-
-    Raises:
-        ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
-    """
+    """Indices of the episodes on disk; empty if nothing was written yet."""
     shards = shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(

@@ -30,7 +30,6 @@ class Recorder:
     """Records output ports of a diagram, row by row.
 
     Args:
-        diagram: The diagram.
         names: Ports to record; a mapping from recorded names to those of ports renames them.
     """
 
@@ -41,12 +40,7 @@ class Recorder:
         self._times: list[float] = []
 
     def record(self, context: Context, time_s: float | None = None) -> None:
-        """Appends a row, unless a port raises.
-
-        Args:
-            context: The diagram's Context.
-            time_s: Time of the row without rounding errors [s]; the Context's by default.
-        """
+        """Appends a row, unless a port raises; a given time is without rounding errors [s]."""
         self._rows.append(
             {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
         )
@@ -68,10 +62,6 @@ def advance_to(simulator: Simulator, time_s: float) -> None:
     The state of a discrete plant is then that of the given time. The update due then already
     computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
     upwards) would not belong to its time.
-
-    Args:
-        simulator: The simulator.
-        time_s: The time [s]; nothing happens if it is not later than the present.
     """
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
@@ -94,11 +84,7 @@ class EpisodeTiming:
     monitor_period_s: float
 
     def monitor_times(self, step: int) -> list[float]:
-        """Times at which the safe set is sampled during a step, its end included [s].
-
-        Args:
-            step: 1 for the step that leads to row 1.
-        """
+        """Times at which the safe set is sampled in a step, from 1, its end included [s]."""
         count = max(math.ceil(self.step_s / self.monitor_period_s - 1e-6), 1)
         begin_s = (step - 1) * self.step_s
         within = [begin_s + i * self.monitor_period_s for i in range(1, count)]
@@ -118,15 +104,9 @@ def record_episode(
     """Simulates an episode, which ends when it leaves the safe set or its time is over.
 
     Args:
-        simulator: Simulator of the diagram, with its Context set to the start.
         ports: The diagram's port for each of the names in ``RECORDED``, and for ``safe``. ``safe``
             defaults to no margin being negative, ``true_state`` to ``state``, ``desired_output``
             to the preview's first sample, and ``features`` to none.
-        timing: Sampling times.
-        constraint_names: The n_c constraints.
-        who: The episode, for messages.
-        index: Number of the episode in its set.
-        first_step: First row whose future is undisturbed.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that

@@ -50,16 +50,7 @@ def to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
 
 
 def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
-    """The episodes of a shard's rows.
-
-    Args:
-        table: The rows.
-        info: Metadata of the set.
-        shard: The file, for messages.
-
-    Raises:
-        ValueError: The shard is empty or of another set, or its values are not those of episodes.
-    """
+    """The episodes of a shard's rows; ValueError if they are damaged or of another set."""
     widths = info.widths
     names = ["episode", "step", "time_s", *(name for name, width in widths.items() if width)]
     names += ["is_safe", "cause", "first_step"]
@@ -129,16 +120,7 @@ def shard_number(shard: Path) -> int:
 
 
 def read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
-    """The rows of a shard.
-
-    Args:
-        shard: The file.
-        columns: The columns; all by default.
-
-    Raises:
-        MissingExtraError: The extra "train" is not installed.
-        ValueError: The shard is truncated or damaged, or lacks a column.
-    """
+    """The rows of a shard, of all columns by default; ValueError if it is damaged."""
     require_extra("train", f"episodes in {shard.parent}", "pyarrow")
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -36,11 +36,7 @@ class EpisodeStart:
     controller_state: list[np.ndarray] | None = None
 
     def feet(self, kinematics: RobotKinematics) -> np.ndarray:
-        """Foot positions, (n_c, 3) [m].
-
-        Args:
-            kinematics: The robot.
-        """
+        """Foot positions, (n_c, 3) [m]."""
         if self.foot_positions is not None:
             return self.foot_positions
         p_WC = kinematics.contact_positions(self.q).copy()
@@ -48,24 +44,11 @@ class EpisodeStart:
         return p_WC
 
     def stance_pose(self, kinematics: RobotKinematics) -> np.ndarray:
-        """Pose of the plan's frame, [x, y, yaw] in the world (3,) [m, rad].
-
-        Args:
-            kinematics: The robot.
-        """
+        """Pose of the plan's frame, [x, y, yaw] in the world (3,) [m, rad]."""
         return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
 
     def check(self, who: str, num_positions: int, num_velocities: int) -> None:
-        """Checks the sizes of the state.
-
-        Args:
-            who: Owner of the start, for messages.
-            num_positions: n_q.
-            num_velocities: n_v.
-
-        Raises:
-            ValueError: The state has another size, or is not finite.
-        """
+        """Checks the sizes of the state."""
         for name, size in {"q": num_positions, "v": num_velocities}.items():
             value = getattr(self, name)
             if np.shape(value) != (size,) or not np.isfinite(value).all():
@@ -75,13 +58,6 @@ class EpisodeStart:
         """Checks that the start fits a robot, and returns it with a quaternion of unit norm.
 
         The quaternion of a simulated plant drifts: its norm changes by up to 1e-4 a second.
-
-        Args:
-            kinematics: The robot.
-
-        Raises:
-            ValueError: A part has another size than the robot or is not finite, or the quaternion's
-                norm is not near 1.
         """
         who = f"start of robot '{kinematics.robot.name}'"
         self.check(who, kinematics.num_positions, kinematics.num_velocities)
@@ -106,8 +82,6 @@ class StatePlane:
 
     Attributes:
         axes: Names of the two variables, with units.
-        lowest: Lower bounds.
-        highest: Upper bounds.
         start: Maps a point (2,) of the plane to a start.
     """
 
@@ -117,14 +91,7 @@ class StatePlane:
     start: Callable[[np.ndarray], EpisodeStart]
 
     def points(self, resolution: int) -> np.ndarray:
-        """A grid with its border, (resolution, resolution, 2); the first variable varies first.
-
-        Args:
-            resolution: Points along either variable.
-
-        Raises:
-            ValueError: There are fewer than two of them.
-        """
+        """A grid with its border, (resolution, resolution, 2); the first variable varies first."""
         if resolution < 2:
             raise ValueError(f"state plane: resolution must be at least 2; got {resolution}")
         x, y = (

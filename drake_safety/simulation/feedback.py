@@ -30,13 +30,7 @@ _TWINS = "nominal"
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodePairs:
-    """Actual episodes and their nominal twins.
-
-    Attributes:
-        actual: Episodes of the actual plant.
-        nominal: Episodes of the nominal plant with the same initial states and plans.
-        nominal_hash: Scenario hash of the nominal plant.
-    """
+    """Actual episodes and their nominal twins."""
 
     actual: Episodes
     nominal: Episodes
@@ -70,20 +64,11 @@ def run_pairs(
     Both episodes of a pair draw from the same generator, so their initial states are the same.
 
     Args:
-        scenario: The scenario.
-        num_pairs: Number of pairs.
         variation: The actual plant.
-        seed: Seed of the set.
-        num_workers: Number of processes; that of cores by default.
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        progress: Called with the number of episodes done and in all, two per pair; True shows it.
-        extra: Stored with the episodes' info.
         **loop_options: Options of the task; they replace those of
             ``pairing_options`` of the task.
-
-    Raises:
-        ValueError: No such variation, or the folder holds other sets.
     """
     loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
@@ -112,20 +97,9 @@ def run_pairs(
 
 
 def AddFeedbackRecorder(
-    builder: DiagramBuilder,
-    loop: ClosedLoop,
-    *,
-    num_steps: int | None = None,
-    capacity: int = 400,
+    builder: DiagramBuilder, loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
 ) -> FeedbackRecorder:
-    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop.
-
-    Args:
-        builder: The diagram's builder.
-        loop: The loop of the actual robot, a system of the diagram.
-        num_steps: Assessment steps of a window; those of an episode by default.
-        capacity: Largest number of finished windows kept.
-    """
+    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
     recorder = builder.AddNamedSystem(
         "feedback_recorder",
         FeedbackRecorder(
@@ -148,10 +122,6 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
 
     The plan interpolates the desired outputs of the window and of its last preview, and is constant
     after that.
-
-    Args:
-        loop: The nominal loop.
-        window: The window.
     """
     preview = window.episode.desired_preview
     num_outputs = len(loop.output_names)
@@ -172,18 +142,7 @@ def run_twins(
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Episodes:
-    """Simulates the nominal twins of recorded windows.
-
-    Args:
-        scenario: The scenario.
-        windows: Windows of a `FeedbackRecorder`.
-        seed: Seed of the noise.
-        num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all; True shows it.
-
-    Raises:
-        ValueError: The task cannot begin with a given start.
-    """
+    """Simulates the nominal twins of recorded windows."""
     # pydrake never frees a system in Python: one loop serves every call.
     info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(
@@ -203,17 +162,7 @@ def pair_starts(
     *,
     seed: int = ADAPTATION.first,
 ) -> EpisodePairs:
-    """Simulates the nominal twins of episodes with known starts, in this process.
-
-    Args:
-        scenario: The scenario.
-        actual: Episodes of an actual robot, such as those of a log.
-        starts: Start of each episode.
-        seed: Seed of the noise.
-
-    Raises:
-        ValueError: The task cannot begin with a given start.
-    """
+    """Simulates the nominal twins of episodes with known starts, in this process."""
     loop = worker_loop(scenario, _TWINS, {})
     twins = [
         run_episode(loop, episode.index, seed=seed, start=start)
@@ -242,14 +191,6 @@ def feedback_of_windows(
     run: Callable[..., Episodes] = run_twins,
     **options: Any,
 ) -> list[FeedbackSet]:
-    """Feedback sets of recorded windows, whose nominal twins are simulated.
-
-    Args:
-        scenario: The scenario.
-        recorder: The recorder of the windows.
-        windows: The windows.
-        run: Function that simulates the twins.
-        **options: Options of `run`.
-    """
+    """Feedback sets of recorded windows, whose nominal twins are simulated."""
     actual = Episodes(recorder.info, [window.episode for window in windows])
     return feedback_sets(actual, run(scenario, windows, **options))

@@ -51,16 +51,9 @@ def run_free(
     """Simulates an episode from a random start, beyond the safe set for half a second.
 
     Args:
-        loop: A closed loop.
         index: Number of the episode; it and the seed determine start and plan.
-        seed: Seed of the set.
         duration_s: End time [s]; a fall, or half a second outside the safe set, ends it sooner.
-        log_period_s: Time between two rows [s].
         ports: More output ports to log, into ``extra``.
-        realtime_rate: Target real-time rate; 0 for as fast as possible.
-
-    Raises:
-        ValueError: The loop has no such port, or the simulation fails before the first row.
     """
     require_ports(loop, ("margins", *ports))
     simulator = Simulator(loop)

@@ -9,12 +9,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import (
-    CanBePushed,
-    CanFall,
-    HasGoals,
-    require,
-)
+from drake_safety.simulation.capabilities import CanBePushed, CanFall, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
 from drake_safety.simulation.rollouts import episode_rng
@@ -51,7 +46,6 @@ class GoalMotion(Mishap):
 
     Attributes:
         goal: In the world, (3,) [m].
-        push: The push, if there was one.
         time_s: [s], (N,).
         output: Measured output, in the world, (N, 3) [m].
         margins: (N, n_c), of the true state.
@@ -91,19 +85,11 @@ def run_to_goal(
     """Simulates the motion from the standing posture to a goal, safe or not.
 
     Args:
-        loop: A closed loop whose plans have a goal.
         goal: In the world, (3,) [m].
-        push: A push on the robot.
         duration_s: End time [s]; a fall ends the motion sooner.
-        seed: Seed of the noise.
-        log_period_s: Time between two rows [s].
         ports: More output ports to log, into ``extra``.
-        realtime_rate: Target real-time rate; 0 for as fast as possible.
         until_unsafe: Whether the motion ends when it leaves the safe set, not only at a fall.
         after_fall_s: Time for which a motion continues after a fall [s].
-
-    Raises:
-        ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
     """
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)

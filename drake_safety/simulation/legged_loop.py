@@ -79,21 +79,10 @@ class LeggedLoop(PlannedLoop):
     :meth:`finish`. It extends :meth:`_set_state` by the controller's initial state, and implements
     :meth:`_output_of`, the output that its plans specify.
 
-    Args:
-        scenario: The scenario.
-        variation: Name of the plant variation.
-        assessment: The assessment, or None.
-
     Attributes:
-        robot: The robot.
-        kinematics: Kinematics of the nominal robot.
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
-        robot_instance: The robot in the plant.
-        scene_graph: The SceneGraph of its geometry.
-        fall_name: The constraint whose violation is a fall.
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
-        view: The camera's pose.
         tick_s: Time between two systems that update one after the other [s].
     """
 
@@ -134,11 +123,7 @@ class LeggedLoop(PlannedLoop):
         """Adds observers, with options of `StateObserver`; returns the controller's state."""
         noise = self.variation.observation_noise
         self._observers = Observers(
-            builder,
-            self.kinematics,
-            self._physics.state,
-            self.scenario.control_period_s,
-            **options,
+            builder, self.kinematics, self._physics.state, self.scenario.control_period_s, **options
         )
         self._observer = self._observers.add("observer", noise)
         seen_noise = combined(noise, self.variation.input_noise)
@@ -242,15 +227,7 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Sets a push on a body of the robot; call it after a reset.
-
-        Args:
-            context: The root Context.
-            push: The push; it replaces an earlier one.
-
-        Raises:
-            ValueError: The robot has no such body, or the task adds no source of pushes.
-        """
+        """Sets a push, in place of an earlier one; ValueError without such a body or source."""
         if self._push_source is None:
             raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
         self._push_source.set_push(
@@ -322,12 +299,7 @@ class LeggedLoop(PlannedLoop):
         """Sets the command for a start in the present state; a controller may hold none."""
 
     def advance_control(self, context: Context, time_s: float) -> None:
-        """Moves a Context to a later time, with the command that the controller holds then.
-
-        Args:
-            context: The root Context; its state is the caller's.
-            time_s: The time [s].
-        """
+        """Moves a Context to a later time, with the command that the controller holds then."""
         context.SetTime(time_s)
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:

@@ -20,15 +20,7 @@ from drake_safety.systems.state_observer import StateObserver
 
 
 class Observers:
-    """Adds observers to a diagram, each with its own noise source.
-
-    Args:
-        builder: The diagram's builder.
-        kinematics: The robot.
-        plant_state: Port of its true state.
-        period_s: Sampling period of the noise [s].
-        **options: Options of every `StateObserver`.
-    """
+    """Adds observers to a diagram, each with its own noise source."""
 
     def __init__(
         self,
@@ -49,12 +41,7 @@ class Observers:
         self._faults: list[SensorFaults] = []
 
     def add(self, name: str, noise: ObservationNoise) -> StateObserver:
-        """Returns the observer of a noise level, and adds it if there is none yet.
-
-        Args:
-            name: Name of the system if it is added.
-            noise: Standard deviations.
-        """
+        """Returns the observer of a noise level, and adds it if there is none yet."""
         key = (noise.position, noise.velocity)
         if key in self._observers:
             return self._observers[key]
@@ -89,12 +76,7 @@ class Observers:
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
-        """Reseeds every noise source and the noise of faults.
-
-        Args:
-            context: The root Context.
-            rng: Source of the seeds; None for fixed seeds.
-        """
+        """Reseeds every noise source and the noise of faults; without ``rng`` with fixed seeds."""
         rng = np.random.default_rng(0) if rng is None else rng
         for source in self._sources:
             source.SetRandomContext(
@@ -105,11 +87,7 @@ class Observers:
             faulty.set_seed(faulty.GetMyMutableContextFromRoot(context), int(rng.integers(2**31)))
 
     def silence(self, context: Context) -> None:
-        """Sets the noise to zero until the next sample.
-
-        Args:
-            context: The root Context.
-        """
+        """Sets the noise to zero until the next sample."""
         for source in self._sources:
             source_context = source.GetMyMutableContextFromRoot(context)
             source_context.get_mutable_discrete_state_vector().SetZero()

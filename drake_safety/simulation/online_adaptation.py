@@ -35,18 +35,13 @@ class OnlineAdaptation:
     ```
 
     Args:
-        scenario: The scenario.
         prior: The assessment before feedback.
-        recorder: The recorder, a system of the diagram.
-        assessor: The assessor, a system of the diagram.
-        method: Method of `SafetyAssessment.adapt`.
         run: Function that simulates the twins; see `feedback_of_windows`.
         capacity: Largest number of feedback sets kept; the oldest are dropped.
 
     Attributes:
         feedback: All feedback so far, up to the capacity.
         adapted: The assessments after the newest eight updates.
-        num_updates: The number of all updates.
     """
 
     def __init__(
@@ -75,13 +70,6 @@ class OnlineAdaptation:
 
         Updates are between two calls of `AdvanceTo`, at the times of the recorder's rows: events
         and monitors of a simulation must not change its Context.
-
-        Args:
-            simulator: The simulator of the diagram.
-            until_s: The time until which to simulate [s].
-
-        Returns:
-            The status of the last `AdvanceTo`, which may have ended early.
         """
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:

@@ -24,9 +24,6 @@ class PlannedLoop(ClosedLoop):
     :meth:`_add_safe_set`, sets the names of state and output, :meth:`_export`, :meth:`finish`. It
     implements :meth:`_set_state`, which sets the plant's state. Episodes can then begin with a
     given start.
-
-    Attributes:
-        plant_state_sizes: n_q and n_v.
     """
 
     def _check_variation(self, *varied: str) -> None:
@@ -145,7 +142,6 @@ class PlannedLoop(ClosedLoop):
         """Sets the plan and keeps the state.
 
         Args:
-            context: The root Context.
             plan: Desired output over simulation time, in the stance frame, (n_z, 1) [m].
         """
         self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)

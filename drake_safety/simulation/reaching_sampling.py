@@ -58,12 +58,7 @@ class PostureSampling:
         """Samples positions in the safe set with the feet of the standing posture, (n_q,).
 
         Args:
-            safe_set: The safe set, with robot and obstacles.
-            rng: Random generator.
             mirror: If given, the posture is mirrored: that of the other hand's episode.
-
-        Raises:
-            RuntimeError: No sampled posture is in the safe set.
         """
         kinematics = safe_set.kinematics
         robot = kinematics.robot
@@ -77,8 +72,7 @@ class PostureSampling:
                 -1, 1, kinematics.num_joints
             )
             offset = np.append(
-                rng.uniform(-1, 1, 2) * self.base_offset_m,
-                -rng.uniform(0, self.base_lowering_m),
+                rng.uniform(-1, 1, 2) * self.base_offset_m, -rng.uniform(0, self.base_lowering_m)
             )
             rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
             X_WB = RigidTransform(RotationMatrix(rotation), standing[4:NUM_BASE_POSITIONS] + offset)

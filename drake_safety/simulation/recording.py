@@ -78,26 +78,18 @@ def record_episodes(
 
     Args:
         make_diagram: Builds the diagram; called with ``parameters``, once in each worker.
-        num_episodes: Size of the set.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             which is the diagram's default one. It may return the first row whose future is
             undisturbed, if that is not 0.
-        duration_s: Duration of a safe episode [s].
         step_s: Time between two rows, the unit of H [s].
-        parameters: Arguments of ``make_diagram``; part of the set's hash.
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
-        output_names: Names of the entries of ``output``.
-        feature_names: Names of the entries of ``features``.
-        constraint_names: Names of the entries of ``margins``.
         name: Name of the set; that of ``make_diagram`` by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
-        seed: Seed of the set.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes; those of the same set that it already holds are kept. A set
             is identified by name, parameters, ports, times and seed, and by one of its episodes,
             which is simulated again and must be the same to the last bit.
-        progress: Called with the number done and in all; True shows it.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause

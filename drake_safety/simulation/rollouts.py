@@ -22,12 +22,7 @@ from drake_safety.learning.segments import (
     EpisodesInfo,
     installed_versions,
 )
-from drake_safety.simulation.capabilities import (
-    CanStartAnywhere,
-    HasGoals,
-    OffersPlans,
-    require,
-)
+from drake_safety.simulation.capabilities import CanStartAnywhere, HasGoals, OffersPlans, require
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
@@ -39,25 +34,14 @@ _LOGGER = logging.getLogger("drake_safety")
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
-    """The random generator of an episode, which depends on the seed and the index alone.
-
-    Args:
-        seed: Seed of the set.
-        index: Number of the episode in its set.
-    """
+    """The random generator of an episode, which depends on the seed and the index alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
 def episodes_info(
     loop: ClosedLoop, seed: int, loop_options: dict[str, Any] | None = None
 ) -> EpisodesInfo:
-    """Metadata common to all episodes of a loop.
-
-    Args:
-        loop: The closed loop.
-        seed: Seed of the set.
-        loop_options: Options with which the loop was made; part of the set's hash.
-    """
+    """Metadata common to all episodes of a loop; its options are part of the set's hash."""
     scenario = loop.scenario
     scenario_hash = scenario.simulation_hash(loop.variation_name)
     if loop_options:
@@ -94,8 +78,6 @@ def run_episode(
 
     Args:
         loop: The closed loop; it has no state and can be used again.
-        index: Number of the episode in its set.
-        seed: Seed of the set.
         goal: Goal of the plan, in place of a random one; for tasks with goals.
         is_standing: Whether it begins in the standing posture instead of a random one; requires a
             goal.
@@ -155,16 +137,8 @@ def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.nda
 
     ``assessment.predict_one(*inputs_at(loop, start))`` is the verdict on them.
 
-    Args:
-        loop: The closed loop, whose task can begin with a given start.
-        start: State and plan, such as ``replace(loop.standing_start(), plan=plan)`` of a legged
-            robot.
-
     Returns:
         State (n_s,) without noise, desired preview (H*n_z,) and features (n_f,).
-
-    Raises:
-        ValueError: The task takes no start, or the start does not fit the plant.
     """
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)
@@ -195,15 +169,9 @@ def run_episodes(
     identical for any number of workers.
 
     Args:
-        scenario: The scenario.
-        num_episodes: Size of the set.
-        variation: The plant.
-        seed: Seed of the set.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes; those of the same set that it already holds are kept, if one
             of them, simulated again, is the same to the last bit.
-        progress: Called with the number done and in all; True shows it.
-        extra: Stored with the episodes' info.
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             cannot be stored.
         is_standing: Whether episodes begin in the standing posture; requires goals.

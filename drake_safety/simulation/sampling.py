@@ -108,12 +108,7 @@ class PushSampling:
         _check_size("push", "target_offset_m", self.target_offset_m, 2)
 
     def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball from any horizontal direction.
-
-        Args:
-            rng: Random generator.
-            time_s: Time of impact [s].
-        """
+        """Samples a ball from any horizontal direction."""
         return Throw(
             time_s=time_s,
             mass_kg=_between(rng, self.mass_kg),
@@ -135,11 +130,8 @@ def calm_start(
     """Samples a start on a plan near the standing posture, without tracking error.
 
     Args:
-        kinematics: The robot.
-        rng: Random generator.
         half_widths_m: Half-widths of the plan's start and goal, about the stance, (2,) [m].
         plan_duration_s: Shortest and longest duration of the plan [s].
-        elapsed_s: Time since the plan's start [s].
     """
     half = np.array([*half_widths_m, 0.0])
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
@@ -163,9 +155,6 @@ def resting_feet(
     """Velocities with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq.
 
     Args:
-        kinematics: The robot.
-        X_WB: Pose of the base.
-        joints: Joint positions, (n_j,) [rad].
         V_WB: Spatial velocity of the base, angular first, (6,) [rad/s, m/s].
 
     Returns:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed
 
-from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_typed
@@ -26,8 +26,6 @@ from drake_safety.systems.safety_assessor import ON_ALARM
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
-
-    from drake_safety.learning.assessment import SafetyAssessment
 
 
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
@@ -99,11 +97,7 @@ class Scenario:
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name.
-
-        Raises:
-            ValueError: No such variation.
-        """
+        """A plant variation by name."""
         if name not in self.variations:
             raise ValueError(
                 f"scenario '{self.name}' has no variation '{name}'"
@@ -112,11 +106,7 @@ class Scenario:
         return self.variations[name]
 
     def task_class(self) -> type[ClosedLoop]:
-        """The task, imported.
-
-        Raises:
-            ValueError: The import path is malformed or is not that of a ClosedLoop.
-        """
+        """The task, imported."""
         return _import_task(self.task, self.name, self.folder)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -127,20 +117,16 @@ class Scenario:
         self,
         variation: str = "nominal",
         *,
-        assessment: "SafetyAssessment | None" = None,
+        assessment: SafetyAssessment | None = None,
         meshcat: "Meshcat | None" = None,
         **options: Any,
     ) -> ClosedLoop:
         """Builds the task's diagram.
 
         Args:
-            variation: The plant.
             assessment: Adds an assessor and, for example, recovery.
             meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
             **options: Options of the task, such as ``recovery=False``.
-
-        Raises:
-            ValueError: Unknown variation or option, or an assessment of another diagram.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
@@ -165,9 +151,6 @@ class Scenario:
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
-
-        Raises:
-            ValueError: No such variation.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -310,9 +293,6 @@ def load_scenario(name: str | Path) -> Scenario:
     not. The task's module may stand in the scenario file's folder, where modules are searched last,
     while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
 
-    Args:
-        name: Name of a scenario of the package, or a path.
-
     Raises:
         ValueError: No such scenario, unknown or ill-typed keys, or no such task.
     """
@@ -326,14 +306,8 @@ def load_scenario(name: str | Path) -> Scenario:
 def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
     """Reads a scenario's file without importing its task, so that no code of a stranger runs.
 
-    Args:
-        name: See :func:`load_scenario`.
-
     Returns:
         The scenario without parameters, and the task's parameters as they stand in the file.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
     """
     path = _scenario_file(name)
     with reading(path):
@@ -358,13 +332,7 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
     """Reads a scenario from YAML text.
 
     Args:
-        text: The YAML.
-        name: The scenario's name.
-        folder: Folder of relative robot paths.
         task_folder: Folder in which the task's module may stand; "" for none.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
     """
     scenario, parameters = _parsed(text, name, folder)
     scenario.folder = task_folder

@@ -52,15 +52,9 @@ def check_scenario(
     robot or diagram that cannot be made are left out.
 
     Args:
-        name: Name of a scenario of the package, or the path of one.
         num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
-        seed: Seed of the episodes.
         is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
             files are checked.
-        progress: Called with a stage, the number done and the number wanted.
-
-    Yields:
-        The findings.
     """
     report: StageProgress = progress or (lambda stage, done, total: None)
     scenario = yield from _guarded("scenario", _scenario(name, is_imported))

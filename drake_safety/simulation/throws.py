@@ -39,7 +39,6 @@ class ThrowLog(Mishap):
     """Log of one throw, with a row every ``log_period_s``.
 
     Attributes:
-        index: Number of the throw in its set.
         throw: Mass, speed, direction; ``throw.time_s`` is the time of impact [s].
         time_s: [s], (N,).
         state: (N, n_s), the assessor's input.
@@ -85,9 +84,6 @@ class ViolationCounter:
 
     Args:
         loop: A closed loop with a ``plant``, a ``robot_instance`` and ``kinematics``.
-
-    Raises:
-        ValueError: The plant's contacts and efforts are not Drake's.
     """
 
     _POSITION_SLACK_RAD = 0.02
@@ -118,11 +114,7 @@ class ViolationCounter:
         )
 
     def count(self, context: Context) -> None:
-        """Counts the violations at one time.
-
-        Args:
-            context: The loop's root Context.
-        """
+        """Counts the violations at one time."""
         plant, instance = self._loop.plant, self._loop.robot_instance
         plant_context = plant.GetMyContextFromRoot(context)
         contacts = plant.get_contact_results_output_port().Eval(plant_context)
@@ -153,18 +145,7 @@ def play_throws(
     duration_s: float,
     log_period_s: float,
 ) -> Iterator[float]:
-    """Advances a simulation while balls are thrown, and stops at every row of a log.
-
-    Args:
-        loop: A closed loop with a ball.
-        simulator: Its initialised simulator.
-        throws: The balls; each is released shortly before its impact at ``time_s``.
-        duration_s: End time [s].
-        log_period_s: Time between two rows [s].
-
-    Yields:
-        The time of each row, from 0 on [s].
-    """
+    """Advances a simulation while balls are thrown; yields the time of every row of a log [s]."""
     thrown = require(loop, HasBall)
     waiting = sorted(throws, key=lambda throw: throw.time_s)
     for row in range(round(duration_s / log_period_s) + 1):
@@ -196,16 +177,7 @@ def run_throw(
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
-        seed: Seed of the set.
-        trigger_time_s: Time of the trigger [s]; NaN for never.
-        throws: Balls in place of the random one.
         duration_s: End time [s]; by default 2.5 s after the first impact.
-        log_period_s: Time between two rows [s].
-        ports: More output ports to log, into ``extra``.
-        realtime_rate: Target real-time rate; 0 for as fast as possible.
-
-    Returns:
-        The log, which ends at a fall.
     """
     rng = episode_rng(seed, index)
     simulator = Simulator(loop)
@@ -276,16 +248,7 @@ def run_throws(
     """Throws a set of balls, in worker processes.
 
     Args:
-        scenario: The scenario.
-        indices: Numbers of the throws.
-        seed: Seed of the set.
-        variation: The plant.
         trigger_times_s: Time of the trigger by index [s]; by default there is no recovery.
-        num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all; True shows it.
-
-    Returns:
-        The logs, in the order of ``indices``.
     """
     options = {"ball": True, "recovery": trigger_times_s is not None}
     times = trigger_times_s or {}
@@ -315,9 +278,7 @@ def trigger_time(log: ThrowLog, probability: np.ndarray, threshold: float) -> fl
     """Time at which a probability first falls below a threshold [s]; NaN if it never does.
 
     Args:
-        log: The log of a throw without recovery.
         probability: Safety probability of every row, (N,); NaN counts as below.
-        threshold: Γ_thre.
     """
     below = ~(probability >= threshold)
     return float(log.time_s[int(np.argmax(below))]) if below.any() else math.nan

@@ -52,12 +52,8 @@ def run_batches(
 
     Args:
         function: A function at module level, or a partial of one; returns one result per item.
-        items: What it is called for, such as indices of episodes.
-        num_workers: Number of processes; that of cores by default.
         progress: Called with the number done and in all, at the start and after each batch; True
             shows it.
-        num_done: Number done beforehand.
-        stage: Name under which it is shown.
     """
     num_wanted = num_done + len(items)
     results = parallel_map(function, [(batch,) for batch in batches(items)], num_workers)
@@ -82,11 +78,6 @@ def parallel_map(
     Every call has one BLAS thread, so that results do not depend on the number of workers. On
     Ctrl-C or any error the workers end; when this process is killed they end within a second or
     two.
-
-    Args:
-        function: A function at module level.
-        arguments: One tuple per call.
-        num_workers: Number of processes; that of cores by default.
 
     Raises:
         ChildProcessError: A worker was killed.
@@ -166,9 +157,6 @@ def end_with_parent(parent: int) -> None:
 
     A worker whose parent is killed while it starts would else wait for minutes, or for ever, when
     it sends a result that nobody reads.
-
-    Args:
-        parent: Process ID of the parent.
     """
 
     def watch() -> None:

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
@@ -53,7 +48,6 @@ class BeliefEvaluator(LeafSystem):
     assessment, between simulations and during them. The embedding is immutable.
 
     Args:
-        assessment: A fitted assessment.
         period_s: Time between two evaluations [s].
         checks_margins: Whether no belief is safe outside the safe set.
         heeds_alarm: Whether every belief is unknown during an alarm.
@@ -120,15 +114,7 @@ class BeliefEvaluator(LeafSystem):
         return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
 
     def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
-        """Replaces the beliefs of every cell.
-
-        Args:
-            context: This system's Context.
-            beliefs: Shaped as the assessment's ``beliefs_``.
-
-        Raises:
-            ValueError: The beliefs have another shape.
-        """
+        """Replaces the beliefs of every cell."""
         beliefs = np.asarray(beliefs, dtype=float)
         if beliefs.shape != self._shape:
             raise ValueError(
@@ -137,15 +123,7 @@ class BeliefEvaluator(LeafSystem):
         context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over what an assessment adapted from this system's own has learned.
-
-        Args:
-            context: This system's Context.
-            adapted: The result of ``adapt``.
-
-        Raises:
-            ValueError: The adapted assessment has other maps.
-        """
+        """Takes over what an assessment adapted from this system's own has learned."""
         if adapted.embedding_ is not self._assessment.embedding_ and not (
             adapted.embedding_.is_same(self._assessment.embedding_)
         ):

@@ -39,17 +39,11 @@ class CommandGuard(LeafSystem):
     of the Context; one that does not passes on everything.
 
     Args:
-        assessment: A fitted assessment.
         with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
             commands, such as `WalkingSafeSet.with_commands`.
-        limits: The policy's ranges.
         threshold: Lowest probability of an accepted command.
         period_s: Time between two decisions [s].
-        offset_s: Time of the first [s].
         num_outlook: M, samples of the outlook.
-
-    Raises:
-        ValueError: The threshold is outside [0, 1].
     """
 
     def __init__(
@@ -100,24 +94,13 @@ class CommandGuard(LeafSystem):
             )
 
     def set_acting(self, context: Context, is_acting: bool) -> None:
-        """Sets whether the guard acts, from its next decision on.
-
-        Args:
-            context: This system's Context.
-            is_acting: Whether it replaces commands that are not accepted.
-        """
+        """Sets whether the guard acts, from its next decision on."""
         context.get_mutable_numeric_parameter(self._is_acting).SetAtIndex(0, float(is_acting))
 
     def probabilities(
         self, state: np.ndarray, features: np.ndarray, commands: np.ndarray
     ) -> np.ndarray:
-        """Probability of constant commands from now on, (C,); 0 where it is "don't know".
-
-        Args:
-            state: (n_s,), the assessor's.
-            features: (n_f,), of any command.
-            commands: (C, 3) [m/s, rad/s].
-        """
+        """Probability of constant commands (C, 3) from now on, (C,); 0 where it is "don't know"."""
         return self._assessment.predict(
             np.tile(state, (len(commands), 1)),
             np.tile(commands, self._horizon),
@@ -133,21 +116,9 @@ class CommandGuard(LeafSystem):
         return commands[np.argsort(distance, kind="stable")]
 
     def decide(
-        self,
-        asked: np.ndarray,
-        state: np.ndarray,
-        features: np.ndarray,
-        *,
-        is_acting: bool = True,
+        self, asked: np.ndarray, state: np.ndarray, features: np.ndarray, *, is_acting: bool = True
     ) -> tuple[np.ndarray, float]:
-        """Returns the command to pass on, (3,), and the probability of the asked one.
-
-        Args:
-            asked: (3,) [m/s, rad/s].
-            state: (n_s,).
-            features: (n_f,).
-            is_acting: Whether to replace a command that is not accepted.
-        """
+        """Returns the command to pass on, (3,), and the probability of the asked one."""
         asked_probability = float(self.probabilities(state, features, asked[None])[0])
         if asked_probability >= self._threshold or not is_acting:
             return asked, asked_probability

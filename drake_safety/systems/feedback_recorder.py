@@ -14,13 +14,7 @@ from drake_safety.learning.segments import RECORDED, Episode, Episodes, Episodes
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedWindow:
-    """A labelled window of a robot's motion.
-
-    Attributes:
-        episode: The window as an episode; its time starts at zero.
-        plant_state: [q; v] of the robot at the first row, (n_q + n_v,).
-        start_time_s: Time of the first row [s].
-    """
+    """A labelled window of a robot's motion."""
 
     episode: Episode
     plant_state: np.ndarray
@@ -29,16 +23,7 @@ class RecordedWindow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """State of a recorder; immutable, so that copies of the Context share it.
-
-    Attributes:
-        rows: Rows of the open window, each the ports' vectors in order.
-        times_s: Times of the rows [s].
-        plant_state: [q; v] at the first row.
-        windows: Finished windows that were not taken yet.
-        num_finished: Number of windows finished so far.
-        num_dropped: Number of finished windows dropped because the capacity was exceeded.
-    """
+    """State of a recorder; immutable, so that copies of the Context share it."""
 
     rows: tuple[tuple[np.ndarray, ...], ...] = ()
     times_s: tuple[float, ...] = ()
@@ -83,14 +68,9 @@ class FeedbackRecorder(LeafSystem):
     with a row at which ``recovery_active`` is not zero is dropped: its twin has no recovery.
 
     Args:
-        info: Metadata of the windows as episodes.
         num_steps: Steps of a safe window.
-        plant_state_size: n_q + n_v.
         watch_period_s: Sampling period of ``safe`` [s].
         capacity: Largest number of finished windows kept; the oldest are dropped.
-
-    Raises:
-        ValueError: A window is shorter than the horizon.
     """
 
     def __init__(
@@ -139,11 +119,7 @@ class FeedbackRecorder(LeafSystem):
         return context.get_abstract_state(int(self._index)).get_value()
 
     def take_windows(self, context: Context) -> list[RecordedWindow]:
-        """Removes the finished windows from a Context and returns them.
-
-        Args:
-            context: This system's Context; the open window is kept.
-        """
+        """Removes the finished windows from a Context and returns them."""
         recording = self.recording(context)
         context.SetAbstractState(int(self._index), replace(recording, windows=()))
         return list(recording.windows)

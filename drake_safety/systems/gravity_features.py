@@ -27,7 +27,6 @@ class GravityFeatures(LeafSystem):
     from gravity, a constant.
 
     Args:
-        kinematics: The robot.
         mirror: If given, the features are those of the robot's mirror image.
     """
 

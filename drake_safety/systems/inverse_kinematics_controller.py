@@ -36,13 +36,9 @@ class InverseKinematicsController(LeafSystem):
     respect the joint limits, and set points move at most at 0.7 of the joints' speed limits.
 
     Args:
-        kinematics: The controller's model of the robot.
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
-
-    Raises:
-        ValueError: A stiffness is not positive.
     """
 
     def __init__(
@@ -85,12 +81,7 @@ class InverseKinematicsController(LeafSystem):
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
-        """Sets the foot positions used while ``desired_foot_positions`` is not connected.
-
-        Args:
-            context: This system's Context.
-            p_WC: Centres of the contact spheres, (n_c, 3) [m].
-        """
+        """Sets the feet, (n_c, 3) [m], used while ``desired_foot_positions`` is not connected."""
         context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
 
     def foot_positions(self, context: Context) -> np.ndarray:
@@ -124,19 +115,11 @@ class InverseKinematicsController(LeafSystem):
         return np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
 
     def start(self, context: Context) -> None:
-        """Sets the command for the present inputs, as the start of a simulation does.
-
-        Args:
-            context: This system's Context, with its inputs connected.
-        """
+        """Sets the command for the present inputs, as the start of a simulation does."""
         self._initialize(context, context.get_mutable_discrete_state())
 
     def update(self, context: Context) -> None:
-        """Updates the command for the present inputs, as a simulation does every period.
-
-        Args:
-            context: This system's Context, with its inputs connected.
-        """
+        """Updates the command for the present inputs, as a simulation does every period."""
         self._update(context, context.get_mutable_discrete_state())
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -40,9 +40,6 @@ class NoveltyMonitor(LeafSystem):
     is reset, and ``alarm_cause`` says what was seen. While ``hold`` is above 0.5, as during a
     recovery step that training does not have, the charts wait. Innovation and novelty are a
     parameter of the Context, see :meth:`adopt`.
-
-    Args:
-        assessment: A fitted assessment.
     """
 
     def __init__(self, assessment: SafetyAssessment):
@@ -81,20 +78,11 @@ class NoveltyMonitor(LeafSystem):
         )
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over innovation and novelty of an assessment adapted from this system's own.
-
-        Args:
-            context: This system's Context.
-            adapted: The result of ``adapt``.
-        """
+        """Takes over innovation and novelty of an assessment adapted from this system's own."""
         context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
 
     def reset(self, context: Context) -> None:
-        """Ends the alarm and empties the charts.
-
-        Args:
-            context: This system's Context.
-        """
+        """Ends the alarm and empties the charts."""
         state = context.get_mutable_discrete_state_vector()
         initial = np.zeros(state.size())
         initial[self._places["x"]] = np.nan

@@ -18,13 +18,6 @@ class PlanFeatures(LeafSystem):
         - desired_preview
         output_ports:
         - features
-
-    Args:
-        safe_set: The safe set.
-        num_positions: n_q of the plant state.
-        num_velocities: n_v of the plant state.
-        horizon: H, samples of the preview.
-        num_outputs: n_z.
     """
 
     def __init__(

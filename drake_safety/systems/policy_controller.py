@@ -32,11 +32,6 @@ class PolicyController(LeafSystem):
     cosine of the phases (2 n_p,), and the command that the policy followed (3,), which differs from
     the input while the policy's change of command is limited. An action that is not finite is
     replaced by the last one, and ``status`` is ``HELD``.
-
-    Args:
-        kinematics: The robot.
-        policy: The policy.
-        offset_s: Time of the first update [s].
     """
 
     def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):

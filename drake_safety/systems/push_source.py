@@ -25,11 +25,6 @@ class PushSource(LeafSystem):
 
     The port fits the plant's ``applied_spatial_force`` input. A push begins and ends with the
     plant's first step after the first multiple of ``period_s`` that is not before its time.
-
-    Args:
-        plant: The finalized plant.
-        instance: The robot in it.
-        period_s: Update period [s].
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
@@ -50,26 +45,9 @@ class PushSource(LeafSystem):
         )
 
     def set_push(
-        self,
-        context: Context,
-        body: str,
-        force_n: np.ndarray,
-        *,
-        start_s: float,
-        duration_s: float,
+        self, context: Context, body: str, force_n: np.ndarray, *, start_s: float, duration_s: float
     ) -> None:
-        """Sets the push; it replaces an earlier one.
-
-        Args:
-            context: This system's Context.
-            body: Name of the body.
-            force_n: Force in the world, (3,) [N].
-            start_s: Start time [s].
-            duration_s: Duration [s].
-
-        Raises:
-            ValueError: The robot has no such body.
-        """
+        """Sets the push; it replaces an earlier one."""
         if body not in self._bodies:
             raise ValueError(
                 f"push: robot '{self._robot_name}' has no body '{body}'; its bodies are "
@@ -81,11 +59,7 @@ class PushSource(LeafSystem):
         )
 
     def clear_push(self, context: Context) -> None:
-        """Removes the push from the next update on.
-
-        Args:
-            context: This system's Context.
-        """
+        """Removes the push from the next update on."""
         context.get_mutable_numeric_parameter(self._parameter).SetFromVector(np.zeros(_SIZE))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

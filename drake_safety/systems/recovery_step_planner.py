@@ -61,10 +61,7 @@ class RecoveryStepPlanner(LeafSystem):
     set points. No output has direct feedthrough.
 
     Args:
-        kinematics: The controller's model of the robot.
-        parameters: Parameters of the recovery steps.
         period_s: Planning period [s].
-        offset_s: Time of the first update [s].
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """
@@ -125,7 +122,6 @@ class RecoveryStepPlanner(LeafSystem):
         """Sets the foot positions, and the planner to idle.
 
         Args:
-            context: This system's Context.
             p_WC: Centres of the contact spheres, (n_c, 3) [m].
             stance_pose: [x, y, yaw] of the stance frame (3,) [m, rad].
         """

@@ -38,17 +38,11 @@ class RecoverySwitch(Diagram):
     ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
 
     Args:
-        kinematics: The controller's model of the robot.
-        parameters: Parameters of the recovery steps.
         threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
-        persistence_s: See there.
-        initial_uncertainty: See there.
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after the assessor, and of the step planner after the
             trigger [s]. Discrete updates of one time see the state before all of them, so each
             would be a period late.
-        horizon: H, samples of the preview.
-        num_outlook: M, samples of the outlook.
     """
 
     def __init__(

@@ -37,10 +37,6 @@ class RecoveryTrigger(LeafSystem):
         initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
             :func:`~drake_safety.learning.prediction.is_unknown`.
         period_s: Update period [s].
-        offset_s: Time of the first update [s].
-
-    Raises:
-        ValueError: The threshold is outside [0, 1], or the persistence negative.
     """
 
     def __init__(

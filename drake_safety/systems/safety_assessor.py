@@ -38,19 +38,11 @@ class SafetyAssessor(Diagram):
     The ports are those of its two systems.
 
     Args:
-        assessment: A fitted assessment.
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
         checks_margins: Whether nothing is safe outside the safe set; otherwise there is no port
             ``margins``.
         on_alarm: What an alarm of the monitor does, one of ``ON_ALARM``; None for no monitor, and
             none of its ports.
-
-    Attributes:
-        evaluator: The BeliefEvaluator.
-        monitor: The NoveltyMonitor, or None.
-
-    Raises:
-        ValueError: Another ``on_alarm``.
     """
 
     def __init__(
@@ -100,13 +92,6 @@ class SafetyAssessor(Diagram):
         """Takes over what an assessment adapted from this system's own has learned.
 
         The monitor begins anew: its alarm was about the robot before the adaptation.
-
-        Args:
-            context: This diagram's Context.
-            adapted: The result of ``adapt``.
-
-        Raises:
-            ValueError: The adapted assessment has other maps.
         """
         self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
         if self.monitor is not None:
@@ -130,18 +115,11 @@ def AddSafetyAssessor(
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
 
     Args:
-        builder: The diagram's builder.
-        assessment: A fitted assessment.
         state: Port of the state, as in the training episodes.
         desired_preview: Port of the desired preview, as in the training episodes.
         margins: Port of the measured state's margins; None if nothing checks them.
         features: Port of the features; not needed if the assessment reads none.
         hold: Port that is 1 while the monitor waits, as during recovery.
-        period_s: See :class:`SafetyAssessor`.
-        on_alarm: See :class:`SafetyAssessor`.
-
-    Returns:
-        The assessor, with its outputs unconnected.
 
     Raises:
         ValueError: The assessment reads features and there is no port for them, or a port has

@@ -44,11 +44,6 @@ class SafetyMonitor(LeafSystem):
     Both outputs are direct functions of the state: margins that were sampled and held would lag a
     recorded row by one period. ``safe`` is 1 while no margin is negative. The margins of a state
     that is not finite are minus infinity.
-
-    Args:
-        safe_set: The constraints.
-        num_positions: n_q of the plant state.
-        num_velocities: n_v of the plant state.
     """
 
     def __init__(self, safe_set: SafeSet, num_positions: int, num_velocities: int):

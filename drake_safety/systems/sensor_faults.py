@@ -32,10 +32,7 @@ class SensorFaults(LeafSystem):
     old, it is the first sample. All memory is discrete state; the seed of noise is a parameter.
 
     Args:
-        names: Names of the entries.
-        faults: The faults.
         period_s: Sampling period of noise and of faults that hold samples [s].
-        offset_s: Time of the first sample [s].
 
     Raises:
         ValueError: No entry has a fault's name, a swap is not of two entries, or a delay is not a

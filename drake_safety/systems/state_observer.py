@@ -36,16 +36,12 @@ class StateObserver(LeafSystem):
     standard deviations, the measurement is exact.
 
     Args:
-        kinematics: The robot.
         noise: Standard deviations that scale the standard normal ``noise`` input, which has
             2 n_v entries: for positions (tangent space), then for velocities.
         hand: Name of the reaching frame whose position is the output z_k; the base by default.
         mirror: If given, the state s_k is that of the robot's mirror image.
         is_walking: Whether s_k is :func:`~drake_safety.control.observation.walking_state`, and z_k
             the velocity (v_x, v_y, ω_z) in the heading frame [m/s, rad/s].
-
-    Raises:
-        ValueError: The robot has no such reaching frame.
     """
 
     def __init__(

@@ -29,11 +29,7 @@ def interpolate(
         start: (n_z,) [m].
         goal: (n_z,) [m].
         duration_s: Duration of the motion [s].
-        start_time_s: When it starts [s].
         detour: (n_z,) [m]; none for the straight line.
-
-    Raises:
-        ValueError: The duration is not positive.
     """
     if not duration_s > 0:
         raise ValueError(f"plan: duration_s must be positive; got {duration_s}")
@@ -50,15 +46,12 @@ def interpolate(
 
 
 def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
-    """Start, goal and detour of a plan of :func:`interpolate`, from its first samples.
+    """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its samples [m].
 
     Args:
         preview: Samples from the plan's start; they may end before the plan, (M, n_z) [m].
         step_s: Time between them [s].
         duration_s: Duration of the whole plan [s].
-
-    Returns:
-        Start, goal and detour, (3, n_z) [m].
     """
     seen_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
@@ -68,15 +61,7 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
 
 
 def points_of_plan(shape: np.ndarray, num_points: int) -> np.ndarray:
-    """Points of a plan at equal intervals of its progress s.
-
-    Args:
-        shape: Start, goal and detour, (3, n_z) [m].
-        num_points: M.
-
-    Returns:
-        The points, (M, n_z) [m].
-    """
+    """Points of a plan (3, n_z) at equal intervals of its progress s, (M, n_z) [m]."""
     return _shares(np.linspace(0, 1, num_points)) @ shape
 
 
@@ -119,10 +104,6 @@ class TrajectoryPlanner(LeafSystem):
         num_outputs: n_z, a multiple of three.
         outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
-
-    Raises:
-        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or number of
-            samples of the outlook is too small.
     """
 
     def __init__(
@@ -167,20 +148,13 @@ class TrajectoryPlanner(LeafSystem):
             )
 
     def set_plan(
-        self,
-        context: Context,
-        plan: PiecewisePolynomial,
-        stance_pose: np.ndarray | None = None,
+        self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None
     ) -> None:
         """Sets the plan and, for an unconnected input, the stance pose.
 
         Args:
-            context: This system's Context.
             plan: Positions in the stance frame over simulation time, (n_z, 1) [m].
             stance_pose: [x, y, yaw] (3,) [m, rad]; unchanged by default.
-
-        Raises:
-            ValueError: The plan's size is not n_z.
         """
         if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
             raise ValueError(

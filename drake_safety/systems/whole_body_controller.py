@@ -10,11 +10,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.whole_body_model import (
-    PointReference,
-    WholeBodyModel,
-    WholeBodyReference,
-)
+from drake_safety.control.whole_body_model import PointReference, WholeBodyModel, WholeBodyReference
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
 
 NOT_FINITE = 1
@@ -46,16 +42,12 @@ class WholeBodyController(LeafSystem):
     ``num_failures`` counts the updates since the initialisation whose status was not 0.
 
     Args:
-        kinematics: The controller's model of the robot.
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
         actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
             :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
             default.
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
-
-    Raises:
-        ValueError: The robot has no such hand, or the matrix is of another size.
     """
 
     def __init__(
@@ -97,15 +89,7 @@ class WholeBodyController(LeafSystem):
         self.DeclareStateOutputPort("num_failures", self._num_failures)
 
     def set_reference(self, context: Context, reference: WholeBodyReference) -> None:
-        """Sets the reference: stance, centre of mass, orientations, posture.
-
-        Args:
-            context: This system's Context, which keeps a copy.
-            reference: For instance ``model.reference(q)`` of an episode's initial positions.
-
-        Raises:
-            ValueError: A part of the reference does not fit the robot.
-        """
+        """Sets stance, centre of mass, orientations and posture, such as ``model.reference(q)``."""
         self.model.check_reference(reference)
         parameter = context.get_mutable_abstract_parameter(self._reference_index)
         parameter.set_value(copy.deepcopy(reference))

@@ -1,0 +1,254 @@
+"""What every system promises: its ports, which may be left open, what feeds through, and NaN."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import PortDataType
+
+from drake_safety import load_assessment
+from drake_safety.control.recovery_step import RecoveryStepParameters
+from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
+from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
+from drake_safety.systems.belief_evaluator import BeliefEvaluator
+from drake_safety.systems.feedback_recorder import FeedbackRecorder
+from drake_safety.systems.gravity_features import GravityFeatures
+from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
+from drake_safety.systems.novelty_monitor import NoveltyMonitor
+from drake_safety.systems.plan_features import PlanFeatures
+from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
+from drake_safety.systems.recovery_switch import RecoverySwitch
+from drake_safety.systems.recovery_trigger import RecoveryTrigger
+from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.safety_monitor import SafetyMonitor
+from drake_safety.systems.sensor_faults import SensorFaults
+from drake_safety.systems.state_observer import StateObserver
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner
+from drake_safety.systems.whole_body_controller import WholeBodyController
+from legged_robots import ROBOT_NAMES, robot_kinematics
+from system_doubles import INFO, AssessmentDouble, SlowIsSafe, controller, guard
+
+PERIOD = {"period_s": 0.01}
+LATE = PERIOD | {"offset_s": 0.002}
+ROWS = PERIOD | {"horizon": 4, "num_outlook": 3}
+STEPS = RecoveryStepParameters(min_steps=1, max_steps=1)
+LEARNED = load_assessment("laikago_balancing")
+N_S, N_F = len(LEARNED.info_.state_names), len(LEARNED.info_.feature_names)
+N_C, N_P = len(LEARNED.info_.constraint_names), 3 * LEARNED.info_.horizon
+SEEN = f"state {N_S}, desired_preview {N_P}, features {N_F}"
+PLAN = "desired_output 3, desired_preview 12, desired_outlook 9"
+ALARM = "alarm 1, levels 5, alarm_cause -"
+BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, "
+BELIEF += "cause_probability {0}, predicted_margins {0}"
+# Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
+CASES = {
+    "SensorFaults": (lambda: SensorFaults(["a", "b"], **PERIOD), "input 2 -> output 2 < *"),
+    "RecoveryTrigger": (
+        lambda: RecoveryTrigger(**PERIOD),
+        "safety_probability 1, belief? 3, recovery_done? 1 -> recovery_active 1, port_selector -",
+    ),
+    "TrajectoryPlanner": (
+        lambda: TrajectoryPlanner(horizon=7, step_s=0.1, num_outputs=6),
+        "stance_pose? 3 -> desired_output 6 < *, desired_output_rate 6 < *, "
+        "desired_preview 42, desired_outlook 30",
+    ),
+    "BeliefEvaluator": (
+        lambda: BeliefEvaluator(AssessmentDouble(), **PERIOD),
+        f"state 2, desired_preview 6, features 3, margins 2, alarm 1 -> {BELIEF.format(2)}",
+    ),
+    "NoveltyMonitor": (lambda: NoveltyMonitor(LEARNED), f"{SEEN}, hold? 1 -> {ALARM}"),
+    "SafetyAssessor": (
+        lambda: SafetyAssessor(LEARNED),
+        f"{SEEN}, margins {N_C}, hold? 1 -> {BELIEF.format(N_C)}, {ALARM}",
+    ),
+    "CommandGuard": (
+        lambda: guard(SlowIsSafe()),
+        f"command 3, state 1, features 3 -> {PLAN}, is_changed 1, safety_probability 1",
+    ),
+    "FeedbackRecorder": (
+        lambda: FeedbackRecorder(INFO, num_steps=5, plant_state_size=2, watch_period_s=0.01),
+        "state 1, true_state? 1, output 3, desired_output 3, desired_preview 9, features 1, "
+        "margins 2, safe 1, plant_state 2, recovery_active? 1 -> num_finished 1 < *",
+    ),
+    "PolicyController": (
+        controller,
+        "plant_state 17, command 3 -> desired_joint_state 4, action_state 10, status 1",
+    ),
+    "PendulumObserver": (
+        lambda: PendulumObserver(0.5),
+        "pendulum_state 2 -> plant_state 2 < *, output 3 < *",
+    ),
+    "PendulumController": (
+        lambda: PendulumController(PendulumParameters(), 0.01),
+        "plant_state 2, desired_output 3, desired_output_rate 3 -> torque 1",
+    ),
+}
+
+
+def add_robot(name):
+    k = robot_kinematics(name)
+    n_q, n_v, n_j = k.num_positions, k.num_velocities, k.num_joints
+    x, feet = f"plant_state {n_q + n_v}", 3 * k.num_contacts
+    safe_set = BalanceSafeSet(k, BalanceLimits())
+    stance = f"desired_foot_positions {feet}, desired_yaw 1, stance_pose 3"
+    ends = [f"nominal_{port}" for port in PLAN.split(", ")]
+    switched = [
+        f"{one} < {end.split()[0]}" for one, end in zip(PLAN.split(", "), ends, strict=True)
+    ]
+    for make, text in (
+        (
+            lambda: StateObserver(k),
+            f"{x}, noise? {2 * n_v} -> measured_{x} < *, state {12 + 2 * n_j} < *, output 3 < *",
+        ),
+        (
+            lambda: InverseKinematicsController(k, np.full(n_j, 250.0), **LATE),
+            f"{x}, desired_output 3, desired_foot_positions? {feet}, desired_yaw? 1 -> "
+            f"desired_joint_state {2 * n_j}",
+        ),
+        (
+            lambda: WholeBodyController(k, **LATE),
+            f"{x}, desired_output? 3, desired_output_rate? 3 -> "
+            f"actuation {n_j}, solver_status 1, num_failures 1",
+        ),
+        (
+            lambda: RecoveryStepPlanner(k, STEPS, **ROWS),
+            f"{x}, recovery_active 1, {ends[0]} -> {PLAN}, {stance}, recovery_done 1",
+        ),
+        (
+            lambda: RecoverySwitch(k, STEPS, threshold=0.6, offset_s=0.0005, **ROWS),
+            f"{x}, safety_probability 1, belief? 3, {', '.join(ends)} -> "
+            f"{', '.join(switched)}, {stance}, recovery_active 1",
+        ),
+        (
+            lambda: PlanFeatures(safe_set, n_q, n_v, horizon=2),
+            f"{x}, desired_preview 6 -> features {len(safe_set.feature_names)} < *",
+        ),
+        (
+            lambda: SafetyMonitor(safe_set, n_q, n_v),
+            f"{x} -> safe 1 < *, margins {len(safe_set.names)} < *",
+        ),
+        (lambda: GravityFeatures(k), f"{x}, gravity 3 -> features 2 < *"),
+    ):
+        CASES[f"{type(make()).__name__} {name}"] = make, text
+
+
+for name in ROBOT_NAMES:
+    add_robot(name)
+
+
+class Given:
+    """A system with the ports that it promises, and a simulator in which its inputs are given."""
+
+    def __init__(self, key, without=(), **values):
+        make, text = CASES[key]
+        inputs, outputs = (side.split(", ") for side in text.split(" -> "))
+        pairs = [one.split() for one in inputs]
+        self.inputs = {name.strip("?"): int(size) for name, size in pairs}
+        self.optional = {name.strip("?") for name, _ in pairs if "?" in name}
+        self.outputs, self.through = {}, set()
+        for output in outputs:
+            name, size, *sources = output.replace(" < ", " ").split()
+            self.outputs[name] = size
+            self.through |= {(one, name) for one in self.inputs if one in sources or "*" in sources}
+        self.system = make()
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        for port in self.inputs.keys() - set(without):
+            self.system.GetInputPort(port).FixValue(
+                self.context, values.get(port, self.value(key, port))
+            )
+
+    def value(self, key, port):
+        if port == "plant_state" and len(key.split()) > 1:
+            kinematics = robot_kinematics(key.split()[1])
+            v = np.zeros(kinematics.num_velocities)
+            return np.append(kinematics.standing_positions(), v)
+        return {
+            "safe": [1.0],
+            "recovery_active": [float("Planner" in key)],
+            "desired_output": [0.0, 0.0, 0.4],
+            "gravity": [0.0, 0.0, -9.81],
+            "plant_state": np.eye(1, self.inputs[port]).ravel(),
+        }.get(port, np.zeros(self.inputs[port]))
+
+    def ports(self):
+        ins = [self.system.get_input_port(i) for i in range(self.system.num_input_ports())]
+        return ins, [self.system.get_output_port(i) for i in range(self.system.num_output_ports())]
+
+    def advance(self, time_s):
+        self.simulator.AdvanceTo(time_s)
+        return {port.get_name(): np.copy(port.Eval(self.context)) for port in self.ports()[1]}
+
+
+@pytest.mark.parametrize("key", CASES)
+def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(key):
+    given = Given(key)
+    ins, outs = given.ports()
+    assert {port.get_name(): port.size() for port in ins} == given.inputs
+    abstract = [port for port in outs if port.get_data_type() == PortDataType.kAbstractValued]
+    found = {port.get_name(): "-" if port in abstract else str(port.size()) for port in outs}
+    assert found == given.outputs
+    is_direct = given.system.HasDirectFeedthrough
+    pairs = [(one, other) for one in ins for other in outs]
+    assert given.through == {
+        (one.get_name(), other.get_name())
+        for one, other in pairs
+        if is_direct(one.get_index(), other.get_index())
+    }
+
+
+@pytest.mark.parametrize("key", [key for key in CASES if key.split()[1:] in ([], ["laikago"])])
+def test_optional_ports_may_be_left_open_and_any_other_is_named(key):
+    given = Given(key, Given(key).optional)
+    given.advance(0.0)
+    given.advance(0.3)
+    for port in given.inputs.keys() - given.optional:
+        # Within the switch it is that of one of Drake's.
+        name = "nominal" if key.startswith("RecoverySwitch") and "nominal" in port else port
+        without = Given(key, {port})
+        with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}.*is not connected"):
+            without.advance(0.0)
+            without.advance(0.3)
+
+
+NOT_FINITE = {
+    ("SafetyMonitor laikago", "plant_state"): {"safe": 0.0, "margins": -np.inf},
+    ("StateObserver laikago", "plant_state"): {"state": np.nan},
+    ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
+    ("BeliefEvaluator", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
+    ("CommandGuard", "command"): {"desired_output": 0.0, "is_changed": 1.0},
+}
+
+
+@pytest.mark.parametrize(("key", "port"), NOT_FINITE)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
+    given = Given(key)
+    before, promised = given.advance(0.01), NOT_FINITE[key, port]
+    assert any(np.any(before[name] != np.array(promised[name])) for name in promised)
+    for entry in range(given.inputs[port]):
+        values = np.array(given.value(key, port))
+        values[entry] = value
+        found = Given(key, **{port: values}).advance(0.01)
+        for name, expected in promised.items():
+            np.testing.assert_array_equal(found[name], np.broadcast_to(expected, found[name].shape))
+
+
+@pytest.mark.parametrize(
+    ("key", "port", "value", "tick_s"),
+    [
+        ("BeliefEvaluator", "state", [0.5, 0.0], 0.01),
+        ("CommandGuard", "command", [0.5, 0.0, 0.0], 0.1),
+        ("PolicyController", "command", [0.2, 0.4, 0.0], 0.02),
+        ("PendulumController", "plant_state", [0.02, 0.0], 0.01),
+        ("InverseKinematicsController laikago", "desired_output", [0.0, 0.0, 0.38], 0.012),
+        ("WholeBodyController laikago", "desired_output", [0.0, 0.0, 0.38], 0.012),
+    ],
+)
+def test_outputs_are_held_until_the_next_tick(key, port, value, tick_s):
+    given, same = Given(key), Given(key)
+    held = given.advance(0.0025)
+    given.system.GetInputPort(port).FixValue(given.context, value)
+    for name, later in given.advance(tick_s - 1e-4).items():
+        np.testing.assert_array_equal(later, held[name])
+    changed, expected = given.advance(tick_s + 1e-4), same.advance(tick_s + 1e-4)
+    assert any(not np.array_equal(changed[name], expected[name]) for name in held)
