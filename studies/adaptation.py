@@ -358,6 +358,8 @@ def losses(
 
     parameters = prior.parameters
     known = split(learned, stride=1, discount=1.0, shortest=parameters.shortest)
+    if np.ptp(known.is_unsafe.astype(int)) == 0:
+        raise ValueError("losses: all actual episodes end alike; expected safe and unsafe ones")
     judged = test.segments
     boosting = DirectClassifier(
         "gradient_boosting", uses_features=prior.uses_features, shortest=parameters.shortest

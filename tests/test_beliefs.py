@@ -33,10 +33,7 @@ def test_fusion_equals_the_printed_products():
     for count in (1, 2, 5, 20):
         beliefs = random_beliefs(rng, count)
         np.testing.assert_allclose(fuse(beliefs), printed_fusion(beliefs), rtol=1e-12)
-
-
-def test_two_beliefs_fuse_to_the_values_worked_by_hand():
-    # w = 1 and 1/4: b_safe = (0.5 + 0.05) / 1.25, mu = (0.5 + 0.2) / 1.25
+    # By hand: w = 1 and 1/4, b_safe = (0.5 + 0.05) / 1.25, mu = (0.5 + 0.2) / 1.25.
     fused = fuse(np.array([[0.5, 0.0, 0.5], [0.2, 0.0, 0.8]]))
     np.testing.assert_allclose(fused, [0.44, 0.0, 0.56])
 

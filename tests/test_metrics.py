@@ -23,11 +23,6 @@ def segments():
     return split(make_episodes(80, seed=1), stride=1, discount=0.99)
 
 
-def blurred_truth(segments, seed=0):
-    noise = np.random.default_rng(seed).normal(size=len(segments))
-    return 1.0 / (1.0 + np.exp(-(2.0 * segments.is_unsafe - 1.0 + noise)))
-
-
 def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
     # 8 of 10 in any table of exact binomial limits.
     estimate = proportion(8, 10)
@@ -160,7 +155,8 @@ def test_no_other_threshold_has_a_better_balanced_accuracy():
 
 
 def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segments):
-    score = blurred_truth(segments)
+    noise = np.random.default_rng(0).normal(size=len(segments))
+    score = 1.0 / (1.0 + np.exp(-(2.0 * segments.is_unsafe - 1.0 + noise)))
     estimates = segment_estimates(segments, score, threshold=0.6)
     label = segments.is_unsafe
     assert estimates["unsafe_recall"].value == pytest.approx((score[label] > 0.6).mean())

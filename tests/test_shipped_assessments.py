@@ -18,7 +18,6 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text
 from studies.publish import NUM_EPISODES, check_shipped
 
 NAME = "shuttling"
-MEGABYTE = 1e6
 
 
 @pytest.mark.slow
@@ -38,7 +37,7 @@ def test_a_card_is_what_shipping_would_write_now(name):
     folder = shipped_folder(name)
     card = (folder / CARD_FILE).read_text(encoding="utf-8")
     assert card == card_text(folder, load_scenario(name)), "`python -m studies readme` writes it"
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 10 * MEGABYTE
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 10e6
 
 
 @pytest.mark.parametrize("missed", [0.2, 0.0])

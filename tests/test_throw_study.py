@@ -36,29 +36,14 @@ def log_of(index, *, leaves=False, falls=False, trigger_time_s=math.nan):
     )
 
 
-class Simulation:
-    """In place of `run_throws`: every third throw falls, and recovery saves whom it is in time."""
-
-    def __init__(self):
-        self.calls = []
-
-    def __call__(self, scenario, indices, *, trigger_times_s=None, progress=None, **options):
-        self.calls.append((tuple(indices), trigger_times_s))
-        logs = []
-        for index in indices:
-            time_s = math.nan if trigger_times_s is None else trigger_times_s[index]
-            falls = index % 3 == 0 and not time_s < IMPACT_S + 0.1
-            logs.append(log_of(index, falls=falls, trigger_time_s=time_s))
-            if progress is not None:
-                progress(len(logs), len(indices))
-        return logs
-
-
-@pytest.fixture
-def simulation(monkeypatch):
-    simulation = Simulation()
-    monkeypatch.setattr(throw_study, "run_throws", simulation)
-    return simulation
+def every_third_falls(scenario, indices, *, trigger_times_s=None, **options):
+    """In place of `run_throws`: recovery saves whom it is in time."""
+    logs = []
+    for index in indices:
+        time_s = math.nan if trigger_times_s is None else trigger_times_s[index]
+        falls = index % 3 == 0 and not time_s < IMPACT_S + 0.1
+        logs.append(log_of(index, falls=falls, trigger_time_s=time_s))
+    return logs
 
 
 def rule(name, threshold, delay_rows=0):
@@ -75,7 +60,8 @@ def rule(name, threshold, delay_rows=0):
 CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
 
 
-def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(simulation):
+def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(monkeypatch):
+    monkeypatch.setattr(throw_study, "run_throws", every_third_falls)
     found, logs = evaluate_throws(
         None, [rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)], num_throws=9, seed=1
     )
